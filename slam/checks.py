@@ -62,3 +62,14 @@ def require_guess(owner: str, guess: Array | None) -> None:
     R = guess[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or (guess[3] != (0, 0, 0, 1)).any():
         raise MeasurementError(f"{owner}: the guess must be a rigid motion: a rotation and a translation")
+
+
+def require_recent(owner: str, n: int) -> int:
+    """How many of the last poses are asked for.
+
+    Raises:
+        MeasurementError: fewer than one.
+    """
+    if n < 1:
+        raise MeasurementError(f"{owner}: recent({n}): one pose at least must be asked for")
+    return int(n)

@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "window": {"data", "geometry", "kernels", "runtime"},
     "tracks": {"data", "geometry", "kernels", "runtime"},
     "calibration": {"data", "geometry", "kernels", "runtime"},
-    "mapping": {"tracks", "data", "geometry", "runtime"},
+    "mapping": {"tracks", "window", "data", "geometry", "runtime"},
     "objects": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},

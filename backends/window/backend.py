@@ -12,8 +12,8 @@ from backends.window.config import WindowConfig
 from backends.window.history import Call, History, state_corrected
 from backends.window.state import State, settle
 from backends.window.steps import Steps
-from slam.checks import require_guess, require_not_measured, require_stamp
-from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
+from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
+from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
@@ -111,6 +111,13 @@ class WindowBackend:
             float(s.stamps[-1]), s.poses[-1].copy(), s.covariance[-6:, -6:].copy(), marks.ids[rows],
             marks.position[rows], marks.world[rows],
         )  # fmt: skip
+
+    def recent(self, n: int) -> RecentPoses:
+        """The last n poses, or as many as the window has without a gap, with their joint covariance."""
+        s = self._started("recent")
+        begins = s.frames - np.arange(len(s.frames))  # the same for all without a gap before the newest
+        n = min(require_recent("window", n), int((begins == begins[-1]).sum()))
+        return RecentPoses(s.stamps[-n:].copy(), s.poses[-n:].copy(), s.covariance[-6 * n :, -6 * n :].copy())
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""

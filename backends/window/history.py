@@ -128,7 +128,7 @@ def state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array]
         before, after = (
             kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0] for p in (marks.position, position)
         )
-        prior = replace(prior, origin=prior.origin + after - before)
+        prior = replace(prior, origin=prior.origin + np.nan_to_num(after - before))  # NaN: behind its chart
     rows = replace(s.rows, z=_corrected(s.rows.z, correct))
     past = s.past.displaced(marks.serial, position - marks.position) if len(marks) else s.past
     return replace(s, rows=rows, landmarks=replace(marks, position=position), prior=prior, past=past)

@@ -9,7 +9,7 @@ import numpy as np
 from backends.window.state import State
 from slam.data import IndexArray
 from slam.models import EstimatorModels
-from slam.window.motion import LONGEST, is_first, velocity_sigmas
+from slam.window.motion import LONGEST, RATIO, velocity_sigmas
 from slam.window.problem import Motion, Places, Rows, Window
 from slam.window.stereo import RectifiedStereo
 
@@ -24,22 +24,17 @@ class Problem:
 
 def motion_between(s: State, models: EstimatorModels) -> Motion:
     """The motion model between all poses of the window that follow each other."""
-    f, t = s.frames, s.stamps
-    poses, interval, weight = [], [], []
-    for i in range(1, len(f)):
-        if f[i] != f[i - 1] + 1 or f[i] == s.begun:
-            continue
-        dt = min(t[i] - t[i - 1], LONGEST)
-        before = min(t[i - 1] - t[i - 2], LONGEST) if i > 1 and f[i - 2] == f[i] - 2 and f[i] > s.begun + 1 else None
-        first = is_first(before, dt)
-        if before is None and f[i] > s.begun + 1:
-            continue  # what the motion model said of it is in the prior
-        poses.append((-1 if first else i - 2, i - 1, i))
-        interval.append((1.0 if before is None else before, dt))
-        weight.append(1 / velocity_sigmas(models, dt, first))
-    if not poses:
+    f, dt = s.frames, np.minimum(np.diff(s.stamps), LONGEST)
+    follows = (np.diff(f) == 1) & (f[1:] != s.begun)
+    before = np.concatenate([[False], follows[:-1]]) & follows
+    begins = follows & (f[1:] == s.begun + 1)
+    i = np.flatnonzero(before | begins)  # what the motion model said of others is in the prior
+    if not len(i):
         return Motion.none()
-    return Motion(np.array(poses), np.array(interval), np.array(weight))
+    earlier = np.where(before[i], dt[i - 1], 1.0)
+    first = ~before[i] | (dt[i] > RATIO * earlier)
+    poses = np.stack([np.where(first, -1, i - 1), i, i + 1], axis=1)
+    return Motion(poses, np.stack([earlier, dt[i]], axis=1), 1 / velocity_sigmas(models, dt[i], first))
 
 
 def problem(

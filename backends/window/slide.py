@@ -87,7 +87,10 @@ def _left(s: State, leaving: int, stayed: IndexArray, ended: IndexArray, conditi
 def _without_oldest(
     surplus: int, s: State, members: BoolArray, joins: BoolArray, ends: BoolArray, there: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
-    """More landmarks end, and fewer join: members out of view that were measured longest ago, then those that join."""
+    """More landmarks end, and fewer join: members out of view that were measured longest ago, then those that join.
+
+    Of those, one that is known in the world does not end: it stays known, and what the pose measured of it is dropped.
+    """
     ends, joins = ends.copy(), joins.copy()
     out_of_view = np.flatnonzero(members & ~there)
     oldest = out_of_view[np.argsort(s.landmarks.last[out_of_view], kind="stable")][:surplus]
@@ -95,7 +98,7 @@ def _without_oldest(
     surplus -= len(oldest)
     if surplus > 0:
         last = np.flatnonzero(joins)[::-1][:surplus]
-        joins[last], ends[last] = False, True
+        joins[last], ends[last] = False, s.landmarks.information[last, 0, 0] == 0
     return ends, joins
 
 

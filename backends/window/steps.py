@@ -21,14 +21,15 @@ from slam.models import EstimatorModels
 from slam.window import kernels, motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
 from slam.window.gating import with_noise
-from slam.window.problem import Places, RelativePrior, Rows
+from slam.window.problem import Places, RelativePrior, Rows, Window
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.solver import CLOSE, Solution, solve
 from slam.window.stereo import RectifiedStereo
 
-#: numerics: `close` for distances beyond the gate. Where a row alone tells something of the pose, its residual and the
-#: variance of that are nearly 0, and what the first solution leaves of them would decide.
-_CLOSER = 1e-8
+#: numerics: share of its noise that a row's residual has at least, to be tested at the first solution. Where a row
+#: alone tells something of the pose, its residual and the variance of that are nearly 0, and what the solution leaves
+#: of them would decide: then it is solved to the last digits.
+_TESTED, _CLOSER = 0.01, 1e-8
 _SOLVED_AGAIN = 2  # numerics: how often an update is solved again without observations that disagree with the others
 
 
@@ -187,30 +188,37 @@ class Steps:
         used, T = found.used.copy(), found.T
         if found.jump is not None:
             s = _restarted(s, found.T, points)
-        start = replace(s, poses=np.concatenate([s.poses[:-1], T[None]]))
+        s = replace(s, poses=np.concatenate([s.poses[:-1], T[None]]))
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
+        p = problem(replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used]))), self.stereo, self.models)
+        w = p.window
         for again in range(_SOLVED_AGAIN + 1):
-            tried = replace(start, rows=s.rows.joined(self._rows(s, points[used], z[used])))
-            p = problem(tried, self.stereo, self.models)
-            at, w = np.searchsorted(p.points, points[used]), p.window
-            for close in (CLOSE, _CLOSER):
-                solution = solve(w, close)
-                local, world = solution.point_covariances(len(s.frames) - 1)
-                w = solution.window
-                distances = kernels.left_out_distances(
-                    self.stereo.intrinsics, self.stereo.R_left, w.poses[-1], w.points[at], z[used], local[at],
-                    self.sigma,
-                )  # fmt: skip
-                bad = distances > limits[used]
-                if not bad.any():
-                    break
+            solution, distances = self._tested(w, np.searchsorted(p.points, points[used]), z[used])
+            bad = distances > limits[used]
             if not bad.any() or again == _SOLVED_AGAIN:
                 break
+            rows = np.append(np.ones(len(s.rows), bool), ~bad)
+            w = replace(solution.window, rows=solution.window.rows.select(rows))
             used[np.flatnonzero(used)[bad]] = False
             if not used.any():
                 raise np.linalg.LinAlgError("no observation agrees with the others")
+        s = replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used])))
+        local, world = solution.point_covariances(len(s.frames) - 1)
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
-        return _after(tried, solution, p.points, local, world, points[used]), used, nis
+        return _after(s, solution, p.points, local, world, points[used]), used, nis
+
+    def _tested(self, w: Window, at: IndexArray, z: Array) -> tuple[Solution, Array]:
+        """The solution, and how far points `at` (M,) are from their measurements z (M, 3) in the newest pose."""
+        for close, least in ((CLOSE, _TESTED), (_CLOSER, 0.0)):
+            solution = solve(w, close)
+            w = solution.window
+            distances = kernels.left_out_distances(
+                self.stereo.intrinsics, self.stereo.R_left, w.poses[-1], w.points[at], z,
+                solution.point_covariances(len(w.poses) - 1, at)[0], self.sigma, least,
+            )  # fmt: skip
+            if np.isfinite(distances).all():
+                break
+        return solution, distances
 
 
 def _lost(s: State) -> bool:
@@ -276,12 +284,14 @@ def _after(s: State, solution: Solution, points: IndexArray, local: Array, world
     """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
     marks, w = s.landmarks, solution.window
     there = replace(s, poses=w.poses, covariance=solution.pose_covariance)
-    h, own = seen_from_newest(there, np.arange(len(marks)))
-    by_pose = points_by_pose(h)
-    own += by_pose @ between(there, s.solved) @ np.swapaxes(by_pose, 1, 2)
-    position, whole, last = marks.position.copy(), marks.world.copy(), marks.last.copy()
-    position[points], last[seen] = w.points, s.frames[-1]
     definite = (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
-    own[points[definite]], whole[points[definite]] = local[definite], world[definite]
+    known = points[definite]
+    others = np.delete(np.arange(len(marks)), known)
+    h, rest = seen_from_newest(there, others)
+    by_pose = points_by_pose(h)
+    position, whole, last, own = marks.position.copy(), marks.world.copy(), marks.last.copy(), marks.local.copy()
+    position[points], last[seen] = w.points, s.frames[-1]
+    own[others] = rest + by_pose @ between(there, s.solved) @ np.swapaxes(by_pose, 1, 2)
+    own[known], whole[known] = local[definite], world[definite]
     marks = replace(marks, position=position, local=own, world=whole, last=last)
     return replace(there, cost=solution.cost, solved=len(s.frames) - 1, landmarks=marks)

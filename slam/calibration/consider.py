@@ -5,20 +5,24 @@ pixel noise does. With δ the error of the applied correction and ``Σ`` its cov
 
     T_true = T exp(J δ),    y_true = y + L δ,
 
-and their covariances grow by ``J Σ Jᵀ`` and ``L Σ Lᵀ``: δ is considered, but not estimated by the back end. A filter of
-its own computes J and L from the measurements (`slam.calibration.sensitivity`). To bound its cost, it tracks a random
-choice of `_FOLLOWED` recently measured landmarks.
+and their covariances grow by ``J Σ Jᵀ`` and ``L Σ Lᵀ``: δ is considered, but not estimated by the back end. J and L
+follow from what was measured, whichever back end estimates. A landmark's h = Rᵀ (y − t) changes by ``B J δ + Rᵀ L δ``
+with ``B = [[h]ₓ, −1]``, and its pixels are displaced by ``F δ``; so each frame is one least-squares problem for J,
+
+    F ≈ H B J + H Rᵀ L,    weighted by (N + H Rᵀ P R Hᵀ)⁻¹,
+
+with N the pixel noise and P a landmark's covariance where all poses are known. Then each L and P is updated by its own
+measurement, J given: the gain of least squares over all poses and landmarks, but for what the landmarks have in common.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slam.calibration.model import RigModel
-from slam.calibration.sensitivity import InactiveLandmarks, SensitivityState
 from slam.data import Estimate
 from slam.geometry.arrays import Array, IdArray, isin
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
@@ -28,10 +32,80 @@ from slam.models import EstimatorModels
 #: tenths of a percent. It scales the whole world, so images never show it.
 BASELINE = 0.002
 
-_FOLLOWED = 60  # cost: most landmarks in the filter
-_UNSEEN = 3  # cost: frames without a measurement after which a landmark leaves the filter
-_EVERY = 0.08  # cost: least time between the filter's updates [s]; frames in between show nearly the same
+_LEAST = 1e-9  # numerics: of a motion's standard deviations [rad], [m]; with none there is no information matrix
 _LONGEST = 1.0  # guard: time [s] after which a motion counts as unknown
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """How the pose and N landmarks depend on m errors of the rig, and what is known of them beside these.
+
+    Attributes:
+        T_world: the estimated pose of the rectified left camera (4, 4).
+        pose: J (6, m).
+        covariance: of the pose where the landmarks are known (6, 6).
+        ids: of the landmarks (N,), ascending.
+        landmarks: L (N, 3, m).
+        own: P (N, 3, 3), in world axes [m²].
+    """
+
+    T_world: Array
+    pose: Array
+    covariance: Array
+    ids: IdArray
+    landmarks: Array
+    own: Array
+
+    @classmethod
+    def start(cls, T_world: Array, m: int) -> Sensitivities:
+        """The first pose defines the world; no landmark is known."""
+        none = np.zeros(0, np.int64), np.zeros((0, 3, m)), np.zeros((0, 3, 3))
+        return cls(T_world, np.zeros((6, m)), np.zeros((6, 6)), *none)
+
+    def moved(self, T_world: Array, rotation: float, translation: float) -> Sensitivities:
+        """At the next pose (4, 4), with the prior standard deviations of the motion [rad], [m]."""
+        A = adjoint(inverse(T_world) @ self.T_world)
+        C = A @ self.covariance @ A.T + np.diag(np.repeat(np.square([rotation, translation]), 3))
+        return replace(self, T_world=T_world, pose=A @ self.pose, covariance=C)
+
+    def measured(self, rows: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Sensitivities:
+        """After measurements of landmarks.
+
+        Args:
+            rows: of the landmarks (M,).
+            local: their estimated positions (M, 3) [m] in the camera's coordinates.
+            H: ∂z/∂h of the measurements z (M, 3, 3).
+            field: F = ∂z/∂δ (M, 3, m).
+            noise: covariance of a measurement (3, 3).
+        """
+        by_pose, by_point, P = H @ points_by_pose(local), H @ self.T_world[:3, :3].T, self.own[rows]
+        PG = P @ np.swapaxes(by_point, 1, 2)
+        W = np.linalg.inv(by_point @ PG + noise)
+        rest = field - by_point @ self.landmarks[rows]
+        AW = (np.swapaxes(by_pose, 1, 2) @ W).transpose(1, 0, 2).reshape(6, -1)
+        before = np.linalg.inv(self.covariance)
+        C = np.linalg.inv(before + AW @ by_pose.reshape(-1, 6))
+        C = 0.5 * (C + C.T)
+        J = C @ (before @ self.pose + AW @ rest.reshape(AW.shape[1], -1))
+        gain = PG @ W
+        landmarks, own = self.landmarks.copy(), self.own.copy()
+        landmarks[rows] += gain @ (rest - by_pose @ J)
+        own[rows] -= gain @ np.swapaxes(PG, 1, 2)
+        return replace(self, pose=J, covariance=C, landmarks=landmarks, own=own)
+
+    def with_new(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Sensitivities:
+        """With landmarks (K,) at `local` (K, 3) [m] first seen from this pose; other arguments as in `measured`."""
+        back = self.T_world[:3, :3] @ np.linalg.inv(H)
+        L = back @ field - self.T_world[:3, :3] @ points_by_pose(local) @ self.pose
+        ids = np.concatenate([self.ids, ids])
+        order = np.argsort(ids, kind="stable")
+        landmarks = np.concatenate([self.landmarks, L])[order]
+        own = np.concatenate([self.own, back @ noise @ np.swapaxes(back, 1, 2)])[order]
+        return replace(self, ids=ids[order], landmarks=landmarks, own=own)
+
+    def select(self, keep: np.ndarray) -> Sensitivities:
+        """With these landmarks only (N,)."""
+        return replace(self, ids=self.ids[keep], landmarks=self.landmarks[keep], own=self.own[keep])
 
 
 class SchmidtFilter:
@@ -55,9 +129,8 @@ class SchmidtFilter:
         self.kept, self._applied = applied, applied
         self._noise = models.pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
         self._columns = len(model.names) + 2
-        self._stamp = self._measured = 0.0
-        self._followed: SensitivityState | None = None
-        self._others = InactiveLandmarks.none(self._columns)
+        self._stamp: float | None = None
+        self._now = Sensitivities.start(np.eye(4), self._columns)
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
 
     def observe(self, T_world_left: Array, stamp: float, ids: IdArray, positions: Array) -> None:
@@ -69,52 +142,26 @@ class SchmidtFilter:
             ids: landmarks that measured it (M,).
             positions: their estimated positions (M, 3) [m] in world coordinates.
         """
-        T = T_world_left @ self._model.rig.rectified.T_left_rectified
-        before, others = self._followed, self._others
-        if before is None:
-            self._followed, self._stamp, self._measured = SensitivityState.start(T, self._columns), stamp, stamp
+        T, now = T_world_left @ self._model.rig.rectified.T_left_rectified, self._now
+        if self._stamp is None:
+            self._now, self._stamp = Sensitivities.start(T, self._columns), stamp
             return
-        local = transform(inverse(T), positions)
-        front = local[:, 2] > 0
-        ids, local, positions = ids[front], local[front], positions[front]
-        lately = before.ids[(before.unseen < _UNSEEN) | isin(before.ids, ids)]
-        rows = np.flatnonzero(isin(ids, others.ids))
-        wanted = _chosen(np.concatenate([lately, ids[rows]]))
-        now, others = self._exchanged(before, others, wanted)
-        rows = rows[isin(ids[rows], wanted)]
-        if len(rows):  # before the motion, whose error they share with the whole state
-            again = np.searchsorted(others.ids, ids[rows])
-            now = now.seen_again(others.select(again), transform(inverse(now.T_world), positions[rows]))
-            others = others.select(np.delete(np.arange(len(others.ids)), again))
         now = now.moved(T, *self._motion_sigmas(stamp - self._stamp))
-        place = {i: row for row, i in enumerate(now.ids.tolist())}
-        rows = np.array([place.get(i, -1) for i in ids.tolist()], np.intp)
-        rows, points = rows[rows >= 0], local[rows >= 0]
-        due = abs(stamp - self._measured) >= _EVERY
-        if due and len(rows):
-            now = now.measured(rows, points, self._by_point(points), self._field(points), self._noise)
-        else:
-            now = now.met(rows, points)
-        # In one statement, so that an interrupt finds all of it done or nothing.
-        self._followed, self._others, self._stamp, self._measured = (
-            now, others, stamp, stamp if due else self._measured,
-        )  # fmt: skip
+        local = transform(inverse(T), positions)
+        rows = np.searchsorted(now.ids, ids).clip(0, max(len(now.ids) - 1, 0))
+        good = (local[:, 2] > 0) & isin(ids, now.ids)
+        if good.any():
+            now = now.measured(rows[good], local[good], *self._sight(local[good]))
+        self._now, self._stamp = now, stamp  # one statement, so that an interrupt finds all of it done or nothing
 
     def change(self, ids: IdArray, positions: Array, erased: IdArray) -> None:
         """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones."""
-        if not len(ids) and not len(erased):
-            return
-        now, others = self._without(erased)
-        new = ~isin(ids, np.concatenate([now.ids, others.ids, erased]))
+        now = self._now.select(~isin(self._now.ids, erased)) if len(erased) else self._now
+        new = ~isin(ids, np.concatenate([now.ids, erased]))
         if new.any():
-            ids, local = ids[new], transform(inverse(now.T_world), positions[new])
-            wanted = _chosen(np.concatenate([now.ids, ids]))
-            now, others = self._exchanged(now, others, wanted)
-            H, field, chosen = self._by_point(local), self._field(local), isin(ids, wanted)
-            rest = now.seen_once(ids[~chosen], local[~chosen], H[~chosen], field[~chosen], self._noise)
-            now = now.first_seen(ids[chosen], local[chosen], H[chosen], field[chosen], self._noise)
-            others = others.joined(rest)
-        self._followed, self._others = now, others
+            local = transform(inverse(now.T_world), positions[new])
+            now = now.with_new(ids[new], local, *self._sight(local))
+        self._now = now
 
     def replace_landmarks(self, ids: IdArray, positions: Array) -> None:
         """Take in landmarks (M,) at `positions` (M, 3) [m] as new ones, replacing their former state."""
@@ -123,9 +170,7 @@ class SchmidtFilter:
 
     def keep(self, ids: IdArray) -> None:
         """Forget all landmarks but these (M,)."""
-        if self._followed is not None:
-            known = np.concatenate([self._followed.ids, self._others.ids])
-            self._followed, self._others = self._without(np.setdiff1d(known, ids))
+        self._now = self._now.select(isin(self._now.ids, ids))
 
     def path_follows(self, applied: Array) -> None:
         """The correction becomes `applied` (n,), and the path was revised accordingly."""
@@ -139,21 +184,18 @@ class SchmidtFilter:
             positions: returns the positions (M, 3) [m] of landmarks by their ids (M,).
             landmarks_follow: the landmarks move to where the new correction places them from the present pose.
         """
-        step, now, others = applied - self._applied, self._followed, self._others
-        if now is not None and step.any():
-            followed, old = now.by_rig.copy(), others.by_rig.copy()
-            followed[:6, -1] += followed[:6, :-2] @ step
+        step, now = applied - self._applied, self._now
+        if step.any():
+            pose, landmarks = now.pose.copy(), now.landmarks.copy()
+            pose[:, -1] += pose[:, :-2] @ step
             if not landmarks_follow:
-                followed[6:, -1] += followed[6:, :-2] @ step
-                old[:, :, -1] += old[:, :, :-2] @ step
-            else:
-                followed[6:, -1] = 0.0
-                if len(others.ids):
-                    local = transform(inverse(now.T_world), positions(others.ids))
-                    old[:, :, -1] = -(points_by_pose(local) @ followed[:6, -1]) @ now.T_world[:3, :3].T
-            now, others = replace(now, by_rig=followed), replace(others, by_rig=old)
+                landmarks[:, :, -1] += landmarks[:, :, :-2] @ step
+            elif len(now.ids):
+                local = transform(inverse(now.T_world), positions(now.ids))
+                landmarks[:, :, -1] = -(points_by_pose(local) @ pose[:, -1]) @ now.T_world[:3, :3].T
+            now = replace(now, pose=pose, landmarks=landmarks)
         # In one statement, so that an interrupt finds all of it done or nothing.
-        self._followed, self._others, self.kept, self._applied = now, others, self.kept + step, applied
+        self._now, self.kept, self._applied = now, self.kept + step, applied
 
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
@@ -190,16 +232,11 @@ class SchmidtFilter:
     @property
     def pose(self) -> Array:
         """Derivative of the pose (6, n + 2) in the axes of the rectified left camera."""
-        return np.zeros((6, self._columns)) if self._followed is None else self._followed.by_rig[:6]
+        return self._now.pose
 
     def landmarks(self) -> tuple[IdArray, Array]:
         """Ids (N,), ascending, and derivatives (N, 3, n + 2) of their positions in world coordinates."""
-        now = self._followed
-        if now is None:
-            return self._others.ids, self._others.by_rig
-        ids = np.concatenate([now.ids, self._others.ids])
-        order = np.argsort(ids, kind="stable")
-        return ids[order], np.concatenate([now.in_world(), self._others.by_rig])[order]
+        return self._now.ids, self._now.landmarks
 
     def _by_left_camera(self) -> Array:
         """Derivative of the pose (6, n + 2) in the axes of the left camera."""
@@ -222,51 +259,21 @@ class SchmidtFilter:
 
     def _motion_sigmas(self, dt: float) -> tuple[float, float]:
         """Prior standard deviations of a motion [rad], [m]: twice the velocity's change."""
-        v, w = np.sqrt(self._motion.velocity_variance(min(abs(dt), _LONGEST)))
-        return 2 * float(w) * min(abs(dt), _LONGEST), 2 * float(v) * min(abs(dt), _LONGEST)
+        dt = min(abs(dt), _LONGEST)
+        v, w = 2 * dt * np.sqrt(self._motion.velocity_variance(dt))
+        return max(float(w), _LEAST), max(float(v), _LEAST)
 
-    def _without(self, erased: IdArray) -> tuple[SensitivityState, InactiveLandmarks]:
-        """The filter's state and the frozen landmarks, without the erased ones."""
-        assert self._followed is not None
-        now, others = self._followed, self._others
-        if not len(erased):
-            return now, others
-        return now.select(np.flatnonzero(~isin(now.ids, erased))), others.select(~isin(others.ids, erased))
+    def _sight(self, local: Array) -> tuple[Array, Array, Array]:
+        """Of z = (x, y, d) [px] of points (M, 3) [m]: ∂z/∂h (M, 3, 3), ∂z/∂δ (M, 3, m), and the noise (3, 3).
 
-    def _exchanged(
-        self, now: SensitivityState, others: InactiveLandmarks, wanted: IdArray
-    ) -> tuple[SensitivityState, InactiveLandmarks]:
-        """Move landmarks that are not `wanted` any more from the filter's state to the frozen ones."""
-        stays = isin(now.ids, wanted)
-        if stays.all():
-            return now, others
-        leaving = now.select(np.flatnonzero(~stays)).frozen()
-        return now.select(np.flatnonzero(stays)), others.joined(leaving)
-
-    def _field(self, local: Array) -> Array:
-        """∂(x, y, d)/∂δ (M, 3, m) [px] at points (M, 3) [m]; the corrected pixels are those of an ideal rig."""
-        points = self._pixels(local)
-        out = np.zeros((len(local), 3, self._columns))
-        out[:, :, :-2] = self._model.field(points)
-        out[:, 2, -2] = -points[:, 2]  # with a longer baseline, the nominal one's disparity is smaller
-        return out
-
-    def _pixels(self, local: Array) -> Array:
-        scale = self._model.focal / local[:, 2:]
-        return np.column_stack([local[:, :2] * scale, self._model.rig.baseline * scale])
-
-    def _by_point(self, local: Array) -> Array:
-        """∂(x, y, d)/∂h (M, 3, 3) [px/m] at points (M, 3) [m]."""
-        x, y, d = self._pixels(local).T
-        f, z, none = self._model.focal, local[:, 2], np.zeros(len(local))
-        rows = [[f + none, none, -x], [none, f + none, -y], [none, none, -d]]
-        return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1) / z[:, None, None])
-
-
-def _chosen(ids: IdArray) -> IdArray:
-    """At most `_FOLLOWED` of some landmarks (N,): a pseudo-random choice, the same each time."""
-    if len(ids) <= _FOLLOWED:
-        return ids
-    # Knuth's multiplicative hash, which is injective for ids below 2³².
-    drawn = (ids.astype(np.uint64) * np.uint64(2654435761)) % np.uint64(2**32)
-    return ids[np.lexsort((ids, drawn))[:_FOLLOWED]]
+        The corrected pixels are those of an ideal rig.
+        """
+        f, depth = self._model.focal, local[:, 2:]
+        points = np.column_stack([local[:, :2], np.full(len(local), self._model.rig.baseline)]) * (f / depth)
+        H = np.zeros((len(local), 3, 3))
+        H[:, 0, 0] = H[:, 1, 1] = f / depth[:, 0]
+        H[:, :, 2] = -points / depth
+        field = np.zeros((len(local), 3, self._columns))
+        field[:, :, :-2] = self._model.field(points)
+        field[:, 2, -2] = -points[:, 2]  # with a longer baseline, the nominal one's disparity is smaller
+        return H, field, self._noise

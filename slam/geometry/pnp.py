@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.geometry.arrays import BoolArray, median
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, inverse
+from slam.geometry.se3 import Array, exp, inverse, points_by_pose
 
 #: fixed: Stereo points that fix a pose.
 MINIMAL_POINTS = 3
@@ -64,25 +64,25 @@ def find_consensus(
         seed: of the random choice.
     """
     clear = CLEAR_MAJORITY * len(points)
-    first = _polish(rig, points, measured, inverse(guess), threshold)
+    first = _polish(rig, points, measured, guess, threshold)
     if first.inliers.sum() >= clear:
         return first
-    nearer = _polish(rig, points, measured, _approach(rig, points, measured, inverse(guess)), threshold)
+    nearer = _polish(rig, points, measured, _approach(rig, points, measured, guess), threshold)
     if nearer.inliers.sum() >= max(clear, float(first.inliers.sum())):
         return nearer
     if len(points) < MINIMAL_POINTS:
         return first
-    T_left_world = _best_hypothesis(rig, points, measured, threshold, hypotheses, seed)
-    if T_left_world is None:
+    hypothesis = _best_hypothesis(rig, points, measured, threshold, hypotheses, seed)
+    if hypothesis is None:
         return first
-    best = _polish(rig, points, measured, T_left_world, threshold)
+    best = _polish(rig, points, measured, hypothesis, threshold)
     return best if best.inliers.sum() > first.inliers.sum() else first
 
 
 def _best_hypothesis(
     rig: StereoRig, points: Array, measured: Array, threshold: float, hypotheses: int, seed: int
 ) -> Array | None:
-    """The pose T_left_world (4, 4) from three matches with which most matches agree; None where there is none.
+    """The pose (4, 4) from three matches with which most matches agree; None where there is none.
 
     Stops before all hypotheses are tried where a better one is improbable (one in a hundred).
     """
@@ -109,33 +109,33 @@ def _best_hypothesis(
     return best
 
 
-def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> PoseConsensus:
+def _polish(rig: StereoRig, points: Array, measured: Array, T: Array, threshold: float) -> PoseConsensus:
     """Least squares on the matches that agree with a pose, repeated while their number grows."""
-    inliers = _agreement(rig, points, measured, T_left_world[None], threshold)[0]
+    inliers = _agreement(rig, points, measured, T[None], threshold)[0]
     for _ in range(_POLISHING_ROUNDS):
         if inliers.sum() < MINIMAL_POINTS:
             break
-        better = _refined(rig, points, measured, _some(inliers)[None], T_left_world[None], STEPS)[0]
+        better = _refined(rig, points, measured, _some(inliers)[None], T[None], STEPS)[0]
         again = _agreement(rig, points, measured, better[None], threshold)[0]
         if again.sum() < inliers.sum():
             break
-        T_left_world, grown = better, again.sum() > inliers.sum()
+        T, grown = better, again.sum() > inliers.sum()
         inliers = again
         if not grown:
             break
-    return PoseConsensus(inverse(T_left_world), inliers)
+    return PoseConsensus(T, inliers)
 
 
-def _approach(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
-    """A pose T_left_world (4, 4) nearer to the better half of the matches, where the guess is too far off for any."""
+def _approach(rig: StereoRig, points: Array, measured: Array, T: Array) -> Array:
+    """A pose (4, 4) nearer to the better half of the matches, where the guess is too far off for any."""
     for _ in range(_APPROACHES):
-        error = _errors(rig, points, measured, T_left_world[None])[0]
+        error = _errors(rig, points, measured, T[None])[0]
         good = np.isfinite(error)
         if good.sum() < MINIMAL_POINTS:
             break
         rows = _some(good & (error <= median(error[good])))
-        T_left_world = _refined(rig, points, measured, rows[None], T_left_world[None], 2)[0]
-    return T_left_world
+        T = _refined(rig, points, measured, rows[None], T[None], 2)[0]
+    return T
 
 
 def _some(mask: BoolArray) -> NDArray[np.intp]:
@@ -146,40 +146,39 @@ def _some(mask: BoolArray) -> NDArray[np.intp]:
     return rows[np.linspace(0, len(rows) - 1, _ENOUGH).astype(int)]
 
 
-def _refined(
-    rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.intp], T_left_world: Array, steps: int
-) -> Array:
-    """Least-squares poses (H, 4, 4) from poses T_left_world, each by the matches `rows` (H, K)."""
+def _refined(rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.intp], T: Array, steps: int) -> Array:
+    """Least-squares poses (H, 4, 4) from poses T, each by the matches `rows` (H, K)."""
     if rig.is_rectified:
-        from slam.geometry.pnp_kernels import refine_rectified
+        from slam.geometry.pose_kernels import gauss_newton
 
-        T = T_left_world.copy()
-        refine_rectified(rig.rectified_parameters, points, measured, rows, T, steps, _CONVERGED)
+        T, one, nothing = T.copy(), np.eye(3), np.zeros((6, 6))
+        gauss_newton(
+            rig.rectified_parameters, one, points, measured, one[None], rows, nothing, nothing[0], T, np.inf, steps,
+            _CONVERGED,
+        )  # fmt: skip
         return T
-    T = T_left_world
     for _ in range(steps):
         delta = _gauss_newton_steps(rig, points[rows], measured[rows], T)
-        T = exp(delta) @ T
+        T = T @ exp(delta)
         if np.abs(delta).max() < _CONVERGED:
             break
     return T
 
 
 def _minimal_poses(rig: StereoRig, points: Array, measured: Array, triples: NDArray[np.intp]) -> Array:
-    """Poses T_left_world (H, 4, 4) from triples (K, 3) of stereo matches."""
+    """Poses (H, 4, 4) from triples (K, 3) of stereo matches."""
     uv_right = np.stack([measured[:, 2], measured[:, 1]], axis=1)
     local = rig.triangulate(measured[:, :2], uv_right)
     good = np.isfinite(local[triples]).all(axis=(1, 2))
     triples = triples[good]
     if not len(triples):
         return np.zeros((0, 4, 4))
-    poses = rigid_fit(points[triples], local[triples])
-    poses = _refined(rig, points, measured, triples, poses, _REFINEMENTS)
+    poses = _refined(rig, points, measured, triples, rigid_fit(local[triples], points[triples]), _REFINEMENTS)
     return poses[np.isfinite(poses).all(axis=(1, 2))]
 
 
 def _left_poses(rig: StereoRig, points: Array, measured: Array, triples: NDArray[np.intp]) -> Array:
-    """Poses T_left_world (H, 4, 4) from the left pixels of triples (K, 3) of matches: up to four of each (P3P)."""
+    """Poses (H, 4, 4) from the left pixels of triples (K, 3) of matches: up to four of each (P3P)."""
     import cv2
 
     bearings = rig.left.normalise(measured[:, :2])
@@ -189,7 +188,7 @@ def _left_poses(rig: StereoRig, points: Array, measured: Array, triples: NDArray
         for turn, shift in zip(turns, shifts):
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-            poses.append(T)
+            poses.append(inverse(T))
     found = np.array(poses).reshape(-1, 4, 4)
     return found[np.isfinite(found).all(axis=(1, 2))]
 
@@ -208,29 +207,32 @@ def rigid_fit(source: Array, target: Array) -> Array:
     return T
 
 
-def _gauss_newton_steps(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
-    """Steps (H, 6) that reduce the errors of poses T_left_world (H, 4, 4), with a set of matches (H, K, 3) each."""
-    from slam.geometry.pnp_kernels import gauss_newton_steps
+def _gauss_newton_steps(rig: StereoRig, points: Array, measured: Array, T: Array) -> Array:
+    """Steps (H, 6) that reduce the errors of poses (H, 4, 4), with a set of matches (H, K, 3) each; any rig."""
+    local = (points - T[:, None, :3, 3]) @ T[:, :3, :3]
+    z, by_point = rig.project_stereo(local.reshape(-1, 3))
+    residual = (measured - z.reshape(local.shape)).reshape(len(T), -1, 1)
+    J = (by_point @ points_by_pose(local.reshape(-1, 3))).reshape(len(T), -1, 6)
+    J = np.where(np.isfinite(residual), J, 0.0)
+    right = np.swapaxes(J, 1, 2)
+    normal = right @ J
+    normal += (1e-12 + 1e-9 * np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(6)
+    return np.asarray(np.linalg.solve(normal, right @ np.nan_to_num(residual))[:, :, 0])
 
-    local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
-    z, J_point = rig.project_stereo(local.reshape(-1, 3))
-    residual = measured - z.reshape(local.shape)
-    return np.asarray(gauss_newton_steps(local, residual, J_point.reshape(*local.shape, 3)))
 
-
-def _agreement(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> BoolArray:
+def _agreement(rig: StereoRig, points: Array, measured: Array, T: Array, threshold: float) -> BoolArray:
     """Which matches (H, M) reproject within `threshold` [px] under each pose."""
     with np.errstate(invalid="ignore"):
-        return np.asarray(_errors(rig, points, measured, T_left_world) < threshold)
+        return np.asarray(_errors(rig, points, measured, T) < threshold)
 
 
-def _errors(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
+def _errors(rig: StereoRig, points: Array, measured: Array, T: Array) -> Array:
     """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
     if rig.is_rectified:
-        from slam.geometry.pnp_kernels import errors_rectified
+        from slam.geometry.pose_kernels import errors
 
-        return np.asarray(errors_rectified(rig.rectified_parameters, points, measured, T_left_world))
-    local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
+        return np.asarray(errors(rig.rectified_parameters, np.eye(3), points, measured, T))
+    local = (points - T[:, None, :3, 3]) @ T[:, :3, :3]
     z = rig.project_stereo(local.reshape(-1, 3), jacobian=False)[0].reshape(local.shape)
     error = np.abs(measured - z)
     right = error[..., 2]

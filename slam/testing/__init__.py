@@ -76,6 +76,7 @@ RIGHT: Sequence[Check] = (
     estimation.predictions_are_of_landmarks_in_view,
     protocol.estimate_is_in_order,
     protocol.trajectory_has_every_stamp,
+    protocol.recent_poses_fit_the_estimate,
     protocol.results_are_the_callers_own,
     protocol.same_input_same_bytes,
     protocol.removed_landmarks_are_gone,

@@ -51,6 +51,8 @@ def _ask(backend: Backend) -> None:
         backend.estimate(landmarks=False)
         backend.positions(backend.estimate().ids)
         backend.trajectory()
+        if hasattr(backend, "recent"):
+            backend.recent(4)
 
 
 def _require_equal(found: Any, expected: Any, what: str) -> None:

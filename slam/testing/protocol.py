@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -145,6 +146,34 @@ def trajectory_has_every_stamp(factory: Factory) -> None:
     require_same(trajectory.poses[-1], backend.estimate().T_world_left, "last pose of trajectory and estimate", 1e-9)
     for T, truth in zip(trajectory.poses, scene.poses):
         assert_near(T, truth, "trajectory")
+
+
+def recent_poses_fit_the_estimate(factory: Factory) -> None:
+    """If it has `recent`: the last of the poses is the estimate's, and how they moved is as sure as it says."""
+    if not hasattr(factory(RIG, models=MODELS), "recent"):
+        return
+    backend: Any = factory(RIG, models=MODELS)
+    raises(MeasurementError, backend.recent, 1, what="recent before predict")
+    scene = make_scene()
+    backend = tracked(factory, scene)[0].backend
+    raises(MeasurementError, backend.recent, 0, what="recent(0)")
+    pose, stamps = backend.estimate(), DT * np.arange(len(scene.frames))
+    for n in (1, 4, 100):
+        found = backend.recent(n)
+        k = len(found.stamps)
+        require(0 < k <= n, f"recent({n}) returned {k} poses")
+        require_same(found.stamps, stamps[-k:], f"stamps of recent({n})", 1e-9)
+        require_same(found.poses[-1], pose.T_world_left, f"last pose of recent({n}) and the estimate's", 1e-9)
+        scale = 0.01 * float(np.abs(pose.covariance).max())
+        require_same(found.covariance[-6:, -6:], pose.covariance, f"last covariance of recent({n})", scale)
+        assert_covariance(found.covariance, (6 * k, 6 * k), f"recent({n})")
+        A = np.zeros((6, 6 * k))
+        step = se3.inverse(found.poses[0]) @ found.poses[-1]
+        A[:, :6], A[:, -6:] = -se3.adjoint(se3.inverse(step)), A[:, -6:] + np.eye(6)
+        truth = se3.inverse(scene.poses[-k]) @ scene.poses[-1]
+        error = se3.log(se3.inverse(step) @ truth)
+        distance = float(error @ np.linalg.solve(A @ found.covariance @ A.T, error)) if k > 1 else 0.0
+        require(distance < 40, f"over the poses of recent({n}) the motion is off by {distance:.3g} (χ² of six)")
 
 
 def results_are_the_callers_own(factory: Factory) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import invert_symmetric, row_times
+from slam.kernels.linear import invert_symmetric, row_times, turn
 from slam.kernels.se3 import adjoint, between, log, move, transform_back
 from slam.kernels.stereo import by_pose, residual
 from slam.kernels.velocities import velocity_change
@@ -120,11 +120,12 @@ def relative_charts(T, points):
 
 
 @kernel
-def linearise(camera, R_left, poses, column, points, place, E, pose, point, z, weight, H, b):
+def linearise(camera, R_left, poses, column, points, place, E, pose, point, z, weight, whole, H, b):
     """Add the rows' normal equations: their squared whitened residuals (M,), information, gradient and cross.
 
     `camera` (7,) and `R_left` (3, 3) are as in `slam.kernels.stereo`; `z` is (uL, vL, uR) (M, 3), NaN where missing,
-    and `weight` 1 / σ (M,), zero for a row that does not count.
+    and `weight` 1 / σ (M,), zero for a row that does not count. Unless
+    `whole`, H is left as it is.
     """
     count, rows = len(points), len(pose)
     information, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
@@ -147,12 +148,14 @@ def linearise(camera, R_left, poses, column, points, place, E, pose, point, z, w
             squares[m] += r[i] * r[i]
             for j in range(3):
                 D[i, j] *= w
-        _add_row(poses, column, place, E, pose[m], point[m], q, r, D, J, Jp, H, b, information, gradient, cross[m])
+        _add_row(
+            poses, column, place, E, pose[m], point[m], q, r, D, J, Jp, whole, H, b, information, gradient, cross[m]
+        )  # fmt: skip
     return squares, information, gradient, cross
 
 
 @helper
-def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, H, b, information, gradient, cross):
+def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, whole, H, b, information, gradient, cross):
     """Add one row: residual r (3,), predicted numbers that change by D (3, 3) with the point q in the camera."""
     T = poses[k]
     free = place[p] != KNOWN
@@ -172,7 +175,7 @@ def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, H, b, information, g
         by_pose(D[i], q, J[i])
     for a in range(6):
         b[at + a] += J[0, a] * r[0] + J[1, a] * r[1] + J[2, a] * r[2]
-        for c in range(a + 1):
+        for c in range(a + 1 if whole else 0):
             H[at + a, at + c] += J[0, a] * J[0, c] + J[1, a] * J[1, c] + J[2, a] * J[2, c]
         if free:
             for c in range(3):
@@ -180,7 +183,9 @@ def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, H, b, information, g
 
 
 @kernel
-def place_rows(poses, column, points, place, E, pose, point, basis, origin, root, H, b, information, gradient):
+def place_rows(
+    poses, column, points, place, E, pose, point, basis, origin, root, whole, H, b, information, gradient
+):  # fmt: skip
     """Add points known relative to a pose: ``root ((α, β, ρ) − origin)`` of each is unit noise. See `linearise`.
 
     `basis` (Q, 3, 3) is each row's chart in the pose's axes, `origin` (Q, 3) where the point stood in it, and `root`
@@ -198,7 +203,9 @@ def place_rows(poses, column, points, place, E, pose, point, basis, origin, root
             cost += r[i] * r[i]
             for j in range(3):
                 W[i, j] = root[m, i, 0] * D[0, j] + root[m, i, 1] * D[1, j] + root[m, i, 2] * D[2, j]
-        _add_row(poses, column, place, E, pose[m], point[m], q, r, W, J, Jp, H, b, information, gradient, cross[m])
+        _add_row(
+            poses, column, place, E, pose[m], point[m], q, r, W, J, Jp, whole, H, b, information, gradient, cross[m]
+        )  # fmt: skip
     return cost, cross
 
 
@@ -224,7 +231,7 @@ def own_priors(points, place, E, mean, own, information, gradient):
 
 
 @kernel
-def eliminate(column, place, pose, cross, first, order, information, gradient, H, b):
+def eliminate(column, place, pose, cross, first, order, information, gradient, whole, H, b):
     """Take points into H and b: those of the prior as unknowns, the others eliminated.
 
     Returns inverses (N, 3, 3) of the information of points that are eliminated.
@@ -235,9 +242,9 @@ def eliminate(column, place, pose, cross, first, order, information, gradient, H
         if d >= 0:
             for i in range(3):
                 b[3 * d + i] += gradient[p, i]
-                for j in range(i + 1):
+                for j in range(i + 1 if whole else 0):
                     H[3 * d + i, 3 * d + j] += information[p, i, j]
-            for o in range(first[p], first[p + 1]):
+            for o in range(first[p], first[p + 1] if whole else 0):
                 m = order[o]
                 at = column[pose[m]]
                 if at >= 0:
@@ -264,7 +271,7 @@ def eliminate(column, place, pose, cross, first, order, information, gradient, H
                     b[at + i] -= cross[m, i, 0] * v[0] + cross[m, i, 1] * v[1] + cross[m, i, 2] * v[2]
                     for j in range(3):
                         W[i, j] = cross[m, i, 0] * S[0, j] + cross[m, i, 1] * S[1, j] + cross[m, i, 2] * S[2, j]
-                for o2 in range(first[p], first[p + 1]):
+                for o2 in range(first[p], first[p + 1] if whole else 0):
                     m2 = order[o2]
                     to = column[pose[m2]]
                     if to < 0 or to > at:
@@ -405,107 +412,15 @@ def _displace(p, E, d, out):
 
 
 @kernel
-def point_relations(T, points, place, E, pose, cross, first, order, column, inverse, X, P_poses, newest, prior):
-    """Covariances (N, 3, 3) of points in the coordinates of a pose T (4, 4), and in the world.
-
-    T's unknowns begin at `newest`; `X` (n, n) is ``L⁻¹`` of the normal equations' Cholesky factor, `P_poses` (6 F, 6 F)
-    the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse` is by `eliminate`.
-    """
-    count, n = len(points), len(X)
-    camera, world = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
-    own, by = np.empty((3, 3)), np.empty((3, 6))
-    A, AP = np.zeros((3, len(P_poses))), np.zeros((3, len(P_poses)))
-    q, D, G, tmp = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 3))
-    at = newest - prior
-    for p in range(count):
-        d = place[p]
-        if d >= 0:
-            for i in range(3):
-                for j in range(i + 1):
-                    total = 0.0
-                    for row in range(3 * d + i, n):
-                        total += X[row, 3 * d + i] * X[row, 3 * d + j]
-                    own[i, j] = own[j, i] = total
-                for j in range(6):
-                    total = 0.0
-                    for row in range(newest + j, n):
-                        total += X[row, 3 * d + i] * X[row, newest + j]
-                    by[i, j] = total
-        elif d == ELIMINATED and inverse[p, 0, 0] > 0.0:
-            for i in range(3):
-                for j in range(len(P_poses)):
-                    A[i, j] = 0.0
-            for o in range(first[p], first[p + 1]):
-                m = order[o]
-                to = column[pose[m]] - prior
-                if column[pose[m]] < 0:
-                    continue
-                for i in range(3):
-                    for j in range(6):
-                        for a in range(3):
-                            A[i, to + j] -= inverse[p, i, a] * cross[m, j, a]
-            for i in range(3):
-                for j in range(len(P_poses)):
-                    AP[i, j] = 0.0
-            for i in range(3):
-                for a in range(len(P_poses)):
-                    if A[i, a] != 0.0:
-                        for j in range(len(P_poses)):
-                            AP[i, j] += A[i, a] * P_poses[a, j]
-            for i in range(3):
-                for j in range(3):
-                    total = inverse[p, i, j]
-                    for a in range(len(P_poses)):
-                        total += AP[i, a] * A[j, a]
-                    own[i, j] = total
-                for j in range(6):
-                    by[i, j] = AP[i, at + j]
-        else:
-            continue
-        _congruent(E[p], own, tmp, world[p])
-        # q = Rᵀ (p − t): δq = Rᵀ E d + hat(q) ω − v
-        for i in range(3):
-            q[i] = 0.0
-            for k in range(3):
-                q[i] += T[k, i] * (points[p, k] - T[k, 3])
-            for j in range(3):
-                D[i, j] = T[0, i] * E[p, 0, j] + T[1, i] * E[p, 1, j] + T[2, i] * E[p, 2, j]
-        G[0, 1], G[0, 2], G[1, 2] = -q[2], q[1], -q[0]
-        G[1, 0], G[2, 0], G[2, 1] = q[2], -q[1], q[0]
-        G[0, 3] = G[1, 4] = G[2, 5] = -1.0
-        _congruent(D, own, tmp, camera[p])
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for a in range(6):
-                    for c in range(3):
-                        total += D[i, c] * by[c, a] * G[j, a] + G[i, a] * by[c, a] * D[j, c]
-                    for c in range(6):
-                        total += G[i, a] * P_poses[at + a, at + c] * G[j, c]
-                camera[p, i, j] += total
-    return camera, world
-
-
-@helper
-def _congruent(D, S, tmp, out):
-    """``D S Dᵀ`` into out (3, 3)."""
-    for i in range(3):
-        for j in range(3):
-            tmp[i, j] = D[i, 0] * S[0, j] + D[i, 1] * S[1, j] + D[i, 2] * S[2, j]
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = tmp[i, 0] * D[j, 0] + tmp[i, 1] * D[j, 1] + tmp[i, 2] * D[j, 2]
-
-
-@kernel
-def left_out_distances(camera, R_left, T, points, z, covariances, sigma):
+def left_out_distances(camera, R_left, T, points, z, covariances, sigma, least=0.0):
     """Squared distance (M,) of each row from what all others predict for it, at the solution, with 3 or 2 numbers.
 
     With r the residual, ``rᵀ (σ² 1 − J C Jᵀ)⁻¹ r``, C the point's covariance (3, 3) in the newest camera T, in which
-    the row itself takes part. ∞ where the point is not in front of the camera.
+    the row itself takes part. ∞ where the point is not in front of the camera, or where a residual has less than the
+    share `least` of the row's noise.
     """
     out, q, r, D = np.empty(len(points)), np.empty(3), np.empty(3), np.empty((3, 3))
-    S, tmp, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    S, inverse = np.empty((3, 3)), np.empty((3, 3))
     for m in range(len(points)):
         transform_back(T, points[m], q)
         if not residual(camera, R_left, q, z[m], r, D):
@@ -513,7 +428,7 @@ def left_out_distances(camera, R_left, T, points, z, covariances, sigma):
             continue
         if np.isnan(r[2]):
             r[2] = D[2, 0] = D[2, 1] = D[2, 2] = 0.0
-        _congruent(D, covariances[m], tmp, S)
+        turn(D, covariances[m], S)
         for i in range(3):
             for j in range(3):
                 S[i, j] = (sigma * sigma if i == j else 0.0) - S[i, j]
@@ -523,33 +438,9 @@ def left_out_distances(camera, R_left, T, points, z, covariances, sigma):
         total = 0.0
         for i in range(3):
             total += r[i] * row_times(inverse, i, r)
-        out[m] = total if total >= 0.0 else np.inf
+        tested = min(S[0, 0], S[1, 1], S[2, 2]) >= least * sigma * sigma
+        out[m] = total if tested and total >= 0.0 else np.inf
     return out
-
-
-@kernel
-def lower_inverse(L):
-    """``L⁻¹`` of a lower triangular L (n, n), by blocks that double in size."""
-    n, size = len(L), 32
-    X = np.zeros((n, n))
-    for start in range(0, n, size):
-        stop = min(start + size, n)
-        for j in range(start, stop):
-            X[j, j] = 1.0 / L[j, j]
-            for i in range(j + 1, stop):
-                total = 0.0
-                for k in range(j, i):
-                    total += L[i, k] * X[k, j]
-                X[i, j] = -total / L[i, i]
-    while size < n:
-        for start in range(0, n - size, 2 * size):
-            middle, stop = start + size, min(start + 2 * size, n)
-            below = np.ascontiguousarray(L[middle:stop, start:middle])
-            first = np.ascontiguousarray(X[start:middle, start:middle])
-            last = np.ascontiguousarray(X[middle:stop, middle:stop])
-            X[middle:stop, start:middle] = -np.dot(last, np.dot(below, first))
-        size *= 2
-    return X
 
 
 @kernel
@@ -557,12 +448,14 @@ def chart_changes(T, points, basis, E):
     """How coordinates in charts `basis` (D, 3, 3) from a pose T (4, 4) change with those of other charts, and with T.
 
     Returns present coordinates (D, 3), derivatives (D, 3, 3) by the coordinates of which E are the points' derivatives,
-    and (D, 3, 6) by the pose.
+    and (D, 3, 6) by the pose; NaN for a point behind its chart.
     """
     origin, change, by = np.empty((len(points), 3)), np.empty((len(points), 3, 3)), np.empty((len(points), 3, 6))
     q, D, zero, row = np.empty(3), np.empty((3, 3)), np.zeros(3), np.empty(3)
     for d in range(len(points)):
-        _chart(T, points[d], basis[d], zero, q, origin[d], D)
+        if not _chart(T, points[d], basis[d], zero, q, origin[d], D):
+            origin[d] = np.nan
+            D[:] = np.nan
         for i in range(3):
             by_pose(D[i], q, by[d, i])
             for k in range(3):
@@ -570,55 +463,3 @@ def chart_changes(T, points, basis, E):
             for j in range(3):
                 change[d, i, j] = row[0] * E[d, 0, j] + row[1] * E[d, 1, j] + row[2] * E[d, 2, j]
     return origin, change, by
-
-
-@kernel
-def schur_complement(H, b, gone, stay):
-    """Marginalise the unknowns `gone` (g,), ascending, out of ``H x = b``; the others are `stay` (s,), in any order.
-
-    Returns ``H_ss − H_sg H_gg⁻¹ H_gs`` (s, s), ``b_s − H_sg H_gg⁻¹ b_g`` (s,), ``H_gg⁻¹ b_g`` (g,) and ``H_gg⁻¹ H_gs``
-    (g, s), all symmetric parts whole; NaN where H_gg is not positive definite.
-    """
-    g, s = len(gone), len(stay)
-    L, W, v = np.empty((g, g)), np.empty((g, s)), np.empty(g)
-    for i in range(g):
-        for j in range(i + 1):
-            L[i, j] = H[gone[i], gone[j]]
-        L[i, i] *= 1.0 + 1e-13  # numerics: keeps what nothing measures positive
-        v[i] = b[gone[i]]
-        for j in range(s):
-            W[i, j] = H[gone[i], stay[j]] if gone[i] >= stay[j] else H[stay[j], gone[i]]
-    for i in range(g):  # Cholesky's factor, and L⁻¹ times the rest
-        for j in range(i + 1):
-            total = L[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
-        for k in range(i):
-            x = L[i, k]
-            v[i] -= x * v[k]
-            for j in range(s):
-                W[i, j] -= x * W[k, j]
-        x = 1.0 / L[i, i]
-        v[i] *= x
-        for j in range(s):
-            W[i, j] *= x
-    information, vector = np.dot(W.T, -W), np.empty(s)
-    for i in range(s):
-        total = b[stay[i]]
-        for k in range(g):
-            total -= W[k, i] * v[k]
-        vector[i] = total
-        for j in range(s):
-            information[i, j] += H[stay[i], stay[j]] if stay[i] >= stay[j] else H[stay[j], stay[i]]
-    for i in range(g - 1, -1, -1):
-        for k in range(i + 1, g):
-            x = L[k, i]
-            v[i] -= x * v[k]
-            for j in range(s):
-                W[i, j] -= x * W[k, j]
-        x = 1.0 / L[i, i]
-        v[i] *= x
-        for j in range(s):
-            W[i, j] *= x
-    return information, vector, v, W

@@ -8,7 +8,7 @@ import numpy as np
 
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.se3 import adjoint, inverse
-from slam.window import kernels
+from slam.window import covariance_kernels, kernels
 from slam.window.problem import RelativePrior, Window
 from slam.window.solver import linearised
 
@@ -61,7 +61,9 @@ def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrio
     e = linearised(w, reference)
     points = np.concatenate([leaving, np.zeros(len(w.joining), bool)])
     gone = np.concatenate([np.repeat(points, 3), np.repeat(np.arange(len(w.poses)) == pose, 6)])
-    information, vector, mean, gain = kernels.schur_complement(e.H, e.b, np.flatnonzero(gone), np.flatnonzero(~gone))
+    information, vector, mean, gain = covariance_kernels.schur_complement(
+        e.H, e.b, np.flatnonzero(gone), np.flatnonzero(~gone)
+    )
     if not (np.isfinite(mean).all() and np.isfinite(e.cost)):
         raise np.linalg.LinAlgError("what leaves a window cannot be marginalised")
     E = e.E[w.members]
@@ -74,6 +76,8 @@ def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrio
     else:
         basis = w.basis[~points]
     origin, change, by = kernels.chart_changes(poses[0], w.points[members], basis, conditional.stayed)
+    if not np.isfinite(origin).all():
+        raise np.linalg.LinAlgError("a point of the prior is behind its chart")
     if reference:  # coordinates from another pose
         back = np.linalg.inv(change)
         rows = (np.swapaxes(back, 1, 2) @ information[: 3 * D].reshape(D, 3, n)).reshape(3 * D, n)

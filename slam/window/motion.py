@@ -10,27 +10,25 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.geometry.arrays import BoolArray
 from slam.geometry.se3 import Array, pose, so3_exp, so3_left_jacobian, so3_log
 from slam.models import EstimatorModels
 
 LONGEST = 1000.0  # guard: time [s] after which a camera can be anywhere; more would only exhaust the digits
-_RATIO = 1e4  # numerics: of an interval to the one before it, from which on the earlier velocity tells nothing
+RATIO = 1e4  #: numerics: of an interval to the one before it, from which on the earlier velocity tells nothing
 
 
-def velocity_sigmas(models: EstimatorModels, dt: float, first: bool) -> Array:
-    """Standard deviations (6,) of the change of [ω, v] over `dt` [s]; of the velocity itself in the first interval."""
-    linear, angular = models.motion.velocity_variance(dt)
-    variances = np.repeat([angular, linear], 3)
-    if first:
-        variances = variances + np.repeat(
-            [models.initial_angular_velocity_sigma**2, models.initial_velocity_sigma**2], 3
-        )
-    return np.sqrt(variances)
+def velocity_sigmas(models: EstimatorModels, dt: float | Array, first: bool | BoolArray) -> Array:
+    """Standard deviations (…, 6) of the change of [ω, v] over `dt` [s]; in the first interval, of the velocity."""
+    linear, angular = models.motion.velocity_variance(1.0)  # they grow as time does
+    jump = np.asarray(dt)[..., None] * np.array([angular, linear])
+    start = np.asarray(first)[..., None] * [models.initial_angular_velocity_sigma, models.initial_velocity_sigma]
+    return np.asarray(np.sqrt(np.repeat(jump + start**2, 3, axis=-1)))
 
 
 def is_first(before: float | None, dt: float) -> bool:
     """Whether the velocity over `dt` [s] is taken for unknown: no interval is before it, or one that is far shorter."""
-    return before is None or dt > _RATIO * before
+    return before is None or dt > RATIO * before
 
 
 def predict(T0: Array, T1: Array, dt01: float, dt12: float) -> tuple[Array, Array, Array, Array]:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.data import BoolArray
+from slam.geometry import pose_kernels as kernels
 from slam.geometry.pnp import STEPS
 from slam.geometry.se3 import Array, inverse, log
-from slam.window import pose_kernels as kernels
 from slam.window.gating import chi_square_gate, whiteners
 from slam.window.stereo import RectifiedStereo
 
@@ -59,10 +59,25 @@ def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
     return T, used
 
 
+def least_squares(problem: PoseProblem, start: Array) -> tuple[Array, Array]:
+    """Pose (4, 4) by all measurements that are in front of the camera, and its covariance (6, 6).
+
+    Raises:
+        numpy.linalg.LinAlgError: nothing determines it.
+    """
+    whitener = _whiteners(problem.noise, problem.z)
+    T = _gauss_newton(problem, whitener, start, np.ones(len(problem.z), bool))
+    _, J = residuals(problem, T)
+    G = (whitener @ J).reshape(-1, 6)
+    if not np.isfinite(T).all():
+        raise np.linalg.LinAlgError("nothing determines the pose")
+    return T, np.linalg.inv(problem.information + G.T @ G)
+
+
 def residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
     """Measured less predicted (M, 3), NaN where missing, and the prediction's Jacobians (M, 3, 6) by the pose."""
     stereo = problem.stereo
-    r, J = kernels.residuals(stereo.intrinsics, stereo.rectified_rig.R_left, problem.points, problem.z, T)
+    r, J = kernels.residuals(stereo.intrinsics, stereo.R_left, problem.points, problem.z, T)
     return r, J
 
 
@@ -81,14 +96,13 @@ def _whiteners(noise: Array, z: Array) -> Array:
 
 def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: BoolArray | None) -> Array:
     """Pose by Gauss-Newton with the prediction as prior; with Huber weights where `used` is None."""
-    stereo = problem.stereo
-    prior = log(inverse(problem.predicted) @ start)
-    robust = used is None
-    counted = np.ones(len(problem.points), bool) if used is None else used
-    return np.asarray(kernels.gauss_newton(
-        stereo.intrinsics, stereo.rectified_rig.R_left, problem.points, problem.z, whitener, counted,
-        problem.information, prior, start, _HUBER if robust else np.inf, STEPS, _CONVERGED,
-    ))  # fmt: skip
+    stereo, T = problem.stereo, start[None].copy()
+    rows = np.arange(len(problem.points)) if used is None else np.flatnonzero(used)
+    kernels.gauss_newton(
+        stereo.intrinsics, stereo.R_left, problem.points, problem.z, whitener, rows[None], problem.information,
+        log(inverse(problem.predicted) @ start), T, _HUBER if used is None else np.inf, STEPS, _CONVERGED,
+    )  # fmt: skip
+    return np.asarray(T[0])
 
 
 def seen_from(T: Array, points: Array, own: Array) -> tuple[Array, Array]:

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from slam.geometry.arrays import Array
-from slam.window import kernels
+from slam.geometry.arrays import Array, IndexArray
+from slam.window import covariance_kernels, kernels
 from slam.window.carried import carried_rows
 from slam.window.problem import Window
 
@@ -17,6 +17,9 @@ _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
 #: numerics: Decrease of the cost by a step with the last factor below which that step is the last; it leaves far less.
 CLOSE = 1e-2
+_NEAR = (
+    50.0  # numerics: the same for a step with a factor of its own, in units of `close`; it leaves the square of that
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +55,21 @@ class NormalEquations:
         Raises:
             numpy.linalg.LinAlgError: H is not positive definite: something is not determined.
         """
+        if not len(self.H):
+            return self.H
         L, info = dpotrf(self.H.T, lower=0, clean=0, overwrite_a=0)
         if info or not np.isfinite(L[-1:, -1:]).all():
             raise np.linalg.LinAlgError("the window's information is not positive definite")
         return np.asarray(L)  # upper triangle, Lᵀ in Fortran's order
 
     def step(self, factor: Array) -> tuple[Array, float]:
-        """Step of the unknowns (n,) by a factor of these or nearby equations, and the decrease of cost it expects."""
-        x = dpotrs(factor, self.b, lower=0)[0]
-        return x, float(x @ self.b)
+        """Step of the unknowns (n,) by a factor of these or nearby equations, and the decrease of cost it expects.
+
+        That is of the points that are eliminated, too, which step with them.
+        """
+        x = dpotrs(factor, self.b, lower=0)[0] if len(self.b) else self.b
+        points = np.einsum("ni,nij,nj->", self.gradient, self.inverse, self.gradient)
+        return x, float(x @ self.b + points)
 
     def after(self, x: Array) -> Window:
         """The window after a step of the unknowns."""
@@ -99,6 +108,7 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
         rows.point,
         rows.z,
         rows.weight,
+        whole,
         H,
         b,
     )
@@ -106,8 +116,8 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
     if len(w.places):
         p = w.places
         more, its = kernels.place_rows(
-            w.poses, w.column, w.points, w.place, E, p.pose, p.point, p.basis, p.origin, p.root, H, b, information,
-            gradient,
+            w.poses, w.column, w.points, w.place, E, p.pose, p.point, p.basis, p.origin, p.root, whole, H, b,
+            information, gradient,
         )  # fmt: skip
         cost, cross = cost + more, np.concatenate([cross, its])
     if w.information is not None and w.mean is not None:
@@ -120,7 +130,9 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
         cost += carried_rows(
             w.poses, w.column, c.cameras, c.covariance, c.poses, c.interval, c.mean, c.variance, H, b
         )  # fmt: skip
-    inverse = kernels.eliminate(w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, H, b)
+    inverse = kernels.eliminate(
+        w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, whole, H, b
+    )  # fmt: skip
     return NormalEquations(w, H, b, cost, squares, E, inverse, gradient, cross)
 
 
@@ -167,7 +179,7 @@ class Solution:
     @cached_property
     def inverse_factor(self) -> Array:
         """``L⁻¹`` (n, n), lower triangular."""
-        return np.asarray(kernels.lower_inverse(self.equations.factor.T))
+        return np.asarray(covariance_kernels.lower_inverse(self.equations.factor.T))
 
     @cached_property
     def pose_covariance(self) -> Array:
@@ -176,12 +188,18 @@ class Solution:
         X = self.inverse_factor[first:, first:]
         return np.asarray(X.T @ X)
 
-    def point_covariances(self, pose: int) -> tuple[Array, Array]:
-        """Covariances (N, 3, 3) of points in the coordinates of a pose, and in the world; zero for known ones."""
+    def point_covariances(self, pose: int, points: IndexArray | None = None) -> tuple[Array, Array]:
+        """Covariances (N, 3, 3) of points in the coordinates of a pose, and in the world; zero for known ones.
+
+        Args:
+            pose: which.
+            points: these alone (N,); None for all.
+        """
         w, e = self.window, self.equations
-        return kernels.point_relations(
+        chosen = np.arange(len(w.points)) if points is None else points
+        return covariance_kernels.point_relations(
             w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,
-            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members),
+            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members), chosen,
         )  # fmt: skip
 
 
@@ -197,7 +215,9 @@ def solve(window: Window, close: float = CLOSE) -> Solution:
     """
     now = linearised(window)
     for taken in range(1, _STEPS + 1):
-        x, _ = now.step(now.factor)
+        x, rest = now.step(now.factor)
+        if rest < _NEAR * close:
+            return Solution(now.after(x), now, now.cost - rest, taken)
         following = _descended(now, x)
         if following is None:
             return Solution(now.window, now, now.cost, taken)

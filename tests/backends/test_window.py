@@ -168,3 +168,17 @@ def test_blind_for_longer_than_the_window_landmarks_become_as_uncertain_as_in_th
                 backend.add(seen) if not k else backend.update(seen)
         deviations[name] = np.median(np.sqrt(np.trace(prediction.innovation, axis1=1, axis2=2)))
     assert deviations["window"] == pytest.approx(deviations["smoother"], rel=0.05)
+
+
+def test_landmarks_known_in_the_world_stay_known_beyond_the_priors_limit():
+    deviations = []
+    for limit in (5, 150):
+        backend = backends.create("window", RIG, models=EstimatorModels(pixel_sigma=0.5), landmarks=limit)
+        poses = path(40, 0.1, np.array([0.0, 0.0, 0.1]), np.zeros(3))
+        rng = np.random.default_rng(0)
+        points, known = cloud(poses, 40, rng), set(range(40))
+        backend.insert(np.arange(40), points, np.tile(1e-6 * np.eye(3), (40, 1, 1)))
+        for k, T in enumerate(poses):
+            step(backend, 0.1 * k, observe(T, points, 0.5, rng), known)
+        deviations.append(np.sqrt(np.trace(backend.estimate().covariance[3:, 3:])))
+    assert deviations[0] < 2 * deviations[1]

@@ -9,16 +9,17 @@ import numpy as np
 from slam.data import StereoFeatures
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import Matches, match_everywhere
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
+from slam.window.pose_only import PoseProblem, least_squares
+from slam.window.stereo import RectifiedStereo
 
-_ROUNDS = 5  # numerics: most iterations of least squares
-_CONVERGED = 1e-6  # numerics: step [rad], [m]
+_ROUNDS = 2  # numerics: of least squares, with the points' noise in the pixels as seen from the last pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +92,7 @@ def refined_pose(
     Both frames have noise: the points' covariance is propagated to the present pixels.
 
     Args:
-        rig: the cameras.
+        rig: the cameras, rectified.
         points: in the earlier camera's coordinates (M, 3) [m].
         measured: (uL, vL, uR) (M, 3) [px] in the present frame; uR NaN where there is no right pixel.
         T_world_left: initial guess of the present camera's pose in the earlier one's coordinates (4, 4).
@@ -100,26 +101,14 @@ def refined_pose(
     Raises:
         LinAlgError: these points do not determine the pose.
     """
-    P = rig.triangulation_covariance(points, pixel_sigma)
-    T, normal = T_world_left, np.eye(6)
-    missing = np.isnan(measured[:, 2])
+    stereo, T = RectifiedStereo.of(rig), T_world_left
+    P: Array = np.eye(6)
+    z, own = measured - [0.0, 0.0, stereo.doffs], rig.triangulation_covariance(points, pixel_sigma)
     for _ in range(_ROUNDS):
-        local = transform(inverse(T), points)
-        z, H = rig.project_stereo(local)
-        J = H @ points_by_pose(local)
-        HR = H @ T[:3, :3].T
-        S, error = pixel_sigma**2 * np.eye(3) + HR @ P @ np.swapaxes(HR, 1, 2), measured - z
-        J[missing, 2] = error[missing, 2] = 0
-        S[missing, 2, :] = S[missing, :, 2] = [0, 0, 1]
-        W = np.linalg.inv(S)
-        good = np.isfinite(z).all(axis=1)
-        JW = np.swapaxes(J, 1, 2)[good] @ W[good]
-        normal = (JW @ J[good]).sum(axis=0)
-        step = np.linalg.solve(normal, (JW @ error[good][:, :, None]).sum(axis=0)[:, 0])
-        T = T @ exp(step)
-        if np.abs(step).max() < _CONVERGED:
-            break
-    return T, np.linalg.inv(normal)
+        H = rig.project_stereo(transform(inverse(T), points))[1] @ T[:3, :3].T
+        noise = pixel_sigma**2 * np.eye(3) + H @ own @ np.swapaxes(H, 1, 2)
+        T, P = least_squares(PoseProblem(stereo, points, z, noise, T, np.zeros((6, 6)), 1.0), T)
+    return T, P
 
 
 def _rows(keyframe: Keyframe) -> LandmarkTable:

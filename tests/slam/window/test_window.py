@@ -7,7 +7,7 @@ import pytest
 
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.window import kernels, solver
+from slam.window import covariance_kernels, kernels, solver
 from slam.window.marginal import marginalised
 from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.solver import linearised
@@ -166,6 +166,17 @@ def test_a_fixed_pose_stays():
     np.testing.assert_array_equal(found.window.poses[0], w.poses[0])
     free = solve(window())
     np.testing.assert_allclose(found.window.poses, free.window.poses, atol=1e-5)
+    for mine, its in zip(found.point_covariances(0), free.point_covariances(0)):
+        np.testing.assert_allclose(mine, its, rtol=1e-3, atol=1e-3 * np.trace(its, axis1=1, axis2=2).max())
+
+
+def test_points_alone():
+    """All poses are fixed: each point is solved for by itself."""
+    w = solve(window()).window
+    found = solve(replace(w, prior=RelativePrior.none(), free=np.zeros(POSES, bool), points=1.01 * w.points))
+    np.testing.assert_allclose(found.window.points, w.points, atol=1e-4)
+    world, n = found.point_covariances(0, np.array([3]))[1], 6 * POSES
+    np.testing.assert_allclose(world[0], np.linalg.inv(dense(w)[n + 9 : n + 12, n + 9 : n + 12]), rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("leaves", [0, 1])
@@ -222,4 +233,4 @@ def test_triangular_inverse():
     rng = np.random.default_rng(0)
     for n in (1, 5, 31, 32, 33, 64, 130):
         L = np.tril(rng.standard_normal((n, n))) + 5 * np.eye(n)
-        np.testing.assert_allclose(kernels.lower_inverse(L) @ L, np.eye(n), atol=1e-12)
+        np.testing.assert_allclose(covariance_kernels.lower_inverse(L) @ L, np.eye(n), atol=1e-12)

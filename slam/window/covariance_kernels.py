@@ -1,0 +1,168 @@
+"""Compiled loops over a window's normal equations once they are solved: covariances, and what leaves the window.
+
+The arrays are those of `slam.window.kernels`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.kernels.linear import turn
+from slam.kernels.se3 import transform_back
+from slam.runtime.compilation import kernel
+from slam.window.kernels import ELIMINATED
+
+
+@kernel
+def point_relations(T, points, place, E, pose, cross, first, order, column, inverse, X, P_poses, newest, prior, chosen):
+    """Covariances of the points `chosen` (C,) in the coordinates of a pose T (4, 4), and in the world (C, 3, 3) each.
+
+    T's unknowns begin at `newest`, −1 where it is fixed; `X` (n, n) is ``L⁻¹`` of the normal equations' Cholesky
+    factor, `P_poses` (6 F, 6 F) the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse`
+    is by `eliminate`.
+    """
+    n, size, at = len(X), len(P_poses), newest - prior
+    camera, world = np.zeros((len(chosen), 3, 3)), np.zeros((len(chosen), 3, 3))
+    own, by = np.empty((3, 3)), np.zeros((3, 6))
+    A, AP = np.zeros((3, size)), np.zeros((3, size))
+    q, D, G, tmp = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 3))
+    for c in range(len(chosen)):
+        p = chosen[c]
+        d = place[p]
+        if d >= 0:
+            for i in range(3):
+                for j in range(i + 1):
+                    total = 0.0
+                    for row in range(3 * d + i, n):
+                        total += X[row, 3 * d + i] * X[row, 3 * d + j]
+                    own[i, j] = own[j, i] = total
+                for j in range(6 if newest >= 0 else 0):
+                    total = 0.0
+                    for row in range(newest + j, n):
+                        total += X[row, 3 * d + i] * X[row, newest + j]
+                    by[i, j] = total
+        elif d == ELIMINATED and inverse[p, 0, 0] > 0.0:
+            A[:], AP[:] = 0.0, 0.0
+            for o in range(first[p], first[p + 1]):
+                m = order[o]
+                to = column[pose[m]] - prior
+                for i in range(3 if column[pose[m]] >= 0 else 0):
+                    for j in range(6):
+                        for a in range(3):
+                            A[i, to + j] -= inverse[p, i, a] * cross[m, j, a]
+            for i in range(3):
+                for a in range(size):
+                    if A[i, a] != 0.0:
+                        for j in range(size):
+                            AP[i, j] += A[i, a] * P_poses[a, j]
+                for j in range(6 if newest >= 0 else 0):
+                    by[i, j] = AP[i, at + j]
+            for i in range(3):
+                for j in range(3):
+                    total = inverse[p, i, j]
+                    for a in range(size):
+                        total += AP[i, a] * A[j, a]
+                    own[i, j] = total
+        else:
+            continue
+        turn(E[p], own, world[c])
+        # q = Rᵀ (p − t): δq = Rᵀ E d + hat(q) ω − v
+        transform_back(T, points[p], q)
+        for i in range(3):
+            for j in range(3):
+                D[i, j] = T[0, i] * E[p, 0, j] + T[1, i] * E[p, 1, j] + T[2, i] * E[p, 2, j]
+        turn(D, own, camera[c])
+        if newest < 0:
+            continue
+        G[0, 1], G[0, 2], G[1, 2] = -q[2], q[1], -q[0]
+        G[1, 0], G[2, 0], G[2, 1] = q[2], -q[1], q[0]
+        G[0, 3] = G[1, 4] = G[2, 5] = -1.0
+        for i in range(3):
+            for j in range(3):
+                tmp[i, j] = 0.0
+                for a in range(6):
+                    for k in range(3):
+                        tmp[i, j] += D[i, k] * by[k, a] * G[j, a]
+                    for k in range(6):
+                        tmp[i, j] += 0.5 * G[i, a] * P_poses[at + a, at + k] * G[j, k]
+        for i in range(3):
+            for j in range(3):
+                camera[c, i, j] += tmp[i, j] + tmp[j, i]
+    return camera, world
+
+
+@kernel
+def lower_inverse(L):
+    """``L⁻¹`` of a lower triangular L (n, n), by blocks that double in size."""
+    n, size = len(L), 32
+    X = np.zeros((n, n))
+    for start in range(0, n, size):
+        stop = min(start + size, n)
+        for j in range(start, stop):
+            X[j, j] = 1.0 / L[j, j]
+            for i in range(j + 1, stop):
+                total = 0.0
+                for k in range(j, i):
+                    total += L[i, k] * X[k, j]
+                X[i, j] = -total / L[i, i]
+    while size < n:
+        for start in range(0, n - size, 2 * size):
+            middle, stop = start + size, min(start + 2 * size, n)
+            below = np.ascontiguousarray(L[middle:stop, start:middle])
+            first = np.ascontiguousarray(X[start:middle, start:middle])
+            last = np.ascontiguousarray(X[middle:stop, middle:stop])
+            X[middle:stop, start:middle] = -np.dot(last, np.dot(below, first))
+        size *= 2
+    return X
+
+
+@kernel
+def schur_complement(H, b, gone, stay):
+    """Marginalise the unknowns `gone` (g,), ascending, out of ``H x = b``; the others are `stay` (s,), in any order.
+
+    Returns ``H_ss − H_sg H_gg⁻¹ H_gs`` (s, s), ``b_s − H_sg H_gg⁻¹ b_g`` (s,), ``H_gg⁻¹ b_g`` (g,) and ``H_gg⁻¹ H_gs``
+    (g, s), all symmetric parts whole; NaN where H_gg is not positive definite.
+    """
+    g, s = len(gone), len(stay)
+    L, W, v = np.empty((g, g)), np.empty((g, s)), np.empty(g)
+    for i in range(g):
+        for j in range(i + 1):
+            L[i, j] = H[gone[i], gone[j]]
+        L[i, i] *= 1.0 + 1e-13  # numerics: keeps what nothing measures positive
+        v[i] = b[gone[i]]
+        for j in range(s):
+            W[i, j] = H[gone[i], stay[j]] if gone[i] >= stay[j] else H[stay[j], gone[i]]
+    for i in range(g):  # Cholesky's factor, and L⁻¹ times the rest
+        for j in range(i + 1):
+            total = L[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+        for k in range(i):
+            x = L[i, k]
+            v[i] -= x * v[k]
+            for j in range(s):
+                W[i, j] -= x * W[k, j]
+        x = 1.0 / L[i, i]
+        v[i] *= x
+        for j in range(s):
+            W[i, j] *= x
+    information, vector = np.dot(W.T, -W), np.empty(s)
+    for i in range(s):
+        total = b[stay[i]]
+        for k in range(g):
+            total -= W[k, i] * v[k]
+        vector[i] = total
+        for j in range(s):
+            information[i, j] += H[stay[i], stay[j]] if stay[i] >= stay[j] else H[stay[j], stay[i]]
+    for i in range(g - 1, -1, -1):
+        for k in range(i + 1, g):
+            x = L[k, i]
+            v[i] -= x * v[k]
+            for j in range(s):
+                W[i, j] -= x * W[k, j]
+        x = 1.0 / L[i, i]
+        v[i] *= x
+        for j in range(s):
+            W[i, j] *= x
+    return information, vector, v, W
