@@ -16,7 +16,7 @@ from backends.ekf.motion import Motion, advanced, at_rest, motion_noise, turning
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import Problem, UnsolvableError
 from backends.ekf.state import State
-from slam.checks import require_guess, require_not_measured, require_stamp
+from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
@@ -133,9 +133,9 @@ class EkfBackend:
         """The camera's last n poses, at most five, as they were believed in their time; see `slam.data.RecentPoses`.
 
         Raises:
-            MeasurementError: before the first `predict`.
+            MeasurementError: before the first `predict`, or n is less than one.
         """
-        return self._started("recent").recent_poses(n)
+        return self._started("recent").recent_poses(require_recent("ekf", n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
