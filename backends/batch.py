@@ -20,7 +20,7 @@ from backends.smoother.graph import FAILURES, Problem, Tracks, minimised
 from slam.bounds import require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.options import from_options
@@ -68,7 +68,7 @@ class BatchBackend:
         self.rig = rig
         self.models = models
         self.config = from_options(BatchConfig, "batch", options)
-        self._smoother = SmootherBackend(rig, models, motion=0.0, past=10**6)
+        self._smoother = SmootherBackend(rig, models, motion=0.0, lag=None)
         self._solution: _Solution | None = None
 
     def predict(self, stamp: float) -> Prediction:
@@ -118,6 +118,8 @@ class BatchBackend:
             if serial in solution.landmarks:
                 positions[row] = solution.values.atPoint3(landmark_key(serial))
                 covariances[row] = solution.covariance(landmark_key(serial), covariances[row])
+            elif serial in solution.once:  # it moves with the pose that measured it
+                positions[row] = transform(solution.once[serial], positions[row : row + 1])[0]
         T, P = rough.T_world_left, rough.covariance
         if s.inside:  # else it is predicted only: its measurements are still to come
             T, P = solution.poses[-1].copy(), solution.covariance(pose_key(s.number), P)
@@ -158,6 +160,7 @@ class _Solution:
         values: all variables.
         poses: of the graph (N, 4, 4); those before a restart of the smoother are its own.
         landmarks: serial numbers of the landmarks that are variables.
+        once: how those that are none, but were measured, move with their pose (4, 4), by serial number.
     """
 
     def __init__(self, smoother: SmootherBackend) -> None:
@@ -197,6 +200,13 @@ class _Solution:
         self.values = minimised(problem, _ITERATIONS)
         solved = np.array([self.values.atPose3(pose_key(i)).matrix() for i in numbers])
         self.poses = np.concatenate([s.poses[: s.of(s.begun)], solved])
+        moved = solved @ inverse(s.poses[s.of(s.begun) :])
+        self.once = {
+            serial: moved[number - s.begun]
+            for number in numbers
+            for serial in s.sights[s.of(number)].serials.tolist()
+            if serial not in self.landmarks
+        }
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | None:

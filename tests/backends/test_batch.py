@@ -123,7 +123,7 @@ def test_covariances_that_gtsam_cannot_give_are_the_smoothers(monkeypatch, error
             raise error
 
     data = drive()
-    backend, smoother = BatchBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, motion=0.0)
+    backend, smoother = BatchBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, motion=0.0, lag=None)
     run(backend, data)
     run(smoother, data)
     monkeypatch.setattr(gtsam, "Marginals", Broken)
