@@ -15,7 +15,7 @@ from backends.smoother.mending import corrected, path_solved, rebuilt
 from backends.smoother.path import Path
 from backends.smoother.state import State
 from backends.smoother.steps import Steps
-from slam.checks import require_guess, require_not_measured, require_stamp
+from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import CopyError, MeasurementError
 from slam.geometry.rig import StereoRig
@@ -147,7 +147,7 @@ class SmootherBackend:
     @one_blas_thread
     def recent(self, n: int) -> RecentPoses:
         """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
-        return self._path.recent(self._started("recent"), self._graph, n)
+        return self._path.recent(self._started("recent"), self._graph, require_recent("smoother", n))
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
