@@ -18,7 +18,7 @@ from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key
 from backends.smoother.graph import FAILURES, Problem, Tracks, minimised
 from slam.bounds import require_not_negative
-from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
+from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
@@ -128,10 +128,6 @@ class BatchBackend:
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`: the smoother's."""
         return self._smoother.positions(ids)
-
-    def recent(self, n: int) -> RecentPoses:
-        """See `slam.interfaces.RecentBackend.recent`: the smoother's."""
-        return self._smoother.recent(n)
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
