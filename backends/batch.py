@@ -1,12 +1,12 @@
 """The maximum-likelihood estimate from all measurements, by Levenberg-Marquardt: the reference for back ends.
 
-Every landmark is a variable and every accepted measurement a factor of its own; nothing is approximated but the motion
-model: between two poses it counts as the prediction that it gave.
+Every frame and every landmark is a variable, every accepted measurement a factor of its own, and the motion model ties
+three successive frames; nothing is approximated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,18 +15,20 @@ import gtsam
 import numpy as np
 
 from backends.smoother import SmootherBackend
-from backends.smoother.factors import landmark_key, pose_key
+from backends.smoother.factors import landmark_key, pose_key, to_pose3
 from backends.smoother.graph import FAILURES, Problem, Tracks, minimised
 from slam.bounds import require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.se3 import Array, inverse, points_by_pose, so3_left_jacobian, so3_log, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
+from slam.window.motion import LONGEST, is_first, velocity_sigmas
 
 _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
+_DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determines a landmark well enough for Cholesky
 
 
 @dataclass(frozen=True)
@@ -120,9 +122,7 @@ class BatchBackend:
                 covariances[row] = solution.covariance(landmark_key(serial), covariances[row])
             elif serial in solution.once:  # it moves with the pose that measured it
                 positions[row] = transform(solution.once[serial], positions[row : row + 1])[0]
-        T, P = rough.T_world_left, rough.covariance
-        if s.inside:  # else it is predicted only: its measurements are still to come
-            T, P = solution.poses[-1].copy(), solution.covariance(pose_key(s.number), P)
+        T, P = solution.poses[-1].copy(), solution.covariance(solution.newest, rough.covariance)
         return Estimate(rough.stamp, T, P, rough.ids, positions, covariances)
 
     def positions(self, ids: IdArray) -> Array:
@@ -135,15 +135,13 @@ class BatchBackend:
         s = self._smoother.state
         if not s.started:
             return self._smoother.trajectory()
-        found = self._smoother.path.trajectory(s, self._solved().poses)
-        if not s.inside:
-            found.poses[-1] = s.last[1]
+        found, solved = self._smoother.path.trajectory(s), self._solved().poses
+        found.poses[-len(solved) :] = solved
         return found
 
     def _solved(self) -> _Solution:
-        """The solution; a frame that is only predicted changes nothing of it."""
-        sights = self._smoother.state.sights
-        if self._solution is None or self._solution.sights is not sights:
+        """The solution for what is known now."""
+        if self._solution is None or self._solution.state is not self._smoother.state:
             self._solution = _Solution(self._smoother)
         return self._solution
 
@@ -152,20 +150,31 @@ class _Solution:
     """A solved problem.
 
     Attributes:
-        sights: what it is the solution for.
+        state: what it is the solution for.
         values: all variables.
-        poses: of the graph (N, 4, 4); those before a restart of the smoother are its own.
+        poses: of the last frames (F, 4, 4), from where the problem begins: the first, or a restart of the smoother.
+        newest: variable of the newest frame.
         landmarks: serial numbers of the landmarks that are variables.
         once: how those that are none, but were measured, move with their pose (4, 4), by serial number.
     """
 
     def __init__(self, smoother: SmootherBackend) -> None:
         s, make = smoother.state, smoother.factor_maker
-        self.sights = s.sights
+        self.state = s
         problem, tracks = Problem(), Tracks(make, 2, None)
         numbers = range(s.begun, s.number + 1)
-        for number in numbers:
-            tracks.add_pose(problem, s, number, s.begun)
+        stamps, hangs = smoother.path.frames(s.begun)
+        before = smoother.path.trajectory(s).poses[-len(stamps) :]
+        keys = [
+            pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
+            for i, number in enumerate(hangs.tolist())
+        ]
+        tracks.add_pose(problem, s, s.begun, s.begun)
+        for key, T in zip(keys[1:], before[1:]):
+            problem.values.insert(key, to_pose3(T))
+        for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), smoother.models):
+            problem.factors.add(factor)
+        self.newest = keys[-1]
         count = np.zeros(s.serials, np.int64)
         stereo = smoother.stereo
         nearest: dict[int, tuple[float, Array]] = {}  # largest disparity, and where that puts the landmark
@@ -179,11 +188,19 @@ class _Solution:
                     nearest[serial] = d, place
         known = {serial: one for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
         self.landmarks = {
-            serial for serial in np.flatnonzero(count).tolist() if count[serial] > 1 and serial in nearest
+            serial
+            for serial in np.flatnonzero(count).tolist()
+            if serial in nearest and (count[serial] > 1 or nearest[serial][0] > _DISTINCT)
         }
-        self.landmarks |= {serial for serial in known if count[serial]}
+        self.landmarks |= set(known)
         for serial in sorted(self.landmarks):
-            if serial in known:
+            one = known.get(serial)
+            if one is not None and one.pose >= 0:
+                noise = gtsam.noiseModel.Gaussian.Covariance(one.covariance)
+                tied = [pose_key(one.pose), landmark_key(serial)]
+                problem.factors.add(gtsam.CustomFactor(noise, tied, _seen_at(tied, one.position)))
+                problem.values.insert(tied[1], transform(s.poses[s.of(one.pose)], one.position[None])[0])
+            elif one is not None:
                 tracks.add_known(problem, s, serial)
             else:
                 problem.values.insert(landmark_key(serial), nearest[serial][1])
@@ -194,8 +211,8 @@ class _Solution:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
         self._factors = problem.factors
         self.values = minimised(problem, _ITERATIONS)
+        self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])
         solved = np.array([self.values.atPose3(pose_key(i)).matrix() for i in numbers])
-        self.poses = np.concatenate([s.poses[: s.of(s.begun)], solved])
         moved = solved @ inverse(s.poses[s.of(s.begun) :])
         self.once = {
             serial: moved[number - s.begun]
@@ -219,3 +236,58 @@ class _Solution:
             return np.asarray(self._marginals.marginalCovariance(key))
         except FAILURES:
             return otherwise
+
+
+def _motions(keys: list[int], dt: Array, models: EstimatorModels) -> Iterator[gtsam.NonlinearFactor]:
+    """What ties successive poses: their velocities differ by white noise; the first one has its own prior.
+
+    Args:
+        keys: variables of the poses (N,).
+        dt: times between them (N − 1,) [s].
+        models: noise and priors.
+    """
+    for i, interval in enumerate(dt.tolist()):
+        first = is_first(None if not i else float(dt[i - 1]), interval)
+        tied = keys[i : i + 2] if first else keys[i - 1 : i + 2]
+        earlier = interval if first else float(dt[i - 1])
+        noise = gtsam.noiseModel.Diagonal.Sigmas(velocity_sigmas(models, interval, first))
+        yield gtsam.CustomFactor(noise, tied, _velocity_change(tied, earlier, interval))
+
+
+def _velocity_change(keys: list[int], d0: float, d1: float) -> Callable[[gtsam.CustomFactor, gtsam.Values, Any], Any]:
+    """Residual (6,): the velocity [ω, v] between the last two poses, over d1 [s], less that between the first two."""
+
+    def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
+        poses = [values.atPose3(key).matrix() for key in keys]
+        r, J = _velocity(poses[-2], poses[-1], d1)
+        by_pose = [J[0], J[1]]
+        if len(poses) == 3:
+            before, J = _velocity(poses[0], poses[1], d0)
+            r, by_pose = r - before, [-J[0], by_pose[0] - J[1], by_pose[1]]
+        if jacobians is not None:
+            for i, one in enumerate(by_pose):
+                jacobians[i] = one
+        return r
+
+    return error
+
+
+def _seen_at(keys: list[int], local: Array) -> Callable[[gtsam.CustomFactor, gtsam.Values, Any], Any]:
+    """Residual (3,) of a point known to be at `local` (3,) in a camera's coordinates."""
+
+    def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
+        T = values.atPose3(keys[0]).matrix()
+        point = transform(inverse(T), values.atPoint3(keys[1])[None])
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = points_by_pose(point)[0], T[:3, :3].T.copy()
+        return point[0] - local
+
+    return error
+
+
+def _velocity(T0: Array, T1: Array, dt: float) -> tuple[Array, Array]:
+    """Body rate and velocity in world axes (6,) from one pose to the next, and its Jacobians (2, 6, 6) by both."""
+    turn, J = so3_log(T0[:3, :3].T @ T1[:3, :3]), np.zeros((2, 6, 6))
+    J[0, :3, :3], J[1, :3, :3] = -np.linalg.inv(so3_left_jacobian(turn)), np.linalg.inv(so3_left_jacobian(-turn))
+    J[0, 3:, 3:], J[1, 3:, 3:] = -T0[:3, :3], T1[:3, :3]
+    return np.concatenate([turn, T1[:3, 3] - T0[:3, 3]]) / dt, J / dt

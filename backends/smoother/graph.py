@@ -303,6 +303,8 @@ def minimised(problem: Problem, iterations: int) -> gtsam.Values:
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(1e-9)
+    parameters.setAbsoluteErrorTol(1e-9)
     try:
         before = problem.factors.error(problem.values)
         values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()

@@ -6,7 +6,7 @@ import numpy as np
 
 from backends.smoother.graph import Graph
 from backends.smoother.state import State
-from slam.data import RecentPoses
+from slam.data import IndexArray, RecentPoses
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
 
@@ -48,6 +48,11 @@ class Path:
         other._poses = [D @ T for T in self._poses]
         other.follow(s)
         return other
+
+    def frames(self, number: int) -> tuple[Array, IndexArray]:
+        """Stamps [s] of the frames from a pose of the graph on, and numbers of the poses at which they hang (F,)."""
+        first = self._number.index(number)
+        return np.array(self._stamps[first:]), np.array(self._number[first:], np.intp)
 
     def graph(self, first: int) -> Array:
         """Poses of the graph before the one with number `first` (N, 4, 4)."""
