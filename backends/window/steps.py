@@ -257,7 +257,7 @@ def _places(s: State, points: IndexArray, local: Array, covariances: Array) -> P
     T = s.poses[-1]
     world = local @ T[:3, :3].T + T[:3, 3]
     basis, _ = kernels.relative_charts(T, world)
-    axes = np.ascontiguousarray(np.broadcast_to(T[:3, :3], (len(local), 3, 3)))
+    axes = np.tile(T[:3, :3], (len(local), 1, 1))
     origin, D, _ = kernels.chart_changes(T, world, basis, axes)
     root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(D @ covariances @ np.swapaxes(D, 1, 2))), 1, 2)
     return Places(np.full(len(points), len(s.frames) - 1), points, basis, origin, np.ascontiguousarray(root))

@@ -231,7 +231,7 @@ class BodyEstimator:
             w = solution.window
             distances = kernels.left_out_distances(
                 self.stereo.intrinsics, self.stereo.R_left, w.poses[-1], w.points[rows[used]], z[used],
-                local[rows[used]], self.sigma,
+                local[rows[used]], self.sigma, 0.0,
             )  # fmt: skip
             excess = distances / limits[used]
             bad = excess > max(1.0, 0.5 * float(excess.max()))  # the worst draw the pose, and others seem bad
@@ -369,7 +369,7 @@ def _places(frame: int, points: IndexArray, h: Array, shape: Shape) -> Places:
     """
     eye = np.eye(4)
     basis, origin = kernels.relative_charts(eye, h)
-    _, D, _ = kernels.chart_changes(eye, h, basis, np.ascontiguousarray(np.broadcast_to(np.eye(3), (len(h), 3, 3))))
+    _, D, _ = kernels.chart_changes(eye, h, basis, np.tile(np.eye(3), (len(h), 1, 1)))
     back = np.linalg.inv(D)
     information = np.swapaxes(back, 1, 2) @ np.linalg.inv(shape.covariance) @ back
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)

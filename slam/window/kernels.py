@@ -412,7 +412,7 @@ def _displace(p, E, d, out):
 
 
 @kernel
-def left_out_distances(camera, R_left, T, points, z, covariances, sigma, least=0.0):
+def left_out_distances(camera, R_left, T, points, z, covariances, sigma, least):
     """Squared distance (M,) of each row from what all others predict for it, at the solution, with 3 or 2 numbers.
 
     With r the residual, ``rᵀ (σ² 1 − J C Jᵀ)⁻¹ r``, C the point's covariance (3, 3) in the newest camera T, in which

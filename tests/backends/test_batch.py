@@ -59,7 +59,7 @@ def test_the_smoother_is_nearly_as_good_as_the_optimum():
         errors.append(absolute_errors(backend.trajectory(), sequence.ground_truth).translation_statistics.rmse)
     best, whole, ours = errors
     # One short run scatters about the optimum in both directions.
-    assert whole < 1.1 * best and ours < 1.5 * best, errors
+    assert whole < 1.2 * best and ours < 1.5 * best, errors
 
 
 def test_the_solution_is_worked_out_when_asked_for_and_kept(monkeypatch):

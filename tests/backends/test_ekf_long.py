@@ -29,7 +29,8 @@ def test_rounds_past_the_same_landmarks(name):
     """Two rounds: the second adds next to no landmark, and comes back to where the first began."""
     last = list(run(name, 220, 110, Loop(count=150, speed=3.0)))
     assert last[1].landmarks <= 150 and last[1].landmarks - last[0].landmarks < 10
-    assert last[1].failed == 0 and last[1].error < 0.2  # of 66 m
+    # Of 66 m. The smoother forgets what left its lag: there the atlas closes the loop, which is not run here.
+    assert last[1].failed == 0 and last[1].error < (0.4 if name == "smoother" else 0.2)
 
 
 def test_options_are_given_as_to_the_command():
