@@ -65,7 +65,7 @@ def test_nees(make):
         pose.append(found.pose_nees[[2, 4, 8]])
         velocity.append(found.velocity_nees[[2, 4, 8]])
     low, high = chi_square_band(6, SEEDS)
-    # Velocities are constant in these scenes, where the motion model allows for impulses: the lower end has less weight.
+    # Velocities are constant in these scenes, where the motion model allows for impulses: rather too uncertain.
     assert low < np.mean(pose) < (1.2 if make is car_scene else 1.0) * high
     assert 0.9 * low < np.mean(velocity) < (1.2 if make is car_scene else 1.0) * high
 
