@@ -43,6 +43,9 @@ FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
     ("driving", "surf"): {"upright": True},
 }
 
+#: Options of back ends that depend on the kind of motion. A vehicle's frames are a metre apart: each is worth a pose.
+BACKENDS: dict[tuple[str, str | None], dict[str, Any]] = {("driving", "smoother"): {"motion": 0.0}}
+
 
 @dataclass(frozen=True)
 class SystemConfig:
@@ -80,8 +83,6 @@ class SystemConfig:
     def for_kind(cls, kind: str, frontend: str | None = "surf", backend: str | None = None) -> SystemConfig:
         """The default settings for a kind of motion (``"handheld"``, ``"driving"``), front end and back end by name.
 
-        No back end has options that depend on the kind today.
-
         Raises:
             ConfigurationError: the kind is not known.
         """
@@ -92,6 +93,7 @@ class SystemConfig:
             map=MAPS[kind],
             objects=OBJECTS[kind],
             frontend=dict(FRONTENDS.get((kind, frontend), {})),
+            backend=dict(BACKENDS.get((kind, backend), {})),
         )
 
     def to_json(self) -> dict[str, Any]:
