@@ -55,15 +55,15 @@ What follows:
   that it finds. `objects.mode=off` is for scenes where nothing moves.
 - One iteration is enough where frames are near each other, and fails where they are far apart (V1_01, `street`): the
   filter iterates. The papers' single iteration is part of `backend.papers=true`.
-- Transport of the filter's covariance changes errors within their scatter. Without it the NEES on raw 0001 is larger: it
-  stays, as it costs nothing.
+- Transport of the filter's covariance changes errors within their scatter. Without it the NEES on raw 0001 is larger:
+  it stays, as it costs nothing.
 - Without the rig's uncertainty the paths are the same, and their covariances far too small on raw 0001 and V1_01: it
   stays.
 - The test of first frames gains a few per cent in the mean, most where much is new at once (V1_01, `box`): it stays.
 - The atlas costs nothing where no place is seen again.
 - Left pixels alone, as in the papers, are worse in most cases: they are an option.
-- Pixel noise as on drives makes handheld paths much worse. Pixel noise as by hand makes the drives' errors no larger, and
-  their NEES a little smaller: it is a candidate for one default.
+- Pixel noise as on drives makes handheld paths much worse. Pixel noise as by hand makes the drives' errors no larger,
+  and their NEES a little smaller: it is a candidate for one default.
 """
 HEADER = ("sequence", "trial", "back end", "variant", "error", "NEES", "frames", "lost", "ms")
 
