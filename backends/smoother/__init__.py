@@ -1,4 +1,4 @@
-"""The GTSAM smoother: ISAM2 over smart stereo factors. See `backends.smoother.backend`."""
+"""The GTSAM smoother: a fixed lag of smart stereo factors. See `backends.smoother.backend`."""
 
 from backends.smoother.backend import SmootherBackend
 from backends.smoother.config import SmootherConfig

@@ -79,5 +79,6 @@ class Path:
         if len(frames) > 1 and self._number[frames[-2]] == s.number:
             own[-12:, -12:] = s.pair
         P = J @ joint @ J.T + own
-        poses = self.trajectory(s).poses[frames]
-        return RecentPoses(np.array(self._stamps)[frames], poses, 0.5 * (P + P.T))
+        poses = np.array([self._poses[self._number[f]] @ self._relative[f] for f in frames])
+        poses[-1] = s.last[1]
+        return RecentPoses(np.array([self._stamps[f] for f in frames]), poses, 0.5 * (P + P.T))

@@ -158,6 +158,7 @@ class State:
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], sights=self.sights[gone:], ties=self.ties[gone:],
             spread=self.spread[gone:],
+            known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip
 
 

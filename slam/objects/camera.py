@@ -50,10 +50,13 @@ def recent_poses(backend: Backend, n: int, path: RecentPoses, covariance: Array)
     the two frames' own noises N: what its landmarks, were they known, would leave uncertain (`with_estimate`). That
     leaves out how the noises were smoothed by the motion model, so the increments are rather too uncertain than too
     certain; against the impulses of a body's motion they hardly count. The newest pose has just its covariance (6, 6).
+    A back end that has corrected its past may give fewer poses for a while; then the online poses serve as well.
     """
-    if isinstance(backend, RecentBackend):
-        return backend.recent(n)
     k = len(path)
+    if isinstance(backend, RecentBackend):
+        recent = backend.recent(n)
+        if len(recent) >= min(n, k):
+            return recent
     by_newest = adjoint(inverse(path.poses) @ path.poses[-1])  # of a common error, as each pose's perturbation
     newest = path.covariance[-6:, -6:]
     stacked = by_newest.reshape(6 * k, 6)
