@@ -17,6 +17,7 @@ import numpy as np
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key, to_pose3
 from backends.smoother.graph import FAILURES, Problem, Tracks, minimised
+from backends.smoother.state import State
 from slam.bounds import require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig
@@ -26,6 +27,7 @@ from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.window.motion import LONGEST, is_first, velocity_sigmas
+from slam.window.stereo import RectifiedStereo
 
 _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
 _DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determines a landmark well enough for Cholesky
@@ -161,7 +163,6 @@ class _Solution:
     def __init__(self, smoother: SmootherBackend) -> None:
         s, make = smoother.state, smoother.factor_maker
         self.state = s
-        problem, tracks = Problem(), Tracks(make, 2, None)
         numbers = range(s.begun, s.number + 1)
         stamps, hangs = smoother.path.frames(s.begun)
         before = smoother.path.trajectory(s).poses[-len(stamps) :]
@@ -169,52 +170,42 @@ class _Solution:
             pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
             for i, number in enumerate(hangs.tolist())
         ]
+        problem, tracks = Problem(), Tracks(make, 2, None)
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))
         for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), smoother.models):
             problem.factors.add(factor)
-        self.newest = keys[-1]
-        count = np.zeros(s.serials, np.int64)
-        stereo = smoother.stereo
-        nearest: dict[int, tuple[float, Array]] = {}  # largest disparity, and where that puts the landmark
-        for number in numbers:
-            sight, T = s.sights[s.of(number)], s.poses[s.of(number)]
-            count[sight.serials] += 1
-            disparity = np.nan_to_num(sight.z[:, 0] - sight.z[:, 2], nan=-1.0)
-            places = transform(T, stereo.triangulate(sight.z))
-            for serial, d, place in zip(sight.serials.tolist(), disparity.tolist(), places):
-                if d > nearest.get(serial, (0.0, place))[0]:
-                    nearest[serial] = d, place
+        places = _places(s, smoother.stereo, numbers)
         known = {serial: one for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
-        self.landmarks = {
-            serial
-            for serial in np.flatnonzero(count).tolist()
-            if serial in nearest and (count[serial] > 1 or nearest[serial][0] > _DISTINCT)
-        }
-        self.landmarks |= set(known)
+        self.landmarks = {*places, *known}
         for serial in sorted(self.landmarks):
             one = known.get(serial)
-            if one is not None and one.pose >= 0:
-                noise = gtsam.noiseModel.Gaussian.Covariance(one.covariance)
-                tied = [pose_key(one.pose), landmark_key(serial)]
-                problem.factors.add(gtsam.CustomFactor(noise, tied, _seen_at(tied, one.position)))
-                problem.values.insert(tied[1], transform(s.poses[s.of(one.pose)], one.position[None])[0])
-            elif one is not None:
+            if one is None:
+                problem.values.insert(landmark_key(serial), places[serial])
+            elif one.pose < 0:
                 tracks.add_known(problem, s, serial)
             else:
-                problem.values.insert(landmark_key(serial), nearest[serial][1])
+                tied = [pose_key(one.pose), landmark_key(serial)]
+                noise = gtsam.noiseModel.Gaussian.Covariance(one.covariance)
+                problem.factors.add(gtsam.CustomFactor(noise, tied, _seen_at(tied, one.position)))
+                problem.values.insert(tied[1], transform(s.poses[s.of(one.pose)], one.position[None])[0])
         for number in numbers:
             sight = s.sights[s.of(number)]
             for serial, z in zip(sight.serials.tolist(), sight.z.tolist()):
                 if serial in self.landmarks:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
-        self._factors = problem.factors
+        self._factors, self.newest = problem.factors, keys[-1]
         self.values = minimised(problem, _ITERATIONS)
         self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])
+        self.once = self._moved(numbers)
+
+    def _moved(self, numbers: range) -> dict[int, Array]:
+        """How measured landmarks that are no variables move with their pose (4, 4), by serial number."""
+        s = self.state
         solved = np.array([self.values.atPose3(pose_key(i)).matrix() for i in numbers])
         moved = solved @ inverse(s.poses[s.of(s.begun) :])
-        self.once = {
+        return {
             serial: moved[number - s.begun]
             for number in numbers
             for serial in s.sights[s.of(number)].serials.tolist()
@@ -236,6 +227,21 @@ class _Solution:
             return np.asarray(self._marginals.marginalCovariance(key))
         except FAILURES:
             return otherwise
+
+
+def _places(s: State, stereo: RectifiedStereo, numbers: range) -> dict[int, Array]:
+    """Where landmarks (3,) begin that measurements determine, by serial number: where their nearest sight puts them."""
+    count = np.zeros(s.serials, np.int64)
+    nearest: dict[int, tuple[float, Array]] = {}  # largest disparity, and where that puts the landmark
+    for number in numbers:
+        sight, T = s.sights[s.of(number)], s.poses[s.of(number)]
+        count[sight.serials] += 1
+        disparity = np.nan_to_num(sight.z[:, 0] - sight.z[:, 2], nan=-1.0)
+        places = transform(T, stereo.triangulate(sight.z))
+        for serial, d, place in zip(sight.serials.tolist(), disparity.tolist(), places):
+            if d > nearest.get(serial, (0.0, place))[0]:
+                nearest[serial] = d, place
+    return {serial: place for serial, (d, place) in nearest.items() if count[serial] > 1 or d > _DISTINCT}
 
 
 def _motions(keys: list[int], dt: Array, models: EstimatorModels) -> Iterator[gtsam.NonlinearFactor]:

@@ -152,12 +152,13 @@ class RecentBackend(Protocol):
     """
 
     def recent(self, n: int) -> RecentPoses:
-        """The camera's last n poses, or all if they are fewer, as they are believed now, with their joint covariance.
+        """The camera's last poses, at most n, as the back end believes them, with their joint covariance.
 
-        The last is that of `Backend.estimate`. Asking changes nothing.
+        The last is that of `Backend.estimate`. They may be fewer than n: those of which the joint covariance is known.
+        Asking changes nothing.
 
         Raises:
-            MeasurementError: before the first `predict`.
+            MeasurementError: before the first `predict`, or n is less than one.
         """
         ...
 

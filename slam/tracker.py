@@ -156,7 +156,7 @@ class Tracker:
 
     def roll_back(self, state: State, stage: str | None) -> State:
         """The state after a step that was interrupted in a stage: what it did to the back end's map is undone."""
-        if stage in ("associate", "objects"):
+        if stage in ("predict", "associate", "objects"):  # those change its tracks
             self.objects.restart()
         if stage in (None, "predict") or state.prior_map is not None:  # that back end has not begun
             return state

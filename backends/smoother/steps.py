@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -13,41 +12,25 @@ from backends.smoother.landmarks import Landmarks, inverses
 from backends.smoother.state import Known, Sight, State, Tie, relative_covariance
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
-from slam.models import EstimatorModels
 from slam.window import motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
 from slam.window.gating import squared_distances, with_noise
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
-from slam.window.stereo import RectifiedStereo
+from slam.window.stereo import RectifiedMeasurement
 
 _STANDS = 1e-5  # numerics: step [rad], [m] of a camera that stands; none at all would leave no information matrix
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class Steps(RectifiedMeasurement):
     """What the steps need besides the state.
 
     Attributes:
-        rig: the cameras.
-        models: noise, priors, motion and gate.
         config: limits.
     """
 
-    rig: StereoRig
-    models: EstimatorModels
     config: SmootherConfig
-
-    @cached_property
-    def stereo(self) -> RectifiedStereo:
-        """The rectified rig that measures."""
-        return RectifiedStereo.of(self.rig)
-
-    @cached_property
-    def sigma(self) -> float:
-        """Noise of rectified pixels [px]."""
-        return self.models.pixel_sigma * self.stereo.scale
 
     @property
     def past(self) -> int | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -15,16 +14,14 @@ from backends.window.state import Landmarks, State, between
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose
-from slam.models import EstimatorModels
 from slam.window import kernels, motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
 from slam.window.gating import with_noise
 from slam.window.problem import Places, RelativePrior, Rows, Window
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.solver import CLOSE, Solution, solve
-from slam.window.stereo import RectifiedStereo
+from slam.window.stereo import RectifiedMeasurement
 
 #: numerics: share of its noise that a row's residual has at least, to be tested at the first solution. Where a row
 #: alone tells something of the pose, its residual and the variance of that are nearly 0, and what the solution leaves
@@ -34,28 +31,14 @@ _SOLVED_AGAIN = 2  # numerics: how often an update is solved again without obser
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class Steps(RectifiedMeasurement):
     """What the steps need besides the state.
 
     Attributes:
-        rig: the cameras.
-        models: noise, priors, motion and gate.
         config: limits.
     """
 
-    rig: StereoRig
-    models: EstimatorModels
     config: WindowConfig
-
-    @cached_property
-    def stereo(self) -> RectifiedStereo:
-        """The rectified rig that measures."""
-        return RectifiedStereo.of(self.rig)
-
-    @cached_property
-    def sigma(self) -> float:
-        """Noise of rectified pixels [px]."""
-        return self.models.pixel_sigma * self.stereo.scale
 
     def predicted(self, s: State, stamp: float) -> State:
         """With a pose at `stamp` [s], by the motion model. Where the window is full, a pose leaves it first."""

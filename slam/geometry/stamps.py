@@ -74,7 +74,9 @@ def frame_range(start: int, stop: int | None, length: int) -> tuple[int, int]:
     if not all(isinstance(number, Integral) for number in (start, length if stop is None else stop)):
         raise SequenceError(f"frames are asked for by whole numbers, not {start!r} to {stop!r}")
     end = length if stop is None else min(stop, length)
+    asked = f"{start}:{'' if stop is None else stop}"
+    if stop is not None and stop <= start:
+        raise SequenceError(f"frames {asked} asked for, but the end is not after the start")
     if start < 0 or start >= length or end <= start:
-        asked = f"{start}:{'' if stop is None else stop}"
         raise SequenceError(f"frames {asked} asked for, but the sequence has frames 0:{length}")
     return start, end

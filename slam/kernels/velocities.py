@@ -1,4 +1,4 @@
-"""How a velocity changes over three successive poses, with derivatives."""
+"""How a velocity changes over three successive poses, with derivatives, and its part of normal equations."""
 
 from __future__ import annotations
 
@@ -41,3 +41,26 @@ def velocity_change(poses, i0, i1, i2, d0, d1, r, J):
                 J[i, j] = Ja[i, j] / d0
                 J[3 + i, 9 + j] -= poses[i1, i, j] / d0
                 J[3 + i, 3 + j] = poses[i0, i, j] / d0
+
+
+@helper
+def add_velocity_rows(J, r, triple, column, H, b):
+    """Add whitened rows J (6, 18), r (6,) of the poses `triple` to normal equations (lower triangle of H, and b).
+
+    `column` (K,) are the poses' first unknowns; a pose that is −1, or has none, is left out.
+    """
+    for p in range(3):
+        at = -1 if triple[p] < 0 else column[triple[p]]
+        if at < 0:
+            continue
+        for i in range(6):
+            for k in range(6):
+                b[at + i] -= J[k, 6 * p + i] * r[k]
+        for o in range(3):
+            to = -1 if triple[o] < 0 else column[triple[o]]
+            if to < 0 or to > at:
+                continue
+            for i in range(6):
+                for j in range(6):
+                    for k in range(6):
+                        H[at + i, to + j] += J[k, 6 * p + i] * J[k, 6 * o + j]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.se3 import adjoint, between
-from slam.kernels.velocities import velocity_change
+from slam.kernels.velocities import add_velocity_rows, velocity_change
 from slam.runtime.compilation import helper, kernel
 
 
@@ -49,7 +49,7 @@ def carried_rows(poses, column, cameras, covariance, triple, interval, mean, var
         _whiten(J, covariance, triple[m], variance[m], S, r)
         for i in range(6):
             cost += r[i] * r[i]
-        _add(J, r, column, triple[m], H, b)
+        add_velocity_rows(J, r, triple[m], column, H, b)
     return cost
 
 
@@ -79,23 +79,3 @@ def _whiten(J, covariance, triple, variance, S, r):
         r[i] /= S[i, i]
         for j in range(18):
             J[i, j] /= S[i, i]
-
-
-@helper
-def _add(J, r, column, triple, H, b):
-    """Add whitened rows J (6, 18), r (6,) to the normal equations."""
-    for p in range(3):
-        at = -1 if triple[p] < 0 else column[triple[p]]
-        if at < 0:
-            continue
-        for i in range(6):
-            for k in range(6):
-                b[at + i] -= J[k, 6 * p + i] * r[k]
-        for o in range(3):
-            to = -1 if triple[o] < 0 else column[triple[o]]
-            if to < 0 or to > at:
-                continue
-            for i in range(6):
-                for j in range(6):
-                    for k in range(6):
-                        H[at + i, to + j] += J[k, 6 * p + i] * J[k, 6 * o + j]

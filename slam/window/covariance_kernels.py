@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.kernels.linear import turn
 from slam.kernels.se3 import transform_back
-from slam.runtime.compilation import kernel
+from slam.runtime.compilation import helper, kernel
 from slam.window.kernels import ELIMINATED
 
 
@@ -139,14 +139,8 @@ def schur_complement(H, b, gone, stay):
                 total -= L[i, k] * L[j, k]
             L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
         for k in range(i):
-            x = L[i, k]
-            v[i] -= x * v[k]
-            for j in range(s):
-                W[i, j] -= x * W[k, j]
-        x = 1.0 / L[i, i]
-        v[i] *= x
-        for j in range(s):
-            W[i, j] *= x
+            _subtract_row(v, W, i, k, L[i, k])
+        _scale_row(v, W, i, 1.0 / L[i, i])
     information, vector = np.dot(W.T, -W), np.empty(s)
     for i in range(s):
         total = b[stay[i]]
@@ -157,12 +151,22 @@ def schur_complement(H, b, gone, stay):
             information[i, j] += H[stay[i], stay[j]] if stay[i] >= stay[j] else H[stay[j], stay[i]]
     for i in range(g - 1, -1, -1):
         for k in range(i + 1, g):
-            x = L[k, i]
-            v[i] -= x * v[k]
-            for j in range(s):
-                W[i, j] -= x * W[k, j]
-        x = 1.0 / L[i, i]
-        v[i] *= x
-        for j in range(s):
-            W[i, j] *= x
+            _subtract_row(v, W, i, k, L[k, i])
+        _scale_row(v, W, i, 1.0 / L[i, i])
     return information, vector, v, W
+
+
+@helper
+def _subtract_row(v, W, i, k, x):
+    """Row i of v (G,) and W (G, S), less x times row k."""
+    v[i] -= x * v[k]
+    for j in range(W.shape[1]):
+        W[i, j] -= x * W[k, j]
+
+
+@helper
+def _scale_row(v, W, i, x):
+    """Row i of v (G,) and W (G, S), times x."""
+    v[i] *= x
+    for j in range(W.shape[1]):
+        W[i, j] *= x

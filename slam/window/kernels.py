@@ -18,7 +18,7 @@ import numpy as np
 from slam.kernels.linear import invert_symmetric, row_times, turn
 from slam.kernels.se3 import adjoint, between, log, move, transform_back
 from slam.kernels.stereo import by_pose, residual
-from slam.kernels.velocities import velocity_change
+from slam.kernels.velocities import add_velocity_rows, velocity_change
 from slam.runtime.compilation import helper, kernel
 
 #: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
@@ -351,21 +351,7 @@ def motion_rows(poses, column, triple, interval, weight, H, b):
             cost += r[i] * r[i]
             for j in range(18):
                 J[i, j] *= weight[m, i]
-        for p in range(3):
-            at = -1 if triple[m, p] < 0 else column[triple[m, p]]
-            if at < 0:
-                continue
-            for i in range(6):
-                for k in range(6):
-                    b[at + i] -= J[k, 6 * p + i] * r[k]
-            for o in range(3):
-                to = -1 if triple[m, o] < 0 else column[triple[m, o]]
-                if to < 0 or to > at:
-                    continue
-                for i in range(6):
-                    for j in range(6):
-                        for k in range(6):
-                            H[at + i, to + j] += J[k, 6 * p + i] * J[k, 6 * o + j]
+        add_velocity_rows(J, r, triple[m], column, H, b)
     return cost
 
 

@@ -15,6 +15,7 @@ from slam.data import Observations
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.rig_kernels import project_rectified, triangulate_rectified
 from slam.geometry.se3 import Array
+from slam.models import EstimatorModels
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,3 +100,26 @@ def _scale(rectified_rig: RectifiedRig) -> float:
     du = rectified_rig.rectify_left(uv + right) - rectified_rig.rectify_left(uv - right)
     dv = rectified_rig.rectify_left(uv + down) - rectified_rig.rectify_left(uv - down)
     return float(np.sqrt(np.nanmean(np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]))))
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedMeasurement:
+    """How an estimator measures: the rectified rig, and the noise of its pixels.
+
+    Attributes:
+        rig: the cameras.
+        models: noise, priors, motion and gate.
+    """
+
+    rig: StereoRig
+    models: EstimatorModels
+
+    @cached_property
+    def stereo(self) -> RectifiedStereo:
+        """The rectified rig that measures."""
+        return RectifiedStereo.of(self.rig)
+
+    @cached_property
+    def sigma(self) -> float:
+        """Noise of rectified pixels [px]."""
+        return self.models.pixel_sigma * self.stereo.scale

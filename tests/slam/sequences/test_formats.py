@@ -62,7 +62,7 @@ def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path, buil
     assert [f.index for f in sequence.frames(3, 4)] == [3]
     assert len(sequence.warnings) == 1
     for start, stop in ((-1, 3), (6, None), (3, 3), (4, 2)):
-        with pytest.raises(SequenceError, match="sequence has frames 0:6"):
+        with pytest.raises(SequenceError, match=r"has frames 0:6|end is not after the start"):
             sequence.frames(start, stop)
 
 
