@@ -170,7 +170,8 @@ class _Solution:
             pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
             for i, number in enumerate(hangs.tolist())
         ]
-        problem, tracks = Problem(), Tracks(make, 2, None)
+        problem, tracks = Problem(), Tracks(make, None)
+        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.spread[s.of(s.begun)]))
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))

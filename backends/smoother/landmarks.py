@@ -13,6 +13,7 @@ from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window.stereo import RectifiedStereo
 
+MISSED = 4  # so many poses without a measurement end a smart factor
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
 _GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
 _DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
@@ -33,6 +34,7 @@ class Landmarks:
             information (S, 3, 3), zero for nothing.
         world: whether that does not depend on any pose (S,).
         z, pose: its last measurements (S, RECENT, 3), and the numbers of their poses (S, RECENT), −1 for none.
+        begun: number of the pose from which its present smart factor counts (S,); the factor may begin later.
     """
 
     ids: IdArray
@@ -45,6 +47,7 @@ class Landmarks:
     world: BoolArray
     z: Array
     pose: IndexArray
+    begun: IndexArray
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -55,7 +58,7 @@ class Landmarks:
         n = len(ids)
         return cls(
             ids, first + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
-            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1),
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp),
         )  # fmt: skip
 
     @classmethod
@@ -103,14 +106,23 @@ class Landmarks:
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
 
-    def measured(self, rows: IndexArray, z: Array, pose: int, oldest: int = 0) -> Landmarks:
+    def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0) -> Landmarks:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number.
+
+        A smart factor spans at most `track` poses. Then, or if a landmark was not measured from the last `MISSED`
+        poses, it goes on in a new one. If landmarks that were found together all did so at once, the motion model alone
+        would tie that pose to the one before. So the first factor spans fewer, down to half of them, differently for
+        each landmark.
 
         What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
         was known beforehand.
         """
+        last, begun = self.pose[rows].max(axis=1), self.begun.copy()
+        anew, full = (last < 0) | (last < pose - MISSED), begun[rows] <= pose - track
+        shorter = self.serial[rows] % max(track // 2, 1)
+        begun[rows] = np.where(anew, pose - shorter, np.where(full, pose, begun[rows]))
         old = np.zeros(len(self), bool)
-        old[rows] = (self.pose[rows].max(axis=1) < oldest) & self.away[rows].any(axis=(1, 2))
+        old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
             self = _put(self, old, self.without_measurements())
         away = self.away.copy()
@@ -118,7 +130,7 @@ class Landmarks:
         zs, poses = self.z.copy(), self.pose.copy()
         oldest = poses[rows].argmin(axis=1)
         zs[rows, oldest], poses[rows, oldest] = z, pose
-        return replace(self, z=zs, pose=poses, away=away)
+        return replace(self, z=zs, pose=poses, away=away, begun=begun)
 
     def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Landmarks:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""

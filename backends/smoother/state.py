@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from backends.smoother.landmarks import Landmarks
-from slam.data import IdArray
+from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, inverse
 
 
@@ -18,10 +18,12 @@ class Sight:
 
     Attributes:
         serials: of the landmarks (M,).
+        begun: which of each one's smart factors it goes into (M,), see `Landmarks.begun`.
         z: measurements (M, 3) of the rectified rig, uR NaN where missing.
     """
 
     serials: IdArray
+    begun: IndexArray
     z: Array
 
     def __len__(self) -> int:
@@ -30,11 +32,17 @@ class Sight:
     @classmethod
     def none(cls) -> Sight:
         """Nothing."""
-        return cls(np.zeros(0, np.int64), np.zeros((0, 3)))
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.intp), np.zeros((0, 3)))
 
-    def with_more(self, serials: IdArray, z: Array) -> Sight:
-        """With further measurements."""
-        return Sight(np.concatenate([self.serials, serials]), np.concatenate([self.z, z]))
+    @classmethod
+    def of(cls, marks: Landmarks, rows: IndexArray, z: Array) -> Sight:
+        """Of measurements z (M, 3) that landmarks have just had."""
+        return cls(marks.serial[rows], marks.begun[rows], z)
+
+    def joined(self, other: Sight) -> Sight:
+        """These measurements and others."""
+        both = zip((self.serials, self.begun, self.z), (other.serials, other.begun, other.z))
+        return Sight(*(np.concatenate(pair) for pair in both))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +97,7 @@ class State:
         serials: number of landmarks so far.
         known: by serial number.
         measured: whether the newest frame may not be updated any more.
+        revisions: how often the measurements were revised.
         contradicted: updates in succession in which most observations agreed on another pose than was expected.
     """
 
@@ -108,6 +117,7 @@ class State:
     serials: int = 0
     known: Mapping[int, Known] = field(default_factory=dict)
     measured: bool = False
+    revisions: int = 0
     contradicted: int = 0
 
     @classmethod
