@@ -10,7 +10,6 @@ import gtsam
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.landmarks import MISSED
 from backends.smoother.state import State
 from slam.errors import SlamError
 from slam.geometry.se3 import Array, adjoint, inverse, transform
@@ -101,7 +100,12 @@ class Tracks:
         row = s.of(number)
         tie = s.ties[row]
         if tie is not None and number != first:
-            problem.factors.add(self._make.tie(number - 1, number, tie.relative, tie.covariance))
+            unknown = tie.times is not None and np.isnan(tie.times[0])
+            if tie.times is None or (not unknown and number - 2 < first):
+                factor = self._make.tie(number - 1, number, tie.relative, tie.covariance)
+            else:
+                factor = self._make.motion(number, s.poses[row - (1 if unknown else 2) : row + 1], np.diff(tie.times))
+            problem.factors.add(factor)
         problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
         problem.stamps[pose_key(number)] = float(number)
 
@@ -159,20 +163,26 @@ class Tracks:
                 problem.factors.add(track.factor)
         return made
 
-    def linearised(self, problem: Problem, number: int, values: gtsam.Values) -> None:
-        """Put one linear factor in the place of all smart factors that will not grow at the pose of a number.
+    def linearised(self, problem: Problem, s: State, values: gtsam.Values) -> None:
+        """Put one linear factor in the place of all smart factors that will not grow any more, at the present values.
 
         They are most of the factors, and gtsam would linearise each of them again with every pose.
         """
-        lost = [serial for serial, track in self._smart.items() if track.poses[-1] < number - MISSED]
-        ended, self._ended = self._ended + [self._smart.pop(serial) for serial in lost], []
-        inside = [t for t in ended if t.factor is not None and values.exists(pose_key(t.poses[0]))]
-        if inside and self._lag is not None:
+        ended, self._ended = self._ended, []
+        if self._lag is None:
+            return
+        in_map = np.isin(list(self._smart), s.landmarks.serial).tolist()
+        oldest = s.number - (self._lag + 1) // 2
+        for serial, goes_on in list(zip(self._smart, in_map)):
+            if not goes_on or self._smart[serial].poses[-1] < oldest:
+                ended.append(self._smart.pop(serial))
+        ended = [t for t in ended if t.factor is not None and values.exists(pose_key(t.poses[0]))]
+        if ended:
             linear = gtsam.GaussianFactorGraph()
-            for track in inside:
+            for track in ended:
                 linear.add(track.factor.linearize(values))
             problem.factors.add(gtsam.LinearContainerFactor(gtsam.HessianFactor(linear), values))
-            problem.removed.extend(track.slot for track in inside)
+            problem.removed.extend(track.slot for track in ended)
 
 
 class Graph:
@@ -268,7 +278,7 @@ class Graph:
             self._tracks.add_pose(problem, s, number, first)
             self._tracks.add_rows(problem, s, number, first)
             self._taken = len(s.sights[s.of(number)])
-        self._tracks.linearised(problem, s.number, self._values)
+        self._tracks.linearised(problem, s, self._values)
         made = self._tracks.make_smart(problem, s.number < self._careful)
         self._solver.update(problem.factors, problem.values, problem.stamps, problem.removed)
         slots = self._solver.getISAM2Result().getNewFactorsIndices()

@@ -13,7 +13,6 @@ from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window.stereo import RectifiedStereo
 
-MISSED = 4  # so many poses without a measurement end a smart factor
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
 _GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
 _DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
@@ -109,8 +108,8 @@ class Landmarks:
     def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0) -> Landmarks:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number.
 
-        A smart factor spans at most `track` poses. Then, or if a landmark was not measured from the last `MISSED`
-        poses, it goes on in a new one. If landmarks that were found together all did so at once, the motion model alone
+        A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
+        in a new one. If landmarks that were found together all did so at once, the motion model alone
         would tie that pose to the one before. So the first factor spans fewer, down to half of them, differently for
         each landmark.
 
@@ -118,9 +117,9 @@ class Landmarks:
         was known beforehand.
         """
         last, begun = self.pose[rows].max(axis=1), self.begun.copy()
-        anew, full = (last < 0) | (last < pose - MISSED), begun[rows] <= pose - track
-        shorter = self.serial[rows] % max(track // 2, 1)
-        begun[rows] = np.where(anew, pose - shorter, np.where(full, pose, begun[rows]))
+        half, full = max(track // 2, 1), begun[rows] <= pose - track
+        anew = (last < 0) | (last < pose - half)
+        begun[rows] = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, begun[rows]))
         old = np.zeros(len(self), bool)
         old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
@@ -214,7 +213,7 @@ class Landmarks:
         older = np.where(self.world[chosen, None, None], 0.0, self.information[chosen])
         J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
         n, width = len(chosen), len(joint)
-        C = own + self.away[chosen] + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
+        C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
 
 

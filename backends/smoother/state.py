@@ -52,10 +52,13 @@ class Tie:
     Attributes:
         relative: the pose relative to the one before it in the graph (4, 4).
         covariance: of that (6, 6).
+        times: of the three frames that the motion model ties [s]; the first is NaN where the velocity is unknown. None
+            where not all of them are poses of the graph, one after the other: then the above counts in its place.
     """
 
     relative: Array
     covariance: Array
+    times: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +93,7 @@ class State:
         stamps: times of the last frame but one and the last (2,) [s]; NaN where there is none.
         last: their poses (2, 4, 4).
         pair: their joint covariance (12, 12), where the newest pose of the graph is known.
+        tie: of the newest frame to the newest pose of the graph that is before it.
         frame: number of the newest frame.
         since: frames since the problem has begun, 0 for its first one.
         inside: whether the newest frame is the newest pose of the graph.
@@ -110,6 +114,7 @@ class State:
     stamps: Array
     last: Array
     pair: Array
+    tie: Tie | None = None
     frame: int = -1
     since: int = 0
     inside: bool = True

@@ -64,10 +64,13 @@ class Steps(RectifiedMeasurement):
             noise = (Jw * motion.velocity_sigmas(self.models, dt, first) ** 2) @ Jw.T
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
-        pair = np.block([[s.own, cross.T], [cross, 0.5 * (own + own.T)]])
+        own = 0.5 * (own + own.T)
+        tie = Tie(inverse(s.poses[-1]) @ T, own)
+        if s.inside and not rests and (first or before is None or (s.tie is not None and s.tie.times is not None)):
+            tie = replace(tie, times=np.array([np.nan if first or before is None else -before, 0.0, dt]))
         return replace(
-            s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), pair=pair, frame=s.frame + 1,
-            since=s.since + 1, inside=False, measured=False,
+            s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
+            pair=np.block([[s.own, cross.T], [cross, own]]), since=s.since + 1, inside=False, measured=False, tie=tie,
         )  # fmt: skip
 
     def in_view(self, s: State) -> tuple[IndexArray, Array, Array, Array]:
@@ -155,10 +158,9 @@ class Steps(RectifiedMeasurement):
                 last=np.stack([s.last[0], found.T]), landmarks=marks,
             )  # fmt: skip
             return self.settled(after, graph.rebuilt(after)), nis, ""
-        tie = Tie(inverse(s.poses[-1]) @ s.last[1], s.own)
         after = _hung(s, found.T, information)
         after = replace(
-            after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, tie),
+            after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, s.tie),
             spread=np.concatenate([s.spread, after.covariance[None]]), inside=True, landmarks=marks,
         )  # fmt: skip
         solved, why = graph.followed(after)
@@ -257,7 +259,7 @@ def _begun(s: State, T: Array, covariance: Array, sight: Sight) -> State:
     return replace(
         s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
         spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
-        since=0, inside=True,
+        since=0, inside=True, tie=None,
     )  # fmt: skip
 
 
