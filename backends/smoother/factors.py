@@ -14,6 +14,8 @@ from slam.models import EstimatorModels
 from slam.window.motion import velocity_sigmas
 from slam.window.stereo import RectifiedStereo
 
+_Smart = gtsam_unstable.SmartStereoProjectionPoseFactor
+
 
 @lru_cache(1024)
 def pose_key(number: int) -> int:
@@ -99,12 +101,12 @@ class FactorMaker:
             poses: the last three (3, 4, 4), or two of which the first velocity is unknown (2, 4, 4).
             dt: times between the last three (2,) [s].
         """
-        first, values = len(poses) == 2, gtsam.Values()
+        first, values, added = len(poses) == 2, gtsam.Values(), newest + 1 - len(poses)
         r, J = velocity_change(poses, dt)
-        rows = [row for i, by_pose in enumerate(J) for row in (pose_key(newest + 1 - len(poses) + i), by_pose)]
+        rows = [row for i, by_pose in enumerate(J) for row in (pose_key(added + i), by_pose)]
         noise = gtsam.noiseModel.Diagonal.Sigmas(velocity_sigmas(self._models, float(dt[1]), first))
         for key, T in zip(rows[::2], poses):
-            values.insert(key, to_pose3(T))
+            values.insert(key, gtsam.Pose3(T))
         return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*rows, -r, noise), values)
 
     def point(self, z: Sequence[float]) -> gtsam.StereoPoint2:
@@ -112,16 +114,15 @@ class FactorMaker:
         return gtsam.StereoPoint2(z[0], z[2], z[1])
 
     def smart(
-        self, points: Sequence[gtsam.StereoPoint2], poses: Sequence[int], careful: bool = False
+        self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int], careful: bool = False
     ) -> gtsam.NonlinearFactor:
         """A landmark eliminated from its measurements, of which two or more are needed and one with a right pixel.
 
         Both modes give the same information; the careful one takes longer, and does not throw where the landmark lies
         behind a camera.
         """
-        parameters = self._careful if careful else self._quick
-        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, parameters, *self._sensor)
-        factor.add(points, [pose_key(i) for i in poses], self._K)
+        factor = _Smart(self._noise, self._careful if careful else self._quick, *self._sensor)
+        factor.add(points, keys, self._K)
         return factor
 
     def explicit(self, point: gtsam.StereoPoint2, pose: int, landmark: int) -> gtsam.NonlinearFactor:

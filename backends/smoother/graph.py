@@ -34,7 +34,7 @@ class Track:
     Attributes:
         begun: see `Landmarks.begun`.
         poses: numbers of the poses that measured it.
-        points: the measurements.
+        keys, points: their variables, and the measurements.
         stereo: whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only.
         factor: what is in the solver; None while there is nothing.
         slot: where it is in the solver.
@@ -42,6 +42,7 @@ class Track:
 
     begun: int
     poses: list[int] = field(default_factory=list)
+    keys: list[int] = field(default_factory=list)
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
     stereo: bool = False
     factor: gtsam.NonlinearFactor | None = None
@@ -112,6 +113,7 @@ class Tracks:
     def add_rows(self, problem: Problem, s: State, number: int, first: int, begin: int = 0) -> None:
         """What was measured from a pose, from some row on."""
         sight, make, known = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
+        key = pose_key(number)
         rows = (column[begin:].tolist() for column in (sight.serials, sight.begun, sight.z))
         for serial, begun, z in zip(*rows):
             point = make.point(z)
@@ -126,6 +128,7 @@ class Tracks:
                     self._ended.append(track)
                 self._smart[serial] = track = Track(begun)
             track.poses.append(number)
+            track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
             problem.grown[serial, begun] = track
@@ -158,7 +161,7 @@ class Tracks:
             if track.stereo and len(track.poses) > 1:
                 if track.factor is not None:
                     problem.removed.append(track.slot)
-                track.factor = self._make.smart(track.points, track.poses, careful)
+                track.factor = self._make.smart(track.points, track.keys, careful)
                 made.append((track, problem.factors.size()))
                 problem.factors.add(track.factor)
         return made
@@ -215,6 +218,7 @@ class Graph:
         parameters.relinearizeSkip = 1
         parameters.setRelinearizeThreshold(0.01)
         parameters.findUnusedFactorSlots = True
+        parameters.cacheLinearizedFactors = self._lag is None  # with a lag, all is linearised with every pose
         self._solver = gtsam.IncrementalFixedLagSmoother(
             _ENDLESS if self._lag is None else float(self._lag), parameters
         )

@@ -305,7 +305,7 @@ def test_a_track_that_cannot_be_triangulated_does_not_end_the_solver():
     values = gtsam.Values()
     for i, pose in enumerate(T):
         values.insert(pose_key(i), to_pose3(pose))
-    make.smart([make.point(row) for row in z], range(3)).linearize(values)
+    make.smart([make.point(row) for row in z], [pose_key(i) for i in range(3)]).linearize(values)
 
 
 def test_a_landmark_close_by_does_not_explain_any_pixel():
