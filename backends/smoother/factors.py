@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
+from typing import Any
 
 import gtsam
 import gtsam_unstable
@@ -103,7 +104,7 @@ class FactorMaker:
         """
         first, values, added = len(poses) == 2, gtsam.Values(), newest + 1 - len(poses)
         r, J = velocity_change(poses, dt)
-        rows = [row for i, by_pose in enumerate(J) for row in (pose_key(added + i), by_pose)]
+        rows: list[Any] = [row for i, by_pose in enumerate(J) for row in (pose_key(added + i), by_pose)]
         noise = gtsam.noiseModel.Diagonal.Sigmas(velocity_sigmas(self._models, float(dt[1]), first))
         for key, T in zip(rows[::2], poses):
             values.insert(key, gtsam.Pose3(T))

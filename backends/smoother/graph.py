@@ -36,8 +36,7 @@ class Track:
         poses: numbers of the poses that measured it.
         keys, points: their variables, and the measurements.
         stereo: whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only.
-        factor: what is in the solver; None while there is nothing.
-        slot: where it is in the solver.
+        slot: of the factor in the solver, −1 while there is none.
     """
 
     begun: int
@@ -45,7 +44,6 @@ class Track:
     keys: list[int] = field(default_factory=list)
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
     stereo: bool = False
-    factor: gtsam.NonlinearFactor | None = None
     slot: int = -1
 
 
@@ -93,7 +91,6 @@ class Tracks:
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
         self._make, self._lag = make, lag
         self._smart: dict[int, Track] = {}
-        self._ended: list[Track] = []  # of which the landmarks have gone on in others
         self._variables: dict[int, int] = {}  # numbers of the poses that measured them last
 
     def add_pose(self, problem: Problem, s: State, number: int, first: int) -> None:
@@ -124,8 +121,6 @@ class Tracks:
                 continue
             track = self._smart.get(serial)
             if track is None or track.begun != begun:
-                if track is not None:
-                    self._ended.append(track)
                 self._smart[serial] = track = Track(begun)
             track.poses.append(number)
             track.keys.append(key)
@@ -159,33 +154,16 @@ class Tracks:
         made = []
         for track in problem.grown.values():
             if track.stereo and len(track.poses) > 1:
-                if track.factor is not None:
+                if track.slot >= 0:
                     problem.removed.append(track.slot)
-                track.factor = self._make.smart(track.points, track.keys, careful)
                 made.append((track, problem.factors.size()))
-                problem.factors.add(track.factor)
+                problem.factors.add(self._make.smart(track.points, track.keys, careful))
         return made
 
-    def linearised(self, problem: Problem, s: State, values: gtsam.Values) -> None:
-        """Put one linear factor in the place of all smart factors that will not grow any more, at the present values.
-
-        They are most of the factors, and gtsam would linearise each of them again with every pose.
-        """
-        ended, self._ended = self._ended, []
-        if self._lag is None:
-            return
-        in_map = np.isin(list(self._smart), s.landmarks.serial).tolist()
-        oldest = s.number - (self._lag + 1) // 2
-        for serial, goes_on in list(zip(self._smart, in_map)):
-            if not goes_on or self._smart[serial].poses[-1] < oldest:
-                ended.append(self._smart.pop(serial))
-        ended = [t for t in ended if t.factor is not None and values.exists(pose_key(t.poses[0]))]
-        if ended:
-            linear = gtsam.GaussianFactorGraph()
-            for track in ended:
-                linear.add(track.factor.linearize(values))
-            problem.factors.add(gtsam.LinearContainerFactor(gtsam.HessianFactor(linear), values))
-            problem.removed.extend(track.slot for track in ended)
+    def forget(self, number: int) -> None:
+        """Forget the smart factors that will not grow at the next pose; once in a while."""
+        if self._lag is not None and not number % self._lag:
+            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] > number - self._lag}
 
 
 class Graph:
@@ -218,12 +196,10 @@ class Graph:
         parameters.relinearizeSkip = 1
         parameters.setRelinearizeThreshold(0.01)
         parameters.findUnusedFactorSlots = True
-        parameters.cacheLinearizedFactors = self._lag is None  # with a lag, all is linearised with every pose
         self._solver = gtsam.IncrementalFixedLagSmoother(
             _ENDLESS if self._lag is None else float(self._lag), parameters
         )
         self._tracks = Tracks(self._make, self._lag)
-        self._values = gtsam.Values()
         self._number, self._taken = -1, 0
         self._poses: dict[int, Array] = {}
         self._held = np.eye(4)  # the pose that is held
@@ -282,7 +258,6 @@ class Graph:
             self._tracks.add_pose(problem, s, number, first)
             self._tracks.add_rows(problem, s, number, first)
             self._taken = len(s.sights[s.of(number)])
-        self._tracks.linearised(problem, s, self._values)
         made = self._tracks.make_smart(problem, s.number < self._careful)
         self._solver.update(problem.factors, problem.values, problem.stamps, problem.removed)
         slots = self._solver.getISAM2Result().getNewFactorsIndices()
@@ -290,7 +265,8 @@ class Graph:
             track.slot = slots[place]
         for _ in range(again):
             self._solver.update()
-        values = self._values = self._solver.calculateEstimate()
+        self._tracks.forget(s.number)
+        values = self._solver.calculateEstimate()
         poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)])
         self._poses = dict(zip(range(first, s.number + 1), poses))
         solved = Solved(first, poses, self._joint(list(range(max(first, s.number - 1), s.number + 1))))

@@ -50,7 +50,7 @@ def tracked(data, **options):
     return backend
 
 
-OPTIONS = [{}, {"motion": 0.0}, {"motion": 0.1}, {"track": 3}, {"lag": None}, {"lag": 4, "past": 0}]
+OPTIONS = [{}, {"motion": 0.02}, {"motion": 0.1}, {"track": 3}, {"lag": None}, {"lag": 4, "past": 0}]
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
@@ -69,7 +69,7 @@ def test_fewer_frames_become_poses_where_less_moves():
     numbers = [tracked(data, motion=motion, overlap=0.5).state.number + 1 for motion in (0.0, 0.01, 0.04)]
     assert numbers[0] == 30 and numbers[0] > numbers[1] > numbers[2] > 2, numbers
     still = scene(np.tile(np.eye(4), (30, 1, 1)))
-    assert tracked(still).state.number == 0
+    assert tracked(still, motion=0.02).state.number == 0
 
 
 def test_errors_fit_the_covariances_over_seeds():
@@ -80,6 +80,23 @@ def test_errors_fit_the_covariances_over_seeds():
         off = se3.log(se3.inverse(last.T_world_left) @ poses[-1])
         squared.append(off @ np.linalg.solve(last.covariance, off))
     assert 1.5 < np.mean(squared) < 9  # 6 expected; the path is smoother than the motion model expects
+
+
+def test_landmarks_that_were_found_together_do_not_all_begin_anew_together():
+    """That would leave but the motion model between two poses, and the newest one 2.8 times as uncertain."""
+    data = drive(22, points=150)
+    ours, best = SmootherBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, lag=None, track=1000)
+    deviations = []
+    for backend in (ours, best):
+        run(backend, data)
+        deviations.append(np.sqrt(np.trace(backend.estimate(landmarks=False).covariance[3:, 3:])))
+    assert deviations[0] < 1.4 * deviations[1], deviations
+    serials = np.concatenate([sight.serials for sight in ours.state.sights[1:]])
+    begun = np.concatenate([sight.begun for sight in ours.state.sights[1:]])
+    first = np.array([begun[serials == n].min() for n in np.unique(serials)])
+    second = np.array([np.setdiff1d(begun[serials == n], [m])[:1] for n, m in zip(np.unique(serials), first)], object)
+    at = np.concatenate([np.asarray(x, int) for x in second])
+    assert len(at) > 10 and np.bincount(at).max() < 0.4 * len(at), "one after the other"
 
 
 def test_what_removed_landmarks_have_told_stays_known():
@@ -239,6 +256,20 @@ def test_right_pixels_are_mended_afterwards(options):
     seen = np.isin(ours.ids, data.observations[-1].ids)
     deviations = np.sqrt(np.trace(theirs.covariances, axis1=1, axis2=2))
     assert np.median((np.linalg.norm(local - truth, axis=1) / deviations)[seen]) < 0.6  # of its own uncertainty
+
+
+def test_a_revision_that_changes_nothing_leaves_the_covariances():
+    """What was seen long ago may become less certain: the path moves, and what is known is known of the newest pose."""
+    data = drive(30, points=250)
+    backend = tracked(data)
+    before = backend.estimate()
+    backend.revise(lambda z: z)
+    after = backend.estimate()
+    np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-6, atol=1e-12)
+    seen = np.isin(before.ids, data.observations[-1].ids)
+    sizes = [np.sqrt(np.trace(e.covariances, axis1=1, axis2=2))[seen] for e in (before, after)]
+    np.testing.assert_allclose(sizes[1], sizes[0], rtol=0.12)
+    assert abs(np.median(sizes[1] / sizes[0]) - 1) < 0.01
 
 
 def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
