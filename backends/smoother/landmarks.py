@@ -196,7 +196,8 @@ class Landmarks:
 
         With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
         fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
-        information. Measurements from earlier poses count for the first one.
+        information. Measurements from earlier poses count for the first one. A landmark that none of the graph's poses
+        measured is carried by the newest, with the drift since it was seen.
 
         Args:
             stereo: the rectified rig.
@@ -214,6 +215,7 @@ class Landmarks:
         J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
         n, width = len(chosen), len(joint)
         C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
+        C += np.where((rows < 0).all(axis=1)[:, None, None], self.away[chosen], 0.0)
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
 
 

@@ -296,8 +296,14 @@ def _with(s: State, marks: Landmarks) -> State:
 
 
 def _seen_from_newest(s: State, ids: IdArray, local: Array, covariances: Array) -> Landmarks:
-    """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes."""
+    """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes.
+
+    From a frame that is no pose of the graph they are as uncertain as it is itself, given the newest pose of the graph.
+    """
     T = s.last[1]
+    if not s.inside:
+        by_pose = points_by_pose(local)
+        covariances = covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)
     own = T[:3, :3] @ covariances @ T[:3, :3].T
     own = 0.5 * (own + np.swapaxes(own, 1, 2))
     return Landmarks.of(ids, s.serials, transform(T, local), own, inverses(own), False)
