@@ -19,7 +19,6 @@ FAILURES = (RuntimeError, ValueError, LookupError)
 
 _ENDLESS = 1e9  # numerics: a lag that no run reaches
 _CAREFUL = 20  # numerics: poses after a failure whose factors are made so that they do not throw
-_ITERATIONS = 2  # numerics: of Gauss and Newton after the first, where measurements were revised
 _FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with which the first pose is held
 
 
@@ -172,9 +171,9 @@ class Graph:
     It follows a `State`, and nothing is in it alone: where it cannot go on from one state to the next, or gtsam fails,
     it is built anew from what the state keeps.
 
-    One pose, the first, is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in
-    the world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks
-    are known in the world the first pose has its own covariance instead.
+    Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
+    world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
+    known in the world the first pose has its own covariance instead.
 
     Args:
         make: makes the factors.
@@ -201,9 +200,9 @@ class Graph:
         )
         self._tracks = Tracks(self._make, self._lag)
         self._number, self._taken = -1, 0
+        self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}
-        self._held = np.eye(4)  # the pose that is held
-        self._base: Array = np.zeros((6, 6))  # what is known of it, besides its prior
+        self._first = np.eye(4)
         self._kind = False, 0
 
     def followed(self, s: State) -> tuple[Solved, str]:
@@ -222,23 +221,20 @@ class Graph:
                 self._careful = s.number + (self._lag or _CAREFUL)
         return self.rebuilt(s), why
 
-    def rebuilt(self, s: State, revised: bool = False) -> Solved:
-        """The solution with all anew, from what the state keeps.
-
-        If measurements were revised, the newest pose is the one that is held, and the solver iterates.
+    def rebuilt(self, s: State, again: int = 0) -> Solved:
+        """The solution with all anew, from what the state keeps; `again` so many times linearised again.
 
         Raises:
             SolverError: gtsam fails.
         """
         self.restart()
         oldest = self.oldest(s)
-        number = s.number if revised and not s.anchored else oldest
         try:
-            self._kind, self._held = _kind(s), s.poses[s.of(number)]
-            prior, self._base = held(s, number)
+            self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
+            prior, self._base = held(s, oldest)
             begin = Problem()
-            begin.factors.add(self._make.prior(number, self._held, prior))
-            return self._update(s, range(oldest, s.number + 1), oldest, begin, _ITERATIONS if revised else 0)
+            begin.factors.add(self._make.prior(oldest, self._first, prior))
+            return self._update(s, range(oldest, s.number + 1), oldest, begin, again)
         except FAILURES as error:
             raise SolverError(_line(error)) from error
 
@@ -290,7 +286,7 @@ class Graph:
     def _joint(self, numbers: list[int]) -> Array:
         isam, keys = self._solver.getISAM2(), [pose_key(i) for i in numbers]
         P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
-        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._held).reshape(-1, 6)
+        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
         P = P + A @ self._base @ A.T
         return np.asarray(0.5 * (P + P.T))
 

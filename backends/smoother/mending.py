@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from backends.smoother.steps import Steps
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, inverse, transform
 
+_AGAIN = 2  # numerics: steps of Gauss and Newton after the first
 _ITERATIONS = 20  # numerics: of Levenberg-Marquardt at most
 
 
@@ -39,9 +41,8 @@ def rebuilt(s: State, steps: Steps, graph: Graph) -> State:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
     first = graph.oldest(s)
     try:
-        now = graph.rebuilt(s, revised=True).poses
+        now = graph.rebuilt(s, _AGAIN).poses
     except SolverError:
-        graph.restart()
         now = s.poses[s.of(first) :]
     if not s.anchored:
         now = s.poses[-1] @ inverse(now[-1]) @ now
@@ -56,7 +57,10 @@ def rebuilt(s: State, steps: Steps, graph: Graph) -> State:
     before = s.poses[-1] if s.inside is False or len(moved) < 2 else s.poses[-2]
     after = moved[-1] if s.inside is False or len(moved) < 2 else moved[-2]
     last[0] = after @ inverse(before) @ s.last[0]
-    return replace(s, poses=moved, last=last, landmarks=marks.refined(steps.stereo, steps.sigma, s.first, moved))
+    s = replace(s, poses=moved, last=last, landmarks=marks.refined(steps.stereo, steps.sigma, s.first, moved))
+    with suppress(SolverError):  # then the next update tries again
+        graph.rebuilt(s)
+    return s
 
 
 def path_solved(s: State, make: FactorMaker, before: Array) -> Array:

@@ -259,7 +259,7 @@ def test_right_pixels_are_mended_afterwards(options):
 
 
 def test_a_revision_that_changes_nothing_leaves_the_covariances():
-    """What was seen long ago may become less certain: the path moves, and what is known is known of the newest pose."""
+    """Up to what poses that have left the lag told of it: the graph is built anew from the poses of the lag alone."""
     data = drive(30, points=250)
     backend = tracked(data)
     before = backend.estimate()
