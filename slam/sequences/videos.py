@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from slam.geometry.se3 import Array
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import FASTEST, SLOWEST
 from slam.sequences.images import MOST_PIXELS, Size, halves
-from slam.sequences.quiet import quiet_libraries
+from slam.sequences.devices import quiet_libraries, read_image
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -55,7 +54,7 @@ class VideoPairs:
                     for video in videos:
                         video.grab()
             for index in range(start, stop):
-                images = [_next_grey(video) for video in videos]
+                images = [read_image(video) if video.grab() else None for video in videos]
                 for path, image in zip(paths, images):
                     if image is None:
                         faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
@@ -102,7 +101,6 @@ def open_video(path: Path) -> Iterator[Any]:
     import cv2
 
     require_content(path)  # a pipe would be waited for
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # faults are reported by us, once
     with quiet_libraries():
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # others take a name for a pattern
     try:
@@ -123,7 +121,7 @@ def _describe(path: Path) -> tuple[int, float, Size]:
     with open_video(path) as video:
         claimed, rate = video.get(cv2.CAP_PROP_FRAME_COUNT), float(video.get(cv2.CAP_PROP_FPS))
         count = int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 0
-        first = _next_grey(video)
+        first = read_image(video) if video.grab() else None
         if first is None:
             raise SequenceError(f"{path}: no frame of the video can be decoded")
         if count <= 0:
@@ -132,17 +130,3 @@ def _describe(path: Path) -> tuple[int, float, Size]:
                 while count < _MOST_FRAMES and video.grab():
                     count += 1
     return count, rate, (first.shape[1], first.shape[0])
-
-
-def _next_grey(video: Any) -> np.ndarray | None:
-    """The next frame in grey (H, W) uint8; None at the end or where it cannot be decoded."""
-    import cv2
-
-    try:
-        with quiet_libraries():
-            good, image = video.read()
-    except cv2.error:
-        return None
-    if not good or image is None:
-        return None
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))

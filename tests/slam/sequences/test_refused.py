@@ -209,7 +209,7 @@ def test_images_that_never_pair(euroc, kitti, two_folders, build):
     refused(euroc, SequenceError, "the nearest two are 20 ms apart, 5 ms are allowed; see tolerance=")
     for path in (kitti / "image_1").iterdir():
         build.cut(path)
-    refused(kitti, SequenceError, r"no pair of images can be read: .*PNG is cut off")
+    refused(kitti, SequenceError, r"no pair of images can be read: .*cut off or damaged")
     for side in ("left", "right"):
         for path, name in zip(sorted((two_folders / side).iterdir()), "abcdef"):
             path.rename(path.with_name(f"{name}.png"))
