@@ -267,9 +267,13 @@ class Session:
         return state, prediction
 
     def left_behind(self, before: State, step: Step) -> IdArray:
-        """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began."""
+        """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began.
+
+        What the rig's uncertainty does to those is forgotten.
+        """
         if before.landmarks is None or step.report.reason != NEW_MAP:
             return step.erased
+        self.rig_error.uncertainty.keep(step.landmarks.ids)
         return np.concatenate([np.setdiff1d(before.landmarks.ids, step.landmarks.ids), step.erased])
 
     def _start(self, T_world_left: Array) -> Backend:

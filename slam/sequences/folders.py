@@ -6,11 +6,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import SequenceError
 from slam.files import expanded
 from slam.sequences.base import RecordedSequence
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import Given
+from slam.sequences.given import Given, layout_of
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.names import of_sides
 from slam.sequences.rigs import calibration_files, read_rig
@@ -19,7 +19,6 @@ from slam.sequences.videos import VIDEO_SUFFIXES, VideoPairs, open_videos
 
 _NAMES = (("left", "right"), ("image_left", "image_right"), ("cam0", "cam1"))
 _TIMES = ("times.txt", "timestamps.txt")
-_LAYOUTS = ("sbs",)
 
 
 @dataclass(frozen=True)
@@ -67,11 +66,8 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
 
 def _sides(folder: Path, options: Given) -> list[_Side]:
     """Both cameras, or the one place where both are side by side."""
-    layout = options.get("layout")
-    if layout is None:
+    if layout_of(options) is None:
         return [_side(folder, side, options) for side in (0, 1)]
-    if layout not in _LAYOUTS:
-        raise ConfigurationError(f"layout must be {' or '.join(_LAYOUTS)} (side by side), got {layout!r}")
     if folder.is_file():
         return [_Side(folder)]
     return [_found(folder / expanded(options["left"]) if "left" in options else _only(folder))]

@@ -32,8 +32,8 @@ _DAMAGED = (OSError, SyntaxError, ValueError, LookupError, TypeError, EOFError, 
 def read_image(path: Path, size: Size | None = None) -> np.ndarray:
     """The image (H, W) in grey, uint8 or uint16 as stored; colour is converted, EXIF rotation ignored.
 
-    The size is taken from the header before anything is decoded. A file that is cut off, or a PNG with a wrong checksum,
-    is never taken for a partly grey image.
+    The size is taken from the header before anything is decoded. A file that is cut off, or a PNG with a wrong
+    checksum, is never taken for a partly grey image.
 
     Args:
         path: the file.
@@ -98,16 +98,21 @@ def require_image_size(found: Size, expected: Size | None, what: str) -> None:
         raise SequenceError(f"{what}: image is {size_text(found)}: at most {MOST_PIXELS} pixels are read")
 
 
-def halves(image: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """The left and the right half of an image that holds two side by side.
+def halved(size: Size, what: str) -> Size:
+    """Width and height of each of two images that are side by side in one.
 
     Raises:
         SequenceError: its width is odd; the message names `what`.
     """
-    width = image.shape[1]
-    if width % 2 or width < 2:
-        raise SequenceError(f"{what}: an image of {size_text(image.shape[1::-1])} cannot hold two side by side")
-    return image[:, : width // 2], image[:, width // 2 :]
+    if size[0] % 2 or size[0] < 2:
+        raise SequenceError(f"{what}: an image of {size_text(size)} cannot hold two side by side")
+    return size[0] // 2, size[1]
+
+
+def halves(image: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """The left and the right half of an image that holds two side by side; raises as `halved`."""
+    width, _ = halved((image.shape[1], image.shape[0]), what)
+    return image[:, :width], image[:, width:]
 
 
 def size_text(size: tuple[int, ...]) -> str:

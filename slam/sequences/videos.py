@@ -14,10 +14,10 @@ from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.files import require_content
 from slam.geometry.se3 import Array
+from slam.sequences.devices import quiet_libraries, read_image
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import FASTEST, SLOWEST
-from slam.sequences.images import MOST_PIXELS, Size, halves
-from slam.sequences.devices import quiet_libraries, read_image
+from slam.sequences.images import MOST_PIXELS, Size, halved, halves
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -74,7 +74,7 @@ def open_videos(left: Path, right: Path | None, rate: float | None, faults: Faul
     (count_left, rate_left, size_left) = _describe(left)
     count_right, size_right = count_left, size_left
     if right is None:
-        size_left = size_right = halves(np.empty(size_left[::-1], bool), str(left))[0].shape[::-1]
+        size_left = size_right = halved(size_left, str(left))
     else:
         count_right, _, size_right = _describe(right)
     if size_left != size_right:
