@@ -92,7 +92,7 @@ class Mapper:
         view = self._view(backend, step.landmarks, step)
         landmarks = self._count(step.landmarks, view, step)
         bad = isin(landmarks.ids, step.labels.landmarks)
-        if step.features.has_stereo.any() or not len(step.features):  # else nothing much can take their place
+        if step.features.has_stereo.any() or not len(step.features):  # else little can take their place
             bad |= bad_landmarks(landmarks, self.config)
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)

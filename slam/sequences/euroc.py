@@ -39,7 +39,7 @@ _TRUTH = ("state_groundtruth_estimate0", "mocap0")  # both give the body's (IMU'
 _CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "../camchain.yaml", "../dso/camchain.yaml")
 
 
-def matches(folder: Path) -> bool:
+def matches_folder(folder: Path) -> bool:
     """Whether a folder looks like EuRoC's: it, or its ``mav0``, holds ``cam0`` or ``cam1`` with data in it."""
     return any((_root(folder) / cam / part).exists() for cam in ("cam0", "cam1") for part in ("data", "data.csv"))
 

@@ -29,7 +29,7 @@ class _Side:
     names: list[str] | None = None
 
 
-def matches(folder: Path) -> bool:
+def matches_folder(folder: Path) -> bool:
     """Whether a folder holds a left or a right camera by one of the usual names, as folders, videos or images."""
     return any(_by_convention(folder, side) is not None for side in (0, 1))
 

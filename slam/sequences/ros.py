@@ -40,7 +40,7 @@ _LATE = 10  # messages in a row that are out of order; more, or the last ones, a
 _LATEST = 10**9  # [ns] that a message is late; more is a wrong stamp, or the clock
 
 
-def matches(path: Path) -> bool:
+def matches_folder(path: Path) -> bool:
     """Whether a path is a ROS recording by its ending or, for a folder, by its ``metadata.yaml``."""
     if not path.is_dir():
         return path.name.lower().endswith(SUFFIXES) and path.is_file()

@@ -11,8 +11,8 @@ from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.naming import suggestion
-from slam.sequences.calibration import naming
-from slam.sequences.calibration_keys import Entries, array, rig_of
+from slam.sequences.calibration import array, naming
+from slam.sequences.calibration_keys import Entries, rig_of
 from slam.sequences.given import layout_of
 from slam.sequences.ros_bag import COMPRESSED, DEPTH, RAW, Bag, naming_recording
 
