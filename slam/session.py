@@ -259,9 +259,10 @@ class Session:
             standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
             atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), place)
         path = old.trajectory().select(slice(None, -1))
+        hidden = elsewhere.T_world_left is None and state.tracking.stood and self._models.motion.wheels
         state = replace(
             state, backend=new, landmarks=landmarks, atlas=atlas, standing=standing,
-            tracking=state.tracking.believing(T, stamp), past=(*state.past, path),
+            tracking=state.tracking.believing(T, stamp, T if hidden else None), past=(*state.past, path),
             restarted=(*state.restarted, state.index + 1),
         )  # fmt: skip
         return state, prediction

@@ -13,7 +13,7 @@ from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED, baseline_doubt
 from slam.models import MotionModel
 from slam.run.summary import RunRecord
-from slam.tracks.state import ENOUGH_FEATURES
+from slam.tracks.state import ENOUGH_FEATURES, HIDDEN
 
 _TRACKED = "tracked"
 
@@ -197,6 +197,8 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
     features, stereo = np.median(np.array(record.features)[untracked], axis=0)
     if features < ENOUGH_FEATURES:
         return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
+    if 2 * record.hidden > len(untracked):
+        return f"in {record.hidden} of them {HIDDEN}"
     if in_map:
         return "the camera is not where the map was made, or the place looks different now"
     missing = _by_missing_images(record, untracked)
