@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from slam.errors import SequenceError
@@ -52,15 +52,12 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
             raise SequenceError(f"{left.path} and {right.path}: one is a video and the other is not")
         if left.names is None:
             source = open_videos(left.path, None if right is None else right.path, options.rate(), faults)
-            size = source.size
         else:
             path = times_file(home, options, *(home / name for name in _TIMES))
             listings = by_names([s.path for s in sides], [s.names or [] for s in sides], faults)
             times = read_times(path, faults)
             _, source = pair_up(listings[0], listings[1] if right else None, options, faults, times)
-            size = source.first_size()
-            source = replace(source, size=size)
-        rig = read_rig(calibration_files(home, options), size, options)
+        rig = read_rig(calibration_files(home, options), source.size, options)
     return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 

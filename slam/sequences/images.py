@@ -98,6 +98,17 @@ def require_image_size(found: Size, expected: Size | None, what: str) -> None:
         raise SequenceError(f"{what}: image is {size_text(found)}: at most {MOST_PIXELS} pixels are read")
 
 
+def require_same_size(left: tuple[int, ...], right: tuple[int, ...], *names: object) -> None:
+    """Raise where the images of two cameras, by these names, differ in size (width first).
+
+    Raises:
+        SequenceError: they do.
+    """
+    if left != right:
+        sizes = ", ".join(f"{name} is {size_text(size)}" for name, size in zip(names, (left, right)))
+        raise SequenceError(f"left and right images differ in size: {sizes}")
+
+
 def halved(size: Size, what: str) -> Size:
     """Width and height of each of two images that are side by side in one.
 

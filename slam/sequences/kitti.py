@@ -91,8 +91,8 @@ def _open(folder: Path, where: Layout, options: Given) -> RecordedSequence:
         dated = path is not None and where.drive is not None and "times" not in options
         origin, times = _dates(path, faults) if path and dated else (None, read_times(path, faults))
         left, source = pair_up(listings[0], listings[1], options, faults, times, by_number=True)
-        source = replace(source, size=source.first_size())
-        rig, T_left_reference = _rig(folder, where, source.first_size(), options)
+        assert source.size is not None
+        rig, T_left_reference = _rig(folder, where, source.size, options)
         frames, gps = Frames(left.keys, source.stamps, left.folder.parent.name == "image_00"), None
         if where.drive is None:
             poses = next((path for path in where.poses if path.is_file()), None)

@@ -18,7 +18,7 @@ from slam.geometry.stamps import IntArray, increasing, pair, trim
 from slam.sequences.base import delivered
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import WIDEST_TOLERANCE, Given
-from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, size_text
+from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, require_same_size, size_text
 from slam.sequences.names import MOST_FRAMES, keys_of, natural, same_order, stem
 from slam.sequences.tables import read_rows, seconds
 
@@ -111,9 +111,7 @@ class ImagePairs:
             except SequenceError as error:
                 reason = str(error)
                 continue
-            if left.shape != right.shape:
-                sizes = f"{left_path} is {size_text(left.shape[::-1])}, {right_path} is {size_text(right.shape[::-1])}"
-                raise SequenceError(f"left and right images differ in size: {sizes}")
+            require_same_size(left.shape[::-1], right.shape[::-1], left_path, right_path)
             return left.shape[1], left.shape[0]
         raise SequenceError(f"{self.left_folder}: no pair of images can be read: {reason}")
 
@@ -240,7 +238,7 @@ def pair_up(
         The left images that are left, and the pairs.
 
     Raises:
-        SequenceError: nothing pairs, or hardly a frame has a time.
+        SequenceError: nothing pairs, hardly a frame has a time, or no pair can be read.
     """
     rate = None if times else options.rate()
     kept, partners = left, list[str | None](left.names)
@@ -263,7 +261,8 @@ def pair_up(
         if rate is None:
             faults.assume(f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
         stamps = numbers / (rate or RATE)
-    return kept, ImagePairs(stamps, left.folder, kept.names, (right or left).folder, partners, halves=right is None)
+    pairs = ImagePairs(stamps, left.folder, kept.names, (right or left).folder, partners, halves=right is None)
+    return kept, replace(pairs, size=pairs.first_size())
 
 
 def in_seconds(

@@ -17,7 +17,7 @@ from slam.geometry.se3 import Array
 from slam.sequences.devices import quiet_libraries, read_image
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import FASTEST, SLOWEST
-from slam.sequences.images import MOST_PIXELS, Size, halved, halves
+from slam.sequences.images import MOST_PIXELS, Size, halved, halves, require_same_size
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -77,11 +77,7 @@ def open_videos(left: Path, right: Path | None, rate: float | None, faults: Faul
         size_left = size_right = halved(size_left, str(left))
     else:
         count_right, _, size_right = _describe(right)
-    if size_left != size_right:
-        raise SequenceError(
-            f"left and right images differ in size: {left} is {size_left[0]}x{size_left[1]}, "
-            f"{right} is {size_right[0]}x{size_right[1]}"
-        )
+    require_same_size(size_left, size_right, left, right)
     if count_left != count_right:
         line = f"{left} has {count_left} frames, {right} has {count_right}: the surplus is left out"
         faults.report("videos", line)
