@@ -27,6 +27,7 @@ _ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
 #: guard: Median speeds [m/s] that no camera in a hand and no vehicle has, and median distances [m] that neither sees.
 _FASTEST = {False: 10.0, True: 100.0}
 _NEAREST = {False: 0.05, True: 1.0}
+_WIDEST = {False: 1.0, True: np.inf}  # guard: baseline [m] that no hand carries
 
 _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is said
 
@@ -89,6 +90,11 @@ def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
     kind = "" if driving else "a vehicle's camera without --kind driving, "
     depths = np.array(record.depths)[np.isfinite(record.depths)]
     seen = f" and what they see is {_rounded(float(np.median(depths)))} m away in the median" if len(depths) else ""
+    if rig.baseline > _WIDEST[driving]:
+        return (
+            f"by the calibration the cameras are {rig.baseline:.3g} m apart{seen}, which no hand carries: a baseline "
+            "in another unit (unit=cm, unit=mm), or a vehicle's camera without --kind driving"
+        )
     return (
         f"features are found in both images, but not again in the next frame: {kind}frames too far apart"
         f"{_speed(record)}, images that are not in order of time or have other times than theirs (fps=…, times=…), or "
@@ -130,7 +136,7 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     if len(speeds) < _LEAST_CHANGES or not len(depths):
         return ""
     speed, depth = float(np.median(speeds[:, 1])), float(np.median(depths))
-    if speed <= _FASTEST[driving] and depth >= _NEAREST[driving]:
+    if speed <= _FASTEST[driving] and depth >= _NEAREST[driving] and rig.baseline <= _WIDEST[driving]:
         return ""
     carrier = "no vehicle does" if driving else "no camera in a hand does (is it a vehicle's: --kind driving?)"
     return (
