@@ -5,7 +5,7 @@ They are read by the package rosbags (``pip install 'surf-stereo-slam[ros]'``), 
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,17 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
 from slam.sequences import rigs
-from slam.sequences.base import RecordedSequence, delivered
+from slam.sequences.base import Images, RecordedSequence
 from slam.sequences.calibration import naming
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given, flag
-from slam.sequences.images import Size, halved, halves
+from slam.sequences.images import Size, halved
 from slam.sequences.ros_bag import Bag, naming_recording, open_bag
 from slam.sequences.ros_topics import Topics, choose_topics, rig_from_camera_infos
 from slam.sequences.source import Listing, hardware_tolerance, in_order, in_seconds, pair_listings, require_size
@@ -113,21 +112,20 @@ class RosPairs:
     right_rows: IntArray
     size: Size
 
-    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
-        """Decode frames `start` to `stop`; a damaged left image costs its frame, a right one itself."""
+    @property
+    def halves(self) -> bool:
+        """Both images are in one topic."""
+        return self.right is self.left
+
+    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
+        """Decode the images of frames `start` to `stop`; an error in place of one that is damaged."""
         right_rows = self.right_rows[start:stop]
         with ExitStack() as stack:
             bags = [stack.enter_context(open_bag(self.path)) for _ in range(2)]  # each goes its own way through it
             left = stack.enter_context(closing(self._images(bags[0], self.left, self.left_rows[start:stop])))
             right = stack.enter_context(closing(self._images(bags[1], self.right, right_rows[right_rows >= 0])))
-            for index, right_row in zip(range(start, stop), right_rows.tolist()):
-                image = next(left, None)
-                partner = next(right, None) if right_row >= 0 else None
-                if image is None:
-                    return
-                if self.right is self.left and isinstance(image, np.ndarray):
-                    image, partner = halves(image, self.left.topic)
-                yield from delivered(index, float(self.stamps[index]), image, partner, faults)
+            for image, right_row in zip(left, right_rows.tolist()):
+                yield image, next(right, None) if right_row >= 0 else None
 
     def _images(
         self, bag: Bag, messages: Messages, rows: IntArray

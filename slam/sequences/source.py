@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.files import expanded, note_input
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
-from slam.sequences.base import delivered
+from slam.sequences.base import Images
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import WIDEST_TOLERANCE, Given
 from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, require_same_size, size_text
@@ -74,18 +72,11 @@ class ImagePairs:
     size: Size | None = None
     halves: bool = False
 
-    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
-        """Decode frames `start` to `stop`.
-
-        A frame whose left image is unreadable or of another size is skipped; one whose right image is, is given
-        without it.
-        """
-        for index in range(start, stop):
-            left, name = self._read_one(self.left_folder / self.left[index]), self.right[index]
-            right = None if self.halves or name is None else self._read_one(self.right_folder / name)
-            if self.halves and isinstance(left, np.ndarray):
-                left, right = halves(left, self.left[index])
-            yield from delivered(index, float(self.stamps[index]), left, right, faults)
+    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
+        """Decode the images of frames `start` to `stop`; an error in place of one that is unreadable."""
+        for name, partner in zip(self.left[start:stop], self.right[start:stop]):
+            right = None if self.halves or partner is None else self._read_one(self.right_folder / partner)
+            yield self._read_one(self.left_folder / name), right
 
     def _read_one(self, path: Path) -> np.ndarray | SequenceError:
         size = self.size

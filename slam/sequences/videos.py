@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.files import require_content
 from slam.geometry.se3 import Array
+from slam.sequences.base import Images
 from slam.sequences.devices import quiet_libraries, read_image
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import FASTEST, SLOWEST
-from slam.sequences.images import MOST_PIXELS, Size, halved, halves, require_same_size
+from slam.sequences.images import MOST_PIXELS, Size, halved, require_same_size
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -40,7 +40,12 @@ class VideoPairs:
     right: Path | None
     size: Size
 
-    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
+    @property
+    def halves(self) -> bool:
+        """Both images are in the left file."""
+        return self.right is None
+
+    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode frames `start` to `stop`, in grey; a video that ends too early ends the sequence with a line.
 
         A video cannot be entered in the middle without errors, so what is skipped is passed over, though not
@@ -58,11 +63,9 @@ class VideoPairs:
                 for path, image in zip(paths, images):
                     if image is None:
                         faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
-                there = [image for image in images if image is not None]
-                if len(there) < len(images):
+                if any(image is None for image in images):
                     return
-                left, right = there if len(there) == 2 else halves(there[0], str(self.left))
-                yield StereoFrame(index, float(self.stamps[index]), left, right)
+                yield images[0], images[1] if len(images) > 1 else None
 
 
 def open_videos(left: Path, right: Path | None, rate: float | None, faults: FaultLog) -> VideoPairs:
