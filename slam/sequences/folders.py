@@ -12,12 +12,12 @@ from slam.sequences.base import RecordedSequence
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given, layout_of
 from slam.sequences.images import IMAGE_SUFFIXES
-from slam.sequences.names import of_sides
+from slam.sequences.names import SIDES, of_sides
 from slam.sequences.rigs import calibration_files, read_rig
 from slam.sequences.source import ImagePairs, by_names, image_names, pair_up, read_times, times_file
 from slam.sequences.videos import VIDEO_SUFFIXES, VideoPairs, open_videos
 
-_NAMES = (("left", "right"), ("image_left", "image_right"), ("cam0", "cam1"))
+_NAMES = (*SIDES, ("image_left", "image_right"))
 _TIMES = ("times.txt", "timestamps.txt")
 
 

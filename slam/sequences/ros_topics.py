@@ -14,10 +14,10 @@ from slam.naming import suggestion
 from slam.sequences.calibration import array, naming
 from slam.sequences.calibration_keys import Entries, rig_of
 from slam.sequences.given import layout_of
+from slam.sequences.names import SIDES
 from slam.sequences.ros_bag import COMPRESSED, DEPTH, RAW, Bag, naming_recording
 
 _INFO = "sensor_msgs/msg/CameraInfo"
-_NAMES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"))
 _SAME_PLACE = 1e-6  # [m] from a pair's left camera
 _LISTED = 12  # topics named in a message
 
@@ -175,7 +175,7 @@ def _pairs_by_name(recording: Bag) -> list[tuple[str, str]]:
     images = sorted(_of_kind(recording, (RAW, COMPRESSED)), key=_preference(recording))
     found: dict[tuple[str, str], tuple[str, str]] = {}
     for topic in images:
-        for names in _NAMES:
+        for names in SIDES:
             other = topic.replace(*names)
             if other != topic and other in images and not _is_depth(recording, topic):
                 spaces = _space(topic), _space(other)
