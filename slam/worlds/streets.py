@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from slam.data import IdArray
 from slam.geometry.se3 import Array, pose
-from slam.worlds.drives import SAME_ROAD, STEP, Road
-from slam.worlds.geometry import Rectangle, rectangle
+from slam.geometry.trajectory import Trajectory
+from slam.worlds.drives import EYE, SAME_ROAD, STEP, Road, around_blocks, level, read_path, sampled
+from slam.worlds.geometry import Parts, Rectangle, rectangle
 from slam.worlds.paths import yaw_pitch_roll
-from slam.worlds.scenes.roadside import cabinet, trunk
-from slam.worlds.textures.surfaces import Facade, Material
+from slam.worlds.roadside import cabinet, car, trunk
+from slam.worlds.surfaces import Material, facade
 
-EYE = 1.65  #: height of the camera above the ground [m]
 ASIDE = 9.0  #: from a road's middle to the house fronts [m]
 STRETCH = 48.0  #: streets are built in stretches of this length [m], so that one can be like another
-
 _HOUSES = 4  # on each side of a stretch
 _NARROWEST = 3.0  # of a house front [m]
 _BENT = 0.5  # most that the road turns along one front [rad]
@@ -34,6 +34,59 @@ _AROUND = 16  # samples ahead and behind between which a road is straight where 
 _TILE = 12.0  # edges of the ground's parts [m]
 _LAP = 0.3  # by which these overlap where the ground is not level [m]
 _SMOOTHED = 6.0  # standard deviation of the mean that gives the ground's height [m]
+_APART = 200  # frames between two passes of a place
+_OTHER = 7_919_000  # from the seed of one car to that of the car that replaces it
+_SEEN = 60.0  # cars are exchanged where the camera is no nearer [m]
+
+
+def drive(values: Mapping[str, Any]) -> Parts:
+    """A town along the path of a file; raises SequenceError where the file is no path."""
+    return _town(read_path(values["path"]), values)
+
+
+def town(values: Mapping[str, Any]) -> Parts:
+    """Streets around two blocks, driven again in the same direction and in the opposite one."""
+    return _town(around_blocks(values["layout"]), values)
+
+
+def _town(path: Trajectory, values: Mapping[str, Any]) -> Parts:
+    """Streets along a path, in the path's own axes, and the drive along them."""
+    R = level(path)  # to level axes
+    streets = Streets(Road.along(path.positions @ R.T), values["layout"], values["alike"])
+    drive = sampled(path, values)
+    always = streets.houses() + streets.furniture() + streets.ground()
+    cars = _parked(streets, drive.positions @ R.T, values["cars"])
+    upright = [
+        replace(r, origin=R.T @ r.origin, along=R.T @ r.along, down=R.T @ r.down)
+        for r in (*always, *(part for part, _ in cars))
+    ]
+    lasting = np.array([(0, len(drive))] * len(always) + [frames for _, frames in cars]).reshape(-1, 2)
+    return Parts(drive.stamps, drive.poses, upright, None, lasting if values["cars"] == "other" else None)
+
+
+def _parked(streets: Streets, positions: Array, way: str) -> list[tuple[Rectangle, tuple[int, int]]]:
+    """Parts of parked cars, each with the frames (from, to) in which it is there.
+
+    Args:
+        streets: where they park.
+        positions: of the camera in every frame (N, 3) [m], level.
+        way: none, same, or other, which are replaced between one pass and the next.
+    """
+    always = (0, len(positions))
+    out = []
+    for T, seed in streets.parking() if way != "none" else ():
+        passes = _passes(positions, T[:3, 3]) if way == "other" else [always]
+        for number, frames in enumerate(passes):
+            out += [(part, frames) for part in car(T, seed + _OTHER * number)]
+    return out
+
+
+def _passes(positions: Array, place: Array) -> list[tuple[int, int]]:
+    """Frames (from, to) of each time that a camera passes a place, half way to the next time."""
+    near = np.flatnonzero(np.linalg.norm((positions - place)[:, :2], axis=1) < _SEEN)
+    gaps = np.flatnonzero(np.diff(near) > _APART)
+    middles = [int(near[i] + near[i + 1]) // 2 for i in gaps]
+    return list(pairwise([0, *middles, len(positions)]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,10 +176,10 @@ class Streets:
                 width = float(plan.widths[house])  # as it is wherever the same house stands
             spread = float((self._high - self._low)[before].max())
             height = float(plan.heights[house]) + (float(np.ceil(spread)) if spread > 0.5 else 0.0)
-            facade = Facade(round(width, 2), height, plan.seed + house + 4 * part)
+            front = facade(round(width, 2), height, plan.seed + house + 4 * part)
             start, end = ends if side > 0 else ends[::-1]
             top = float(self._low[before].min()) - self._foundation + height
-            yield rectangle(facade, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
+            yield rectangle(front, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
 
     def _pieces(self, first: float, last: float, side: int) -> Iterator[tuple[float, float, int]]:
         """From where to where each house front reaches [m along the path], and its number where a house is bent."""
@@ -166,10 +219,10 @@ class Streets:
             if np.abs(self._road.way[rows] - self._road.way[row]).max() > 3 * ASIDE:
                 continue
             plan = self._plan(int(self._stretch[row]), 1)
-            facade = Facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
+            front = facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
             start = middle - to_left * ASIDE * left
-            top = float(self._low[row]) - self._foundation + facade.height
-            out.append(rectangle(facade, (*start, top), (*(to_left * left), 0), (0, 0, -1), occludes=True))
+            top = float(self._low[row]) - self._foundation + front.height
+            out.append(rectangle(front, (*start, top), (*(to_left * left), 0), (0, 0, -1), occludes=True))
         return out
 
     def furniture(self) -> list[Rectangle]:
