@@ -227,9 +227,9 @@ def box(values: Mapping[str, Any]) -> Parts:
     )  # its frame sits at the upper right corner of its front
     rectangles = _laboratory(layout) + carton(size, np.array([-size[0], 0, -size[2]]), 1, 200 + layout)
     times = [i * (REST + MOVE) + wait for i in range(len(PLACES)) for wait in (0.0, REST)]
-    x, y, z, *angles = (through(t, times, column) for column in np.repeat(PLACES, 2, axis=0).T)
+    x, y, z, *turns = (through(t, times, column) for column in np.repeat(PLACES, 2, axis=0).T)
     poses = watching(t, stamps, values["camera"], np.random.default_rng([layout, 51]))
-    return Parts(stamps, poses, rectangles, placed((x, y, z), np.deg2rad(angles))[None])
+    return Parts(stamps, poses, rectangles, placed((x, y, z), [np.deg2rad(turn) for turn in turns])[None])
 
 
 #: Sizes of the boxes 1 to 3, and of the two parts of the articulated one, 4 and 5 [m].

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,20 +12,17 @@ from slam.errors import UnknownNameError
 from slam.worlds import brushes, streetside
 from slam.worlds.books import paint_bay
 from slam.worlds.brushes import Box, Colour, Size
+from slam.worlds.geometry import Texture
 from slam.worlds.surfaces import Bay, Material
 
 _INKS: tuple[Colour, ...] = ((25, 30, 40), (235, 240, 240), (40, 40, 170), (150, 70, 30))
 Painter = Callable[["tuple[int, int]", np.random.Generator, float], np.ndarray]
 
 
-class Painted(Protocol):
-    """A texture that paints itself: ``paint(density)`` gives its picture."""
-
-    def paint(self, density: float) -> np.ndarray: ...  # noqa: D102
-
-
-def paint(piece: Material | Bay | Painted, density: float) -> np.ndarray:
+def paint(piece: Texture, density: float) -> np.ndarray:
     """The picture of a texture, BGR uint8 (round(height · density), round(width · density), 3), texels per metre.
+
+    A texture of another class paints itself: its ``paint(density)`` is called.
 
     Raises:
         UnknownNameError: there is no such material.
@@ -33,7 +30,8 @@ def paint(piece: Material | Bay | Painted, density: float) -> np.ndarray:
     if isinstance(piece, Bay):
         return paint_bay(piece, density)
     if not isinstance(piece, Material):
-        return piece.paint(density)
+        picture: np.ndarray = piece.paint(density)  # type: ignore[attr-defined]
+        return picture
     if piece.material in WHOLE:
         return WHOLE[piece.material](piece, density)
     try:

@@ -147,7 +147,7 @@ def scattered(m: Material) -> Array:
     rng = np.random.default_rng([m.seed, 22])
     count = round(m.width * m.height * m.density)
     x, y = rng.uniform(0, m.width, count), rng.uniform(0, m.height, count)
-    return np.stack([x, y, np.exp(rng.uniform(*np.log(m.sizes), count))], axis=1)
+    return np.stack([x, y, np.exp(rng.uniform(np.log(m.sizes[0]), np.log(m.sizes[1]), count))], axis=1)
 
 
 def windows(house: Material) -> Array:

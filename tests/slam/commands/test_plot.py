@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-import logging
 import shutil
 
 import pytest
 
-from slam.commands.plot import leave_picture, plot_runs
+from slam.commands.plot import plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.run.plots import _STYLE, KINDS
@@ -53,12 +52,6 @@ def test_bad_input_is_one_line(runs, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SlamError, match="cannot be written"):
         plot_runs([runs / "a"], tmp_path / "file" / "a.png", "path")
-
-
-def test_a_run_without_a_map_is_no_error_after_a_run(tmp_path, caplog):
-    with caplog.at_level(logging.WARNING):
-        leave_picture(tmp_path)
-    assert "no picture: " in caplog.text
 
 
 def test_a_picture_that_is_there_is_not_replaced(runs, tmp_path):

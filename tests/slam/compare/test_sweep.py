@@ -13,7 +13,7 @@ from slam.compare.measure import BY_KEY
 from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Variant
 from slam.compare.report import write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler
-from slam.compare.sweep import RUNS, SWEEP, check, sweep
+from slam.compare.sweep import RUNS, SWEEP, sweep
 from slam.compare.tables import groups, write_tables
 from slam.compare.trial import failure, result_files, run_trial
 from slam.errors import SlamError
@@ -136,22 +136,6 @@ def test_bad_input_of_a_trial_is_an_outcome(tmp_path):
     result = json.loads(run_trial(trial, None)["result.json"])
     assert result["outcome"].startswith("failed: SlamError")
     assert result["metrics"] == {}
-
-
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        ({"backends": ("ekf", "nothing")}, "nothing"),
-        ({"sequences": ("synthetic:nowhere",)}, "nowhere"),
-        ({"variants": (Variant("a", "nothing"),)}, "nothing"),
-        ({"variants": (Variant("a", "simulated", ("map.colour=1",)),)}, "colour"),
-        ({"variants": (Variant("a", "simulated", ("backend.colour=1",)),)}, "colour"),
-    ],
-)
-def test_what_cannot_work_is_said_before_anything_runs(change, word, tmp_path):
-    whole = {"sequences": PLAN.sequences, "backends": PLAN.backends, "variants": PLAN.variants}
-    with pytest.raises(SlamError, match=word):
-        check(Plan(**{**whole, **change}), tmp_path)
 
 
 def test_a_folder_with_other_runs_is_left_alone(done, tmp_path):

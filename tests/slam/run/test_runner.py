@@ -24,7 +24,7 @@ from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.run.recorded import RecordedFrame
 from slam.run.recording import load_recording
 from slam.run.run_data import RunData
-from slam.run.runner import RunOptions, parse_frames, run
+from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"
@@ -188,14 +188,3 @@ def test_a_missing_right_image_is_no_error(tmp_path):
 
     summary = run(OneEyed(0), options(tmp_path))
     assert summary["frames"] == 12
-
-
-@pytest.mark.parametrize(("text", "range_"), [(None, (0, None)), ("3:9", (3, 9)), (":9", (0, 9)), ("3:", (3, None))])
-def test_ranges_of_frames(text, range_):
-    assert parse_frames(text) == range_
-
-
-@pytest.mark.parametrize("text", ["", "3", "a:b", "1:2:3"])
-def test_bad_ranges_of_frames(text):
-    with pytest.raises(SlamError, match="A:B"):
-        parse_frames(text)
