@@ -112,7 +112,7 @@ FAULTS = (
     Fault(
         "unequal frame intervals in the motion's derivative", "slam/window/motion.py",
         "J0[3:, 3:] = -s * R2.T @ R0", "J0[3:, 3:] = -R2.T @ R0",
-        "tests/slam/window tests/backends/test_window.py",
+        "tests/slam/window/test_motion.py tests/slam/window tests/backends/test_window.py",
     ),
     # the batch solution
     Fault(
@@ -153,12 +153,12 @@ FAULTS = (
     Fault(
         "a body's points are compared with where it stands now, not where it stood", "slam/objects/following.py",
         "local = transform(inverse(body.T_before), places)", "local = transform(inverse(body.T), places)",
-        "tests/slam/objects",
+        "tests/slam/objects/test_first_sight.py tests/slam/objects",
     ),
     Fault(
         "noise of depth counts as a body's own extent", "slam/objects/points.py",
         "values, axes = np.linalg.eigh(total - noise)", "values, axes = np.linalg.eigh(total)",
-        "tests/slam/objects",
+        "tests/slam/objects/test_first_sight.py tests/slam/objects",
     ),
     Fault(
         "a body's point counts twice as its frame leaves", "slam/objects/belief.py",
@@ -170,7 +170,7 @@ FAULTS = (
     Fault(
         "weight of the mixed derivative in the response", "frontends/surf/localisation.py",
         "return dxx * dyy - 0.81 * dxy * dxy", "return dxx * dyy - 0.9 * dxy * dxy",
-        "tests/frontends",
+        "tests/frontends/test_localisation.py tests/frontends",
     ),
     Fault(
         "a quarter of the wavelets of a turned descriptor has the wrong sign", "frontends/surf/descriptor.py",
@@ -188,7 +188,7 @@ FAULTS = (
     Fault(
         "a loop is tested without its own covariance", "slam/mapping/atlas/consensus.py",
         "return distance(T, loop.T_first_second, P + loop.covariance)", "return distance(T, loop.T_first_second, P)",
-        "tests/slam/mapping",
+        "tests/slam/mapping/atlas/test_disagreement.py tests/slam/mapping",
     ),
     Fault(
         "errors of earlier stretches are counted again", "slam/mapping/atlas/chain.py",

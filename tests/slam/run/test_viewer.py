@@ -27,28 +27,6 @@ def test_without_a_display_one_line_says_what_to_do(monkeypatch):
         Viewer("live")
 
 
-class Unreachable:
-    """A recording whose viewer has gone."""
-
-    def log(self, *_, **__):
-        pass
-
-    def flush(self):
-        raise RuntimeError("\nno connection\nsee the manual")
-
-
-def test_a_window_that_was_closed_takes_nothing_from_the_run(monkeypatch, caplog):
-    monkeypatch.setattr("slam.run.viewer._rerun", lambda: SimpleNamespace(ViewCoordinates=SimpleNamespace(RDF=None)))
-    monkeypatch.setattr("slam.run.viewer._open", lambda rr, target: Unreachable())
-    with Viewer("live"):
-        pass
-    assert caplog.messages == ["viewer live: not all was shown: no connection"]
-    with pytest.raises(SlamError, match=r"a\.rrd: no connection$"), Viewer("a.rrd"):
-        pass
-    with pytest.raises(ZeroDivisionError), Viewer("a.rrd"):  # what went wrong first is what is said
-        1 / 0  # noqa: B018
-
-
 @pytest.mark.filterwarnings("default")  # Rerun's own
 def test_a_run_is_kept_for_rerun(tmp_path):
     pytest.importorskip("rerun")
