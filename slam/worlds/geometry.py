@@ -129,14 +129,12 @@ class Parts(NamedTuple):
         stamps, poses: of the left camera (N,) [s], (N, 4, 4).
         rectangles: every surface.
         objects: poses of the moving objects (B, N, 4, 4), or None.
-        lasting: see `slam.worlds.world.World`.
     """
 
     stamps: Array
     poses: Array
     rectangles: list[Rectangle]
     objects: Array | None = None
-    lasting: IdArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

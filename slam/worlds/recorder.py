@@ -65,9 +65,8 @@ class Recorder:
         T = _between(self._world.T_world_left, frame, ahead)
         bodies = np.array([np.eye(4), *(_between(Ts, frame, ahead) for Ts in self._world.T_world_object)])
         channels = 3 if self._values["colour"] else 1
-        rows = self._world.drawn_there(frame)
         samples = draw(
-            self._world.drawn_arrays.select(rows), lambda row: self._ripmap(int(rows[row])), bodies, T @ T_left_camera,
+            self._world.drawn_arrays, self._ripmap, bodies, T @ T_left_camera,
             lens.view, self._world.sky, channels,
         )  # fmt: skip
         return lens.expose(samples)

@@ -56,12 +56,6 @@ def _camera(default: str) -> tuple[Option, ...]:
     return (Option("camera", default, "how the camera moves", choices=CAMERAS),)
 
 
-_STREETS = (
-    Option(
-        "cars", "same", "parked cars: none, the same at each pass, or other ones", choices=("none", "same", "other")
-    ),
-    Option("alike", 0.0, "share of the streets' stretches of 48 m that look like another one", 0, 1),
-)
 SCENES = {
     "aisle": Scene(
         "a library aisle with bookshelves, walked through by hand (paper A, section V)", indoors.aisle,
@@ -83,7 +77,7 @@ SCENES = {
     "drive": Scene(
         "a drive through a town along the path of a file, at KITTI's scale and rate", streets.drive,
         (4.0, 60.0), 64.0, "driving",
-        (Option("path", "", "file of the path: poses in the form of KITTI (at 10 Hz) or TUM"), *_STREETS), _TOWN, True,
+        (Option("path", "", "file of the path: poses in the form of KITTI (at 10 Hz) or TUM"),), _TOWN, True,
     ),
     "field": Scene(
         "a robots' playing field, the robot walking from its left to its right side (paper B, section 4.3)",
@@ -105,7 +99,7 @@ SCENES = {
     ),
     "town": Scene(
         "a drive around the blocks of a town at KITTI's scale, back to its streets after 550 m, and the other way",
-        streets.town, (4.0, 60.0), 64.0, "driving", _STREETS, _TOWN, True,
+        streets.town, (4.0, 60.0), 64.0, "driving", defaults=_TOWN, alike=True,
     ),
 }  # fmt: skip
 
@@ -125,7 +119,7 @@ def assemble(name: str, scene: Scene, values: Mapping[str, Any], parts: Parts) -
     rig = make_rig(values, focal * values["width"] / width)
     return World(
         name, scene.kind, rig, parts.stamps, parts.poses, tuple(parts.rectangles), landmarks, objects, scene.reach,
-        scene.texels, lasting=parts.lasting,
+        scene.texels,
     )  # fmt: skip
 
 

@@ -34,9 +34,6 @@ _AROUND = 16  # samples ahead and behind between which a road is straight where 
 _TILE = 12.0  # edges of the ground's parts [m]
 _LAP = 0.3  # by which these overlap where the ground is not level [m]
 _SMOOTHED = 6.0  # standard deviation of the mean that gives the ground's height [m]
-_APART = 200  # frames between two passes of a place
-_OTHER = 7_919_000  # from the seed of one car to that of the car that replaces it
-_SEEN = 60.0  # cars are exchanged where the camera is no nearer [m]
 
 
 def drive(values: Mapping[str, Any]) -> Parts:
@@ -52,41 +49,11 @@ def town(values: Mapping[str, Any]) -> Parts:
 def _town(path: Trajectory, values: Mapping[str, Any]) -> Parts:
     """Streets along a path, in the path's own axes, and the drive along them."""
     R = level(path)  # to level axes
-    streets = Streets(Road.along(path.positions @ R.T), values["layout"], values["alike"])
+    streets = Streets(Road.along(path.positions @ R.T), values["layout"])
     drive = sampled(path, values)
-    always = streets.houses() + streets.furniture() + streets.ground()
-    cars = _parked(streets, drive.positions @ R.T, values["cars"])
-    upright = [
-        replace(r, origin=R.T @ r.origin, along=R.T @ r.along, down=R.T @ r.down)
-        for r in (*always, *(part for part, _ in cars))
-    ]
-    lasting = np.array([(0, len(drive))] * len(always) + [frames for _, frames in cars]).reshape(-1, 2)
-    return Parts(drive.stamps, drive.poses, upright, None, lasting if values["cars"] == "other" else None)
-
-
-def _parked(streets: Streets, positions: Array, way: str) -> list[tuple[Rectangle, tuple[int, int]]]:
-    """Parts of parked cars, each with the frames (from, to) in which it is there.
-
-    Args:
-        streets: where they park.
-        positions: of the camera in every frame (N, 3) [m], level.
-        way: none, same, or other, which are replaced between one pass and the next.
-    """
-    always = (0, len(positions))
-    out = []
-    for T, seed in streets.parking() if way != "none" else ():
-        passes = _passes(positions, T[:3, 3]) if way == "other" else [always]
-        for number, frames in enumerate(passes):
-            out += [(part, frames) for part in car(T, seed + _OTHER * number)]
-    return out
-
-
-def _passes(positions: Array, place: Array) -> list[tuple[int, int]]:
-    """Frames (from, to) of each time that a camera passes a place, half way to the next time."""
-    near = np.flatnonzero(np.linalg.norm((positions - place)[:, :2], axis=1) < _SEEN)
-    gaps = np.flatnonzero(np.diff(near) > _APART)
-    middles = [int(near[i] + near[i + 1]) // 2 for i in gaps]
-    return list(pairwise([0, *middles, len(positions)]))
+    level_parts = streets.houses() + streets.furniture() + streets.ground() + streets.parked_cars()
+    parts = [replace(r, origin=R.T @ r.origin, along=R.T @ r.along, down=R.T @ r.down) for r in level_parts]
+    return Parts(drive.stamps, drive.poses, parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +94,9 @@ class Streets:
     Args:
         road: the roads.
         layout: seed of what stands where.
-        alike: share of stretches that are copies of others.
     """
 
-    def __init__(self, road: Road, layout: int, alike: float) -> None:
+    def __init__(self, road: Road, layout: int) -> None:
         self._road = road
         self._layout = layout
         self._tree = cKDTree(road.xy)
@@ -144,7 +110,6 @@ class Streets:
             self._low = self._high = np.full(len(near), np.median(heights))
             self._foundation = 0.0
         self._stretch = np.floor((road.way - road.way[0]) / STRETCH).astype(int)
-        self._source = _sources(int(self._stretch[-1]) + 1, alike, layout)
 
     def houses(self) -> list[Rectangle]:
         """House fronts along both sides of every road, and across both ends of the path."""
@@ -208,7 +173,7 @@ class Streets:
 
     def _plan(self, stretch: int, side: int) -> Plan:
         """What stands on a side of a stretch."""
-        return _plan(self._layout, int(self._source[min(stretch, len(self._source) - 1)]), side)
+        return _plan(self._layout, min(stretch, int(self._stretch[-1])), side)
 
     def _ends(self) -> list[Rectangle]:
         """House fronts across the road behind the start and beyond the end, unless other roads run there."""
@@ -236,12 +201,13 @@ class Streets:
             out += [] if T is None else cabinet(T, plan.seed + 20 + number)
         return out
 
-    def parking(self) -> Iterator[tuple[Array, int]]:
-        """Poses (4, 4) of parked cars, and seeds of their looks."""
+    def parked_cars(self) -> list[Rectangle]:
+        """Cars parked at both sides."""
+        out = []
         for way, side, plan, number in self._places("cars"):
             T = self._pose(way, side, _CAR_ASIDE)
-            if T is not None:
-                yield T, plan.seed + 30 + number
+            out += [] if T is None else car(T, plan.seed + 30 + number)
+        return out
 
     def _places(self, what: str) -> Iterator[tuple[float, int, Plan, int]]:
         """Distance along the path, side, plan and number of everything of one kind."""
@@ -295,13 +261,3 @@ class Streets:
         texture = Material(edge, edge, "asphalt", 100 * self._layout + number, 0.3, (0.05, 0.3))
         along, down = np.array([1, 0, slope_x]) * edge, np.array([0, -1, -slope_y]) * edge
         return Rectangle(np.array([*xy, height]), along, down, texture)
-
-
-def _sources(count: int, alike: float, layout: int) -> IdArray:
-    """Which stretch each stretch looks like (count,): itself, or for a share `alike` another one."""
-    rng = np.random.default_rng([layout, 52])
-    copies = rng.random(count) < alike
-    originals = np.flatnonzero(~copies) if not copies.all() else np.array([0])
-    source = np.arange(count)
-    source[copies] = rng.choice(originals, int(copies.sum()))
-    return source

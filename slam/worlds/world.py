@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import BoolArray, IdArray
+from slam.data import IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays, in_parts
@@ -36,7 +36,6 @@ class World:
         T_world_object: poses of the objects 1..B at each frame (B, N, 4, 4).
         reach: nearest and farthest distance at which a landmark can be detected [m].
         texels: texels per metre at which the surfaces are painted.
-        lasting: first frame in which each rectangle is there, and the first in which it is not (Q, 2); None for always.
         sky: colour (BGR) where no surface is.
         painted: textures painted so far, filled by the recorder.
         seen: landmarks seen in frames so far, filled by the simulator of observations.
@@ -53,7 +52,6 @@ class World:
     reach: tuple[float, float]
     texels: float
     sky: tuple[int, int, int] = (230, 225, 220)
-    lasting: IdArray | None = None
     painted: dict[Any, Any] = field(default_factory=dict, repr=False)
     seen: dict[int, Any] = field(default_factory=dict, repr=False)
 
@@ -84,44 +82,22 @@ class World:
         """`drawn` as arrays."""
         return RectangleArrays.of(self.drawn)
 
-    def drawn_there(self, frame: int) -> IdArray:
-        """Indices in `drawn` of what is there in a frame."""
-        return np.flatnonzero(self.there(self._drawn_source, frame))
-
-    @cached_property
-    def _drawn_source(self) -> IdArray:
-        """The rectangle that each of `drawn` is a part of."""
-        return np.repeat(np.arange(len(self.rectangles)), [len(in_parts(r)) for r in self.rectangles])
-
     @cached_property
     def occluders(self) -> RectangleArrays:
         """The rectangles that may hide others."""
-        return self.arrays.select(self._occluding)
-
-    @cached_property
-    def _occluding(self) -> IdArray:
-        """Indices of these."""
-        return np.flatnonzero([r.occludes for r in self.rectangles])
+        return self.arrays.select(np.flatnonzero([r.occludes for r in self.rectangles]))
 
     def landmarks_near(self, frame: int) -> IdArray:
         """Ids of the landmarks that may be within reach in a frame, and of all that move."""
-        rows = self._within_sight(self.landmarks.positions, 0.0, self.landmarks.object, frame)
-        return rows[self.there(self.landmarks.surface[rows], frame)]
+        return self._within_sight(self.landmarks.positions, 0.0, self.landmarks.object, frame)
 
     def occluders_near(self, frame: int) -> RectangleArrays:
         """The rectangles that may hide landmarks within reach in a frame."""
-        rows = self._within_sight(self.occluders.middle, self.occluders.radius, self.occluders.body, frame)
-        return self.occluders.select(rows[self.there(self._occluding[rows], frame)])
+        every = self.occluders
+        return every.select(self._within_sight(every.middle, every.radius, every.body, frame))
 
     def _within_sight(self, points: Array, radius: Array | float, body: IdArray, frame: int) -> IdArray:
         """Indices of points (P, 3) that may be within reach in a frame, and of all that move."""
         offset = points - self.T_world_left[frame, :3, 3]
         square = np.einsum("ij,ij->i", offset, offset)
         return np.flatnonzero((square < (self.reach[1] * _to_corner(self.rig) + radius) ** 2) | (body > 0))
-
-    def there(self, rectangles: IdArray, frame: int) -> BoolArray:
-        """Which of these rectangles are there in a frame."""
-        if self.lasting is None:
-            return np.ones(len(rectangles), bool)
-        first, end = self.lasting[rectangles].T
-        return (first <= frame) & (frame < end)
