@@ -24,7 +24,7 @@ from tests.slam.objects.test_recovery import POINTS, RIG, SIGMA, scene
 def test_a_body_takes_points_along_that_are_too_young_for_a_velocity():
     body, tracks, _, _ = scene(4, np.zeros(6), np.random.default_rng(3))
     before = body.T.copy()
-    before[0, 3] -= 1.2  # 56 px, where its speed allows 5
+    before[0, 3] -= 3.0  # 140 px: its speed and the noise of depth allow 1.9 m
     points = np.append(POINTS, [[0.1, 0.1, 0.0]], axis=0)
     uv, uv_right = RIG.project(transform(body.T, points))
     features = StereoFeatures(
