@@ -2,7 +2,7 @@
 
     python experiments/aisle.py [--quick] [--world synthetic:aisle] [--out DIR]
 
-Leaves for each back end the files of a run, and the pictures ``map_3d.png`` (paper A, Fig. 5), ``top_view.png`` (paper
+Leaves for each back end the files of a run, and the pictures ``top_view.png`` (paper
 A, Fig. 6: red ellipses for landmarks measured in the last frame, green ones for the others), ``errors.png`` and
 ``map.png`` (D_threshold, landmarks measured and map size over time). Prints a Markdown table. The paper's marks: mean
 pose deviation below 1.5 cm, peak 3 cm, 318 landmarks.
@@ -29,7 +29,6 @@ from slam.evaluation.association_truth import SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.registry import ONLINE
-from slam.run.figures import draw_map_3d
 from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, run
@@ -174,7 +173,6 @@ def main() -> int:
     frontend = Remembered(create("surf", sequence.rig, **config.frontend))
     rows = [row(sequence, backend, frontend, config, arguments.out) for backend in ONLINE]
     runs = [RunData.read(arguments.out / backend, backend) for backend in ONLINE]
-    draw_map_3d(runs, arguments.out / "map_3d.png")
     plot(runs, arguments.out / "top_view.png", "map")
     plot(runs, arguments.out / "errors.png", "errors")
     draw_map_over_time([arguments.out / backend for backend in ONLINE], arguments.out / "map.png")

@@ -21,12 +21,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.surf import medians, test_image
 from experiments.common import script_options
 from frontends.surf import Surf
-from slam.compare.measure import BY_KEY
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant
 from slam.compare.scheduler import LocalScheduler
 from slam.compare.statistics import difference
 from slam.compare.sweep import sweep
 from slam.compare.wording import sentence
+from slam.run.results import BY_KEY
 from slam.runtime.cores import available_cores
 
 WORLDS = ("synthetic:aisle?frames={}", "synthetic:desk?frames={}")

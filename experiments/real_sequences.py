@@ -75,7 +75,7 @@ def draw(names: dict[str, Path], out: Path) -> None:
         axis.set_axis_off()
     for axis, (name, folder) in zip(axes, names.items()):
         paths = [Trajectory.read_tum(folder_of(name, backend, out) / "trajectory.txt") for backend in ONLINE]
-        for backend, path, width in zip(ONLINE, paths, widths(len(ONLINE), 1.5)):
+        for backend, path, width in zip(ONLINE, paths, 1.5 * widths(len(ONLINE))):
             axis.plot(*path.positions[:, [0, 2]].T, lw=width, label=backend)
         truth = true_path(folder, paths[0])
         if truth is not None:

@@ -101,7 +101,6 @@ EXPERIMENTS = (
         "ground truth is named.",
         {
             "errors": ERRORS,
-            "map_3d": "The map at the end with ellipsoids of two standard deviations (paper A, Fig. 5).",
             "top_view": "The map from above with ellipses of two standard deviations (paper A, Fig. 6).",
         },
     ),
@@ -112,7 +111,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "walking_robot", "papers", "Walking robot (B, 4.3, Fig. 8)",
-        "Map and states in 3D; no ground truth, no figures.", {"map_3d": "The map at the end.", "errors": ERRORS},
+        "Map and states in 3D; no ground truth, no figures.", {"errors": ERRORS},
     ),
     Experiment(
         "moving_objects", "objects", "Moving box, moving objects (B, 4.4, Table 1, Fig. 10)",

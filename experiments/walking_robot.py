@@ -21,7 +21,6 @@ from slam.compare.plan import Plan
 from slam.compare.scheduler import LocalScheduler
 from slam.compare.sweep import Run, sweep
 from slam.registry import ONLINE
-from slam.run.figures import draw_map_3d
 from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.runtime.cores import available_cores
@@ -58,7 +57,6 @@ def main() -> int:
     print(text)
     (arguments.out / "tables.md").write_text(text + "\n", encoding="utf-8")
     data = [RunData.read(run.folder, run.trial.backend) for run in runs if run.completed]
-    draw_map_3d(data, arguments.out / "map_3d.png")
     plot(data, arguments.out / "top_view.png", "map")
     plot(data, arguments.out / "errors.png", "errors")
     return 0

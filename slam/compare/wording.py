@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.compare.measure import Metric
 from slam.compare.plan import REPLAY
 from slam.compare.statistics import ALPHA, FEWEST, HINT_ALPHA, LEVEL, Difference, Verdict, fewest
 from slam.evaluation.metrics import chi_square_band
+from slam.run.results import Metric
 
 #: A verdict as a badge has it, in the report and on the terminal.
 WORDS = {

@@ -10,8 +10,9 @@ from slam.commands.plot import leave_picture, plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import position_errors
-from slam.run.plots import _STYLE, KINDS, _in_one_world, read_runs
+from slam.run.figures import pose_errors
+from slam.run.panels import in_one_world
+from slam.run.plots import _STYLE, KINDS, read_runs
 from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
@@ -65,7 +66,7 @@ def test_runs_of_one_sequence_go_into_one_picture(runs):
 def test_a_run_of_later_frames_lies_where_it_was(runs):
     """Its world begins at its own first frame; in the picture it is in that of the first run."""
     (both,) = read_runs([runs / "a", runs / "later"])
-    (whole, part), truth = _in_one_world(both)
+    (whole, part), truth = in_one_world(both)
     np.testing.assert_allclose(part.positions, whole.positions[3:], atol=0.01)
     np.testing.assert_allclose(truth.positions, whole.positions, atol=0.01)
     assert np.linalg.norm(both[1].online.positions[0]) < 1e-3
@@ -76,9 +77,18 @@ def test_the_true_path_of_a_run_is_that_of_its_frames(runs):
     kept = Trajectory.read_tum(runs / "later" / "truth.txt")
     np.testing.assert_allclose(kept.poses, truth.poses[3:], atol=1e-8)
     run_ = RunData.read(runs / "later", "later")
-    time, error, sigma = position_errors(run_, run_.truth)
+    time, error, sigma = pose_errors(run_)
     assert len(time) == len(error) == len(sigma) == 5
-    assert np.abs(error[0]).max() < 1e-9
+    assert np.abs(error[0]).max() < 1e-6
+
+
+def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
+    """What the headline says of the covariances counts both."""
+    run_ = RunData.read(runs / "a", "a")
+    _, error, sigma = pose_errors(run_)
+    summary = run_.summary["accuracy"]["online"]
+    assert np.sqrt(np.mean(error[:, 3] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
+    assert (error[1:, 3] < 5 * sigma[1:, 3]).all() and (sigma[1:, 3] > 0).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -92,7 +102,7 @@ def test_a_run_without_truth_or_objects_is_drawn(runs, tmp_path, kind):
 
         with rc_context(_STYLE):
             labels = [axis.get_ylabel() for axis in KINDS[kind]([RunData.read(tmp_path / "a", "a")], None).axes]
-        assert [label.partition(" [")[0] for label in labels] == ["σ right", "σ down", "σ forward"]
+        assert [label.partition(" [")[0] for label in labels] == ["σ right", "σ down", "σ forward", "σ rotation"]
 
 
 def test_frames_without_a_pose_have_no_deviation(runs, tmp_path):

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.compare.measure import BY_KEY, object_figures, object_metric
 from slam.compare.statistics import ALPHA, FEWEST, Verdict, adjusted, difference, fewest, holm, interval, sign_flip
 from slam.compare.wording import headline, honesty, is_trifle, sentence
+from slam.run.results import BY_KEY, object_figures, object_metric
 
 ATE, NEES, PRECISION = BY_KEY["ate_online_m"], BY_KEY["nees_per_dof"], BY_KEY["association_precision"]
 TRACKED = BY_KEY["tracked"]
