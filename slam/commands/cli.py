@@ -159,9 +159,11 @@ def replay_command(
     from slam.outputs import require_outputs
     from slam.run.recording import load_recording
     from slam.run.runner import RunOptions, run_recording
+    from slam.settings import require_settable
 
     loaded, name = load_recording(recording), backend or "ekf"
     default = SystemConfig.for_kind(loaded.kind, None, name)
+    require_settable(settings or [], default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings or [])
     progress = Progress(len(loaded), _title(loaded, name), quiet)
     with run_folder(out, loaded.name, name) as folder:
@@ -198,7 +200,7 @@ def settings_command(
         str | None, typer.Argument(metavar="SECTION", help="A section, a setting, or a front end or back end.")
     ] = None,
 ) -> None:
-    """List all settings with default per kind of motion, unit, range and meaning."""
+    """List all settings with default per kind of motion, unit and meaning."""
     from slam.commands.settings import print_settings
 
     print_settings(section)

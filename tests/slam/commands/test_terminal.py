@@ -46,18 +46,28 @@ def test_short_options_are_the_long_ones(tmp_path):
     assert (tmp_path / "out" / "summary.png").exists()
 
 
-def test_lengths_below_a_metre_are_in_millimetres_and_bodies_are_in_the_table(capsys):
+def test_figures_are_in_their_units_and_bodies_are_in_the_table(capsys):
     summary = {
         "sequence": "aisle", "backend": "ekf", "frames": 9, "status": {"tracked": 9}, "bodies": 1,
-        "loops": {"closed": 2, "refused": 1}, "accuracy": {"online": {"ATE RMSE [m]": 0.0123, "ATE max [m]": 2.5}},
+        "loops": {"closed": 2, "refused": 1}, "accuracy": {"online": {"ATE RMSE [m]": 0.0123}},
         "objects": {"bodies": {"1": {"coverage": 0.5, "ME": {"translation median [m]": 0.002}}}},
     }  # fmt: skip
     print_summary([summary], Path("out"))
     said = " ".join(capsys.readouterr().out.split())
-    assert "online ATE RMSE [mm] │ 12.3 " in said
-    assert "online ATE max [m] │ 2.5 " in said
+    assert "ATE RMSE, online [mm] │ 12.3 " in said
     assert "loops closed │ 2 " in said
-    assert "its motion a frame [mm] │ 2 " in said
+    assert "body 1: ME translation median [mm] │ 2 " in said
+
+
+def test_covariances_that_are_too_large_on_an_exact_world_say_why(capsys):
+    summary = {"sequence": "aisle", "backend": "ekf", "frames": 9, "status": {"tracked": 9}}
+    for exact in (True, False):
+        print_summary(
+            [{**summary, "consistency": {"mean NEES": 0.5, "dof": 6.0, "exact calibration": exact}}], Path("out")
+        )
+        said = " ".join(capsys.readouterr().out.split())
+        assert "covariances are too large" in said
+        assert ("this world's cameras have none" in said) == exact
 
 
 def test_a_run_without_a_frame_has_no_table_and_no_picture(tmp_path, capsys):
