@@ -33,8 +33,8 @@ from experiments.object_runs import (
     seen_in,
     steps,
     system_for,
-)
-from experiments.tables import markdown
+)  # fmt: skip
+from experiments.tables import markdown, picture
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
@@ -134,25 +134,18 @@ def moving(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
 
 def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
     """How far the box's pose is from the truth over the run, by back end, after one change of body frame each."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
-    for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange", "tab:green")):
-        found = score.poses_of(1)
-        if found is not None:
-            frames, own, true = found
-            errors = absolute_pose_errors(own, true)
-            axes[0].plot(score.stamps[frames], errors.rotation, ".", ms=3, color=colour, label=backend)
-            axes[1].plot(score.stamps[frames], 1e3 * errors.translation, ".", ms=3, color=colour)
-    axes[0].set(ylabel="rotation error [deg]", ylim=(0, None))
-    axes[1].set(ylabel="translation error [mm]", xlabel="time [s]", ylim=(0, None))
-    if axes[0].lines:
-        axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    with picture(path, 7, 4.5, 2, 1, sharex=True) as (turned, moved):
+        for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange", "tab:green")):
+            found = score.poses_of(1)
+            if found is not None:
+                frames, own, true = found
+                errors = absolute_pose_errors(own, true)
+                turned.plot(score.stamps[frames], errors.rotation, ".", ms=3, color=colour, label=backend)
+                moved.plot(score.stamps[frames], 1e3 * errors.translation, ".", ms=3, color=colour)
+        turned.set(ylabel="rotation error [deg]", ylim=(0, None))
+        moved.set(ylabel="translation error [mm]", xlabel="time [s]", ylim=(0, None))
+        if turned.lines:
+            turned.legend(fontsize=8)
 
 
 def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
