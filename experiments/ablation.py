@@ -127,7 +127,12 @@ def table(rows: list[dict[str, str]], backend: str) -> list[list[object]]:
         medians = {c: float(np.median(r)) for c, r in ratios.items()}
         worst = max(medians, key=lambda case: medians[case])
         larger, smaller = (sum(len(r) > 2 and bool(side(r)) for r in ratios.values()) for side in _SIDES)
-        nees = [x for x in (_ratio(r, u, "NEES") for r, u in pairs) if np.isfinite(x)]
+        known = [[p for p in pairs if p[0]["sequence"] == c and np.isfinite(_ratio(*p, "NEES"))] for c in cases]
+        nees = [
+            np.median([float(r["NEES"]) for r, _ in k]) / np.median([float(u["NEES"]) for _, u in k])
+            for k in known
+            if k
+        ]
         out.append([
             variant.name, f"{np.exp(np.mean(np.log(list(medians.values())))):.2f}", f"{medians[worst]:.2f} {worst}",
             larger, smaller, f"{np.median(nees):.2f}" if nees else None,

@@ -203,12 +203,14 @@ def page_head(name: str, quick: bool) -> str:
 
 
 def first_page() -> str:
-    """The README's results, whose figures tests compare with the others; three pictures; the other pages."""
+    """A screen: the README's table of recordings, whose figures tests compare with the pages; pictures; the pages."""
     text = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Results\n")[2].partition("\n## ")[0]
+    table = text.strip().partition("\n\n[NEES]")[0].replace("](docs/", "](")
     captions = {(e.name, name): said for e in EXPERIMENTS for name, said in (e.pictures or {}).items()}
     pictures = [f"![{captions.get(shown, shown[0])}](images/results/{'_'.join(shown)}.png)" for shown in SHOWN]
     pages = [f"- [{title}](results/{name}.md): {question}" for name, (title, question) in PAGES.items()]
-    return "\n\n".join(["# Results", "\n".join(pages), text.replace("](docs/", "](").strip(), *pictures]) + "\n"
+    right = "NEES says whether [covariances](concepts.md#evaluation) are as large as the errors: 6 is right."
+    return "\n\n".join(["# Results", table, right, *pictures, "\n".join(pages)]) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
