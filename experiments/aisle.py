@@ -27,9 +27,10 @@ from slam.evaluation.association_truth import SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.registry import ONLINE
+from slam.run.options import RunOptions
 from slam.run.plots import plot
 from slam.run.run_data import RunData
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.sequences import Sequence, open_sequence
 
 HEADER = (

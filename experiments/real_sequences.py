@@ -26,7 +26,8 @@ from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
 from slam.run.figures import widths
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from slam.sequences import open_sequence
 
 SEQUENCES = {

@@ -13,10 +13,11 @@ from slam.files import write_png
 from slam.outputs import Output, require_outputs
 from slam.registry import ONLINE
 from slam.run.drawing import draw_objects, with_legend
+from slam.run.options import RunOptions
 from slam.run.outputs import NAMES, write_json
 from slam.run.plots import plot
 from slam.run.run_data import RunData
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.sequences import open_sequence
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.

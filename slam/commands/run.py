@@ -16,8 +16,8 @@ from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
 from slam.run import drawing
 from slam.run import viewer as viewing
+from slam.run.options import RunOptions, parse_frames
 from slam.run.repeat import Origin, Repeat, changed_versions, load, versions
-from slam.run.runner import RunOptions, parse_frames
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 from slam.settings import require_settable

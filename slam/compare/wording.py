@@ -100,19 +100,6 @@ def in_short(differences: Sequence[Difference], reference: str, other: str) -> s
     return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
 
 
-def sentence(d: Difference, reference: str, other: str) -> str:
-    """What may be said of one difference."""
-    trials = "one trial" if d.pairs == 1 else f"{d.pairs} trials"
-    if d.verdict is Verdict.NONE:
-        return f"{d.metric.label}: no trial in which both {reference} and {other} have it."
-    said = f"{_brief(d)}, from {reference} to {other}, mean of {trials}"
-    if not direction(d):
-        return f"{said}: no difference can be concluded." if d.metric.better else f"{said}."
-    interval = f"; {round(100 * LEVEL)} % interval {shown_interval(d, ' to ')}" if np.isfinite(d.low) else ""
-    p = f", p {shown_p(d.p)}, adjusted {shown_p(d.p_holm)}" if d.varies else ""
-    return f"{said}{interval}{p}: {direction(d)}, {STRENGTH[d.verdict]}."
-
-
 def is_trifle(d: Difference) -> bool:
     """Whether two means are so near that nobody would choose by them, however sure their difference is.
 

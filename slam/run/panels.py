@@ -83,7 +83,7 @@ def error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
             if known:
                 low = -3 * s if k < 3 else 0 * s  # an angle has no sign
                 axis.fill_between(time, low, 3 * s, color=colour, alpha=0.12, lw=0)
-                for side in (low, 3 * s):
+                for side in (low, 3 * s)[k == 3 :]:
                     axis.plot(time, side, color=colour, alpha=0.6, lw=0.6 * width, ls=dashes)
             if run.truth is not None or not known:
                 axis.plot(time, e if known else s, color=colour, lw=width, label=run.name)

@@ -28,7 +28,7 @@ PICTURE = "summary.png"
 
 _MOST_MAPS = 3  # side by side in the summary
 _PAGE = 8.0  # [in] below which text is small, as in a paper
-_LEAST_HEIGHT = 8.8  # [in] of the summary, below which legends take the place of the panels
+_LEAST_HEIGHT = 9.4  # [in] of the summary, below which legends take the place of the panels
 _COLUMN = 5.0  # [in] below which panels do not stand side by side
 _STYLE: dict[str, Any] = {
     "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 11, "legend.fontsize": 8, "svg.hashsalt": "slam",
@@ -133,8 +133,8 @@ def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
         first, *others = (part.subplots() for part in parts_above)
     else:
         width = width or 5.0 * parts
-        figure = _figure(width, max(9.0 * (width / (5.0 * parts)), _LEAST_HEIGHT) + 0.25 * len(runs))
-        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(4.6, 4.4)))
+        figure = _figure(width, max(9.8 * (width / (5.0 * parts)), _LEAST_HEIGHT) + 0.25 * len(runs))
+        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(4.6, 5.2)))
         first, *others = above.subplots(1, parts)
         left, right = np.asarray(below.subfigures(1, 2))
     path_panel(first, runs)

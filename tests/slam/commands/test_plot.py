@@ -11,10 +11,11 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
 from slam.run.figures import pose_errors
+from slam.run.options import RunOptions
 from slam.run.panels import in_one_world
 from slam.run.plots import _STYLE, KINDS, read_runs
 from slam.run.run_data import RunData
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=8&width=160&height=120"

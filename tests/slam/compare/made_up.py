@@ -16,7 +16,8 @@ from slam.compare.simulated import SimulatedFrontend, WithoutImages
 from slam.compare.sweep import RUNS, SWEEP, Run
 from slam.compare.trial import COMPLETED, SERIES
 from slam.config import SystemConfig
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"

@@ -14,7 +14,8 @@ from slam.compare.simulated import SimulatedFrontend, WithoutImages
 from slam.config import SystemConfig
 from slam.evaluation.summary import evaluate
 from slam.geometry.trajectory import Trajectory
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from slam.worlds import open_world
 
 

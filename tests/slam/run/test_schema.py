@@ -12,9 +12,10 @@ from slam.config import SystemConfig
 from slam.geometry.euler import rotation
 from slam.geometry.se3 import pose
 from slam.object_data import MovingObject, ObjectEstimate
+from slam.run.options import RunOptions
 from slam.run.outputs import RunFiles
 from slam.run.repeat import Origin
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, header, markdown
 from slam.sequences import open_sequence
 
