@@ -138,12 +138,15 @@ def _without_fixed(tree: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigurationError: one had another value.
     """
+    if not isinstance(tree, dict):  # which is refused as any other value of a wrong type
+        return tree
     kept = dict(tree)
     for section, kind in _FIXED.items():
         if isinstance(own := tree.get(section), dict):
-            gone = [key for key in own if key in vars(kind) and key not in {f.name for f in fields(kind)}]
+            constants = {name for name, value in vars(kind).items() if isinstance(value, (int, float))}
+            gone = [key for key in own if key in constants - {f.name for f in fields(kind)}]
             for key in gone:
-                if own[key] != getattr(kind, key):
+                if not (isinstance(own[key], (int, float)) and own[key] == getattr(kind, key)):
                     raise ConfigurationError(
                         f"setting {section}.{key}: no longer a setting; its value is {getattr(kind, key)}, "
                         f"not {own[key]!r:.80}"

@@ -8,7 +8,7 @@ from typing import ClassVar
 from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_positive
 
-_RANGES = {"systematic": (1e-4, 1e4)}  # [px]
+_RANGES = {"systematic": (1e-4, 1e4), "minimum_parallax": (1e-4, 1e4)}  # [px]
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,13 @@ class SelfCalibrationConfig:
         enabled: False leaves all measurements unchanged.
         systematic: error of rows and disparities that all frames of a recording may share, for each parameter [px].
         minimum_common: least number of features matched in both views.
+        minimum_parallax: least median displacement of the features by translation between two views [px].
     """
 
     enabled: bool = True
     systematic: float = 0.05
     minimum_common: int = 30
+    minimum_parallax: float = 4.0
 
     #: Noise of a left pixel [px] at first; it is then estimated from pairs of views.
     pixel_sigma: ClassVar[float] = 0.4
@@ -31,8 +33,6 @@ class SelfCalibrationConfig:
     disparity_sigma: ClassVar[float] = 0.2
     #: Two views are compared once less than this share of the first view's features is matched.
     kept_share: ClassVar[float] = 0.3
-    #: Least median displacement of the features by translation between two views [px].
-    minimum_parallax: ClassVar[float] = 4.0
     #: Factor on the variance of the evidence at first, until its scatter has been measured.
     inflation: ClassVar[float] = 4.0
 

@@ -62,6 +62,9 @@ def test_a_setting_of_an_earlier_version_is_one_line():
         ConfigurationError, match=r"^setting association\.hypotheses: no longer a setting; its value is"
     ):
         SystemConfig.from_json(tree)
+    for tree in ([], "x", {"map": {"__doc__": 1}}, {"association": {"hypotheses": [1]}}):
+        with pytest.raises(ConfigurationError):
+            SystemConfig.from_json(tree)
     with pytest.raises(ConfigurationError, match=r"^setting map\.colour: there is no such setting in this version$"):
         SystemConfig.from_json({"map": {"colour": 1}})
 
