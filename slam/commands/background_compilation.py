@@ -1,8 +1,8 @@
-"""Where nothing is compiled yet, a second process compiles kernels beside the first frames.
+"""Where nothing is compiled yet, a second process compiles the kernels of moving objects beside the first frames.
 
 Numba compiles one function at a time in a process. The first frame waits for the front end's kernels anyway; meanwhile
-those that are needed after them are made, by a few frames of a world with simulated features, and put into Numba's
-cache. The run loads them from there; what is not there in time it compiles itself. Results do not depend on it.
+those that are needed last are made, by a few frames of a world with simulated features, and put into Numba's cache. The
+run loads them from there; what is not there in time it compiles itself. Results do not depend on it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from slam.runtime.cores import available_cores
 
 _SCENE = "synthetic:street?frames=8&density=5"  # a body is found in the seventh frame
+_NEW = 50  # landmarks added in a frame at most
 _PATIENCE = 5.0  # for the end of the second process [s]
 
 
@@ -48,14 +51,38 @@ def compiled_in_background(backend: str) -> Iterator[None]:
 
 
 def compile_objects(backend: str) -> None:
-    """Call every kernel that frames need after their features once, those of moving objects last."""
+    """Call every kernel of moving objects once.
+
+    Landmarks are measured by their true names: the search for them needs kernels that the run itself compiles
+    meanwhile, and two processes that compile the same ones gain nothing.
+    """
+    from slam import registry
+    from slam.config import SystemConfig
+    from slam.data import Observations
+    from slam.objects.modes import detector_for
     from slam.sequences import open_sequence
-    from slam.system import StereoSlam
 
     sequence = open_sequence(_SCENE)
-    system = StereoSlam(sequence.rig, None, backend, kind=sequence.kind)
-    for k in range(len(sequence)):
-        system.process_features(sequence.observations(k))  # type: ignore[attr-defined]
+    config = SystemConfig.for_kind(sequence.kind, None, backend)
+    estimator = registry.create("backends", backend, sequence.rig, models=config.models, **config.backend)
+    detector = detector_for(sequence.rig, config.objects, config.models)
+    known = np.zeros(0, np.int64)
+    for seen in sequence.observe():  # type: ignore[attr-defined]
+        features, ids = seen.features, seen.ids
+        still = np.flatnonzero((ids >= 0) & (seen.objects == 0) & features.has_stereo & ~seen.false_stereo)
+        still = still[np.argsort(ids[still])]
+        old = np.isin(ids[still], known)
+        measured, new = (
+            Observations(ids[rows], features.uv_left[rows], features.uv_right[rows])
+            for rows in (still[old], still[~old][:_NEW])
+        )
+        estimator.predict(features.stamp)
+        estimator.update(measured)
+        landmark = np.where(np.isin(np.arange(len(features)), still[old]), ids, -1)
+        detector.classify(features, estimator.estimate(landmarks=False), landmark)
+        detector.update(estimator, features)
+        estimator.add(new)
+        known = np.union1d(known, new.ids)
 
 
 def _cold() -> bool:
