@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeRemainingColumn
@@ -115,8 +116,8 @@ def _say(text: str, style: str | None = None) -> None:
 
 def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
     """A table of finished runs, a column each."""
-    table = Table(title=summaries[0]["sequence"])
-    table.add_column("")
+    table = Table(title=summaries[0]["sequence"], title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("", no_wrap=True)
     for summary in summaries:
         table.add_column(summary["backend"], justify="right")
     for label, values in rows(summaries):

@@ -102,7 +102,6 @@ METRICS = (
 
 #: What a run's own table says besides, without a better or worse.
 OF_A_RUN = (
-    Metric("frames", "frames", place=("frames",)),
     Metric("landmarks", "landmarks at the end", place=("landmarks",)),
     Metric("path_m", "path length", unit="m", place=("path_length_m",)),
     Metric("speed", "speed, median", unit="m/s", place=("speed_m_per_s",)),
@@ -111,9 +110,9 @@ OF_A_RUN = (
     Metric("dropped", "frames dropped", place=("live", "frames dropped")),
     Metric("behind", "behind, median", unit="ms", place=("live", "milliseconds behind", "median")),
     Metric("behind_most", "behind, most", unit="ms", place=("live", "milliseconds behind", "max")),
-    Metric("milliseconds", "stages of a frame together, median", unit="ms", place=("milliseconds", "median_total")),
+    Metric("milliseconds", "stages of a frame, median", unit="ms", place=("milliseconds", "median_total")),
     Metric("rate", "frames per second", place=("frames_per_second",)),
-    Metric("compiling", "kernels compiled, once, not in the times above", unit="s", place=("compile_seconds",)),
+    Metric("compiling", "kernels compiled, beside these times", unit="s", place=("compile_seconds",)),
 )  # fmt: skip
 
 #: Figures of a comparison that a run's own table leaves out: shares of its status, which it shows in words.
@@ -137,14 +136,22 @@ _UNITS = {"m": _MM, "deg": ("deg", 1.0), "frames": _FRAMES}
 
 def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str]]]:
     """The table of some runs for people: label with unit, and a text per run; what no run has is left out."""
-    yield "status", [", ".join(f"{n} {k}" for k, n in s["status"].items()) for s in summaries]
+    yield "frames tracked", list(map(_tracked, summaries))
     found = [_placed(OF_A_RUN, s) | figures(s) for s in summaries]
     objects = [object_metric(key) for key in dict.fromkeys(key for one in found for key in one) if _is_of_body(key)]
     left_out = [m.key for m in OF_A_RUN[-1:] if not any(one.get(m.key, 0.0) > _COMPILED for one in found)]
-    for metric in (*OF_A_RUN[:6], *METRICS, *objects, *OF_A_RUN[6:]):
+    for metric in (*OF_A_RUN[:5], *METRICS, *objects, *OF_A_RUN[5:]):
         values = [one.get(metric.key, float("nan")) for one in found]
         if metric.key not in (*_NOT_OF_ONE_RUN, *left_out) and np.isfinite(values).any():
             yield metric.title, list(map(metric.show, values))
+
+
+def _tracked(summary: Mapping[str, Any]) -> str:
+    """How many frames had a measured pose, and what became of the others; the first one starts the map."""
+    status = summary["status"]
+    own = status.get("tracked", 0) + status.get("started", 0)
+    others = [f"{n} {name}" for name, n in status.items() if name not in ("tracked", "started")]
+    return ", ".join([f"{own} of {summary['frames']}", *others])
 
 
 def _is_of_body(key: str) -> bool:
@@ -182,7 +189,7 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
 
 def object_metric(key: str) -> Metric:
     """A figure of moving objects by the key that `object_figures` gives it."""
-    text = re.sub(r"^bodies (\d+) ", r"body \1: ", key.removeprefix(f"{_OBJECT} "))
+    text = re.sub(r"^bodies (\d+) (ME )?", _named_body, key.removeprefix(f"{_OBJECT} "))
     label = text if text.startswith("body") else f"objects: {text}"
     if key.endswith(_SHARES):
         return Metric(key, label, "higher", False, *_PERCENT)
@@ -193,6 +200,10 @@ def object_metric(key: str) -> Metric:
     if found is None or found[2] not in _UNITS:
         return Metric(key, label, lower)
     return Metric(key, found[1], lower, False, *_UNITS[found[2]])
+
+
+def _named_body(found: re.Match[str]) -> str:
+    return f"body {found[1]}: {'motion error, ' if found[2] else ''}"
 
 
 def object_figures(summary: Mapping[str, Any]) -> dict[str, float]:

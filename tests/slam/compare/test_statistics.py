@@ -139,7 +139,7 @@ def test_figures_of_objects_know_what_is_better():
     }
     assert {key: object_metric(key).better for key in better} == better
     metric = object_metric("object bodies 2 ME translation median [m]")
-    assert metric.title == "body 2: ME translation median [mm]"
+    assert metric.title == "body 2: motion error, translation median [mm]"
     assert metric.show(0.0021) == "2.1"
 
 
