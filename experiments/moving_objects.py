@@ -34,7 +34,7 @@ from experiments.object_runs import (
     steps,
     system_for,
 )  # fmt: skip
-from experiments.tables import markdown, picture
+from experiments.tables import picture
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
@@ -110,7 +110,6 @@ def place_rows(sequence: Any, true: Any, poses: dict[int, Any], backend: str, mo
         off = np.linalg.norm(E[:, :3, 3], axis=1)
         rows.append({
             "back end": backend, "mode": mode, "place": f"B{place}", "frames": len(here),
-            "true x y z [cm]": np.round(100 * true[min(int(at * 30), len(true) - 1), :3, 3], 1).tolist(),
             "rotation error [deg]": float(np.median(np.degrees(rotation_angle(E[:, :3, :3])))) if len(here) else None,
             "translation error [mm]": 1e3 * float(np.median(off)) if len(here) else None,
         })  # fmt: skip
@@ -346,35 +345,6 @@ def table(rows: list[dict[str, Any]]) -> str:
     return plain_table(rows) + ("\n\n" + plain_table(bodies) if bodies else "")
 
 
-def worlds_together(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each world: medians over the seeds, and all objects that are none."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        found.setdefault(row["world"].partition("seed=")[0].rstrip("?&"), []).append(row)
-    medians = ("ATE [mm]", "camera NEES", "false moving per 1000 still", "counted right", "objects [ms]")
-    return [
-        {
-            "world": world, "seeds": len(runs), **{c: float(np.median([run[c] for run in runs])) for c in medians},
-            "false objects": sum(len(run["false objects [frames]"]) for run in runs),
-            "longest [frames]": max((k for run in runs for k in run["false objects [frames]"]), default=0),
-        }
-        for world, runs in found.items()
-    ]  # fmt: skip
-
-
-def plain_table(rows: list[dict[str, Any]]) -> str:
-    columns = [key for key, value in rows[0].items() if not isinstance(value, dict)]
-    return markdown(columns, [[text(row.get(c)) for c in columns] for row in rows], len(columns))
-
-
-def text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    if isinstance(value, list):
-        value = ", ".join(map(str, value)) or None
-    return "–" if value is None else str(value)
-
-
 def main() -> int:
     parser = script_options(__file__, __doc__, "a few frames of each part")
     parser.add_argument("--observations", action="store_true", help="worlds as observations, not rendered")
@@ -388,7 +358,7 @@ def main() -> int:
             rows = json.loads(kept.read_text())
         else:
             rows = globals()[name](not arguments.observations, arguments.quick, arguments.out)
-        shown = worlds_together(rows) if name == "still" else rows
+        shown = {"still": worlds_together, "table1": places_together}.get(name, list)(rows)
         print(f"\n# {TITLES[name]}\n\n{globals()[name].__doc__}\n\n{table(shown)}", flush=True)
         kept.write_text(json.dumps(rows, indent=2, default=str) + "\n")
     return 0
