@@ -29,10 +29,13 @@ from experiments.object_runs import (
     camera_figures,
     features_where,
     path_of,
+    places_together,
+    plain_table,
     scored_run,
     seen_in,
     steps,
     system_for,
+    worlds_together,
 )  # fmt: skip
 from experiments.tables import picture
 from slam.data import FrameResult, StereoFeatures
