@@ -150,7 +150,7 @@ def _ratio(row: dict[str, str], base: dict[str, str], column: str) -> float:
 
 
 def main() -> int:
-    parser = script_options(__file__, __doc__, "one trial, twelve frames of one world, three variants")
+    parser = script_options(__file__, __doc__, "one trial, twelve frames of one world, two variants")
     parser.add_argument("--trials", type=int, default=5, help="runs of each sequence")
     parser.add_argument("--only", nargs="*", default=[], metavar="VARIANT", help="these variants alone")
     parser.add_argument("--sequences", nargs="*", metavar="NAME", help="these alone")
@@ -158,7 +158,7 @@ def main() -> int:
     cases = [case for case in CASES if not given.sequences or case.name in given.sequences]
     trials, names = given.trials, given.only
     if given.quick:
-        cases, trials, names = [Case("desk", "synthetic:desk?frames=12", 12)], 1, [v.name for v in GROUPS[0][:3]]
+        cases, trials, names = [Case("desk", "synthetic:desk?frames=12", 12)], 1, [ALL_ON.name, "no patch alignment"]
     file = given.out / ("quick.csv" if given.quick else "ablation.csv")
     given.out.mkdir(parents=True, exist_ok=True)
     if not file.exists():
