@@ -253,15 +253,6 @@ def _unresolved(image, stride, x, y, space):
 
 
 @helper
-def _height_beside(image, stride, v, first, count, j, own, space):
-    """`_height` of place number j of a row, to the side on which it is larger."""
-    s = space.scores[j]
-    before, after = space.scores[j - 1] if j > 0 else s, space.scores[j + 1] if j < count - 1 else s
-    side = 1 if after >= before or first + j == _HALF else -1
-    return _height(image, stride, v, first + j, own, s, side, space)
-
-
-@helper
 def _search(image, shape, band, y, first, last, own, limits, space):
     """The place of the patch in columns first..last of the rows within `band` of y: x, y; -1 where there is none.
 
@@ -279,22 +270,33 @@ def _search(image, shape, band, y, first, last, own, limits, space):
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
         _correlate(image, stride, v, first, count, own, space)
         best = _largest(scores, begin, count)
-        if best > score:
-            j = _place_of(scores, best)
-            if abs(first + j - found) > _NEIGHBOURS:
+        better = best > score
+        if better:
+            place = first + _place_of(scores, best)
+            if abs(place - found) > _NEIGHBOURS:
                 rival = max(rival, height)
-            found, row, score = first + j, v, best
-            height = _height_beside(image, stride, v, first, count, j, own, space)
+            found, row, score = place, v, best
         if score < min_correlation:
             continue
-        harmless = one - unresolved - (one - height) / uniqueness  # a rival up to this height is none
+        harmless = one - unresolved - (one - score) / uniqueness  # a rival up to this height is none
         _mark_contenders(scores, count, _CONTENDER * harmless, marks)
+        if better:
+            marks[found - first] = True
         for word in range((count + 7) // 8):
             if words[word] == 0:
                 continue
             for j in range(8 * word, 8 * word + 8):
-                if marks[j] and abs(first + j - found) > _NEIGHBOURS:
-                    rival = max(rival, _height_beside(image, stride, v, first, count, j, own, space))
+                itself = better and first + j == found
+                if not marks[j] or not (itself or abs(first + j - found) > _NEIGHBOURS):
+                    continue
+                s = scores[j]
+                before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
+                side = 1 if after >= before or first + j == _HALF else -1
+                top = _height(image, stride, v, first + j, own, s, side, space)
+                if itself:
+                    height = top
+                else:
+                    rival = max(rival, top)
     if score < min_correlation or one - height > uniqueness * (one - rival - unresolved):
         return -1, -1
     return found, row
