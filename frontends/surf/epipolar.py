@@ -42,8 +42,8 @@ class _Space(NamedTuple):
     def of(cls, width: int) -> _Space:
         """For rows of so many places."""
         words = np.zeros(width // 8 + 1, np.uint64)
-        patches = np.zeros((3, _PADDED), np.float32)
-        return cls(*patches, _SIDE, np.empty(width + _LANES, np.float32), words.view(np.bool_), words)
+        patch, pixels, between = np.zeros((3, _PADDED), np.float32)
+        return cls(patch, pixels, between, _SIDE, np.empty(width + _LANES, np.float32), words.view(np.bool_), words)
 
 
 class HalfImage(NamedTuple):

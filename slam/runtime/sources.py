@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 #: Names of NumPy's functions and methods that make arrays.
-_MAKERS = frozenset(
-    "arange argsort array ascontiguousarray asarray astype concatenate copy copyto cross diag dot empty empty_like eye "
-    "flatnonzero full full_like linalg linspace nonzero ones ones_like outer repeat reshape sort stack sum take tile "
-    "where zeros zeros_like".split()
-)
+_MAKERS = {
+    "arange", "argsort", "array", "ascontiguousarray", "asarray", "astype", "concatenate", "copy", "copyto", "cross",
+    "diag", "dot", "empty", "empty_like", "eye", "flatnonzero", "full", "full_like", "linalg", "linspace", "nonzero",
+    "ones", "ones_like", "outer", "repeat", "reshape", "sort", "stack", "sum", "take", "tile", "where", "zeros",
+    "zeros_like",
+}  # fmt: skip
 _VALUES = (int, float, str, tuple, np.generic, np.ndarray)
 
 

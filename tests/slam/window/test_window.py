@@ -7,7 +7,7 @@ import pytest
 
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.window import covariance_kernels, kernels, solver
+from slam.window import kernels, solver
 from slam.window.marginal import marginalised
 from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.solver import linearised
