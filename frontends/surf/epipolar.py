@@ -47,21 +47,19 @@ class _Space(NamedTuple):
 
 
 class HalfImage(NamedTuple):
-    """An image at half resolution, ready for correlation.
+    """An image at half resolution, ready for correlation: arrays by rows, and a vector register of zeros behind them.
 
     Attributes:
-        pixels: grey values (H/2, W/2) float32 on the scale of 8-bit images.
+        shape: rows and columns.
+        pixels: grey values, float32 on the scale of 8-bit images.
         weight: one over the root of the sum of squared deviations of the patch about each pixel; 0 where it is flat
             or leaves the image.
-        flat_pixels: these by rows in one line, and as many zeros behind them as a vector register reads.
-        flat_weight: likewise.
-        between: likewise, grey values half a column further to the right.
+        between: grey values half a column further to the right.
     """
 
+    shape: tuple[int, int]
     pixels: NDArray[np.float32]
     weight: NDArray[np.float32]
-    flat_pixels: NDArray[np.float32]
-    flat_weight: NDArray[np.float32]
     between: NDArray[np.float32]
 
 
@@ -69,16 +67,17 @@ def half_image(image: NDArray, full_scale: float) -> HalfImage:
     """Halve a grey image (H, W) of pixels 0..full_scale for `search_rows`."""
     import cv2
 
-    height, width = image.shape
-    small = cv2.resize(image, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
-    flat_pixels, flat_weight, between = np.zeros((3, small.size + _LANES), np.float32)
-    pixels, weight = flat_pixels[: small.size].reshape(small.shape), flat_weight[: small.size].reshape(small.shape)
+    rows, columns = (max(n // 2, 1) for n in image.shape)
+    small, beside = (
+        cv2.resize(view, (columns, rows), interpolation=cv2.INTER_AREA) for view in (image, np.roll(image, -1, axis=1))
+    )
+    flat = np.zeros((3, small.size + _LANES), np.float32)
+    pixels, weight, between = (plane[: small.size].reshape(rows, columns) for plane in flat)
     scale = np.float32(255.0 / full_scale)
     np.multiply(small, scale, out=pixels)
-    _weigh(pixels, weight, np.empty(pixels.shape[1], np.float32), np.empty(pixels.shape[1], np.float32))
-    beside = cv2.resize(np.roll(image, -1, axis=1), small.shape[::-1], interpolation=cv2.INTER_AREA)
-    np.multiply(beside, scale, out=between[: small.size].reshape(small.shape))
-    return HalfImage(pixels, weight, flat_pixels, flat_weight, between)
+    np.multiply(beside, scale, out=between)
+    _weigh(pixels, weight, np.empty(columns, np.float32), np.empty(columns, np.float32))
+    return HalfImage((rows, columns), flat[0], flat[1], flat[2])
 
 
 @kernel
@@ -144,7 +143,7 @@ def _correlate(image, stride, y, first, count, own, space):
 
     It goes on to the end of a vector register: `_LANES - 1` more scores and, in the images, pixels at most.
     """
-    pixels, weights, patch, scores = image.flat_pixels, image.flat_weight, space.patch, space.scores
+    pixels, weights, patch, scores = image.pixels, image.weight, space.patch, space.scores
     count = (count + _LANES - 1) & -_LANES
     for j in range(count):
         scores[j] = np.float32(0.0)
@@ -208,7 +207,7 @@ def _height(image, stride, y, x, own, score, side, space):
     """
     zero, one, area = np.float32(0.0), np.float32(1.0), np.float32(_SIDE * _SIDE)
     patch, pixels, between = space.patch, space.pixels, space.between
-    _cut(image.flat_pixels, stride, x, y, space.side, pixels)
+    _cut(image.pixels, stride, x, y, space.side, pixels)
     _cut(image.between, stride, x + (side - 1) // 2, y, space.side, between)
     sa, sb, bb, ab, product = zero, zero, zero, zero, zero
     for k in range(patch.size):
@@ -222,7 +221,7 @@ def _height(image, stride, y, x, own, score, side, space):
     if not spread > area * np.float32(_FLAT * _FLAT):
         return score
     weight = one / np.sqrt(spread)
-    n, alike = product * own * weight, (ab - sa * sb / area) * weight * image.flat_weight[np.uint64(y * stride + x)]
+    n, alike = product * own * weight, (ab - sa * sb / area) * weight * image.weight[np.uint64(y * stride + x)]
     largest = max(score, n)
     if min(score, n) > alike * largest and alike * alike < one:
         largest = np.sqrt((score * score - np.float32(2.0) * alike * score * n + n * n) / (one - alike * alike))
@@ -237,7 +236,7 @@ def _unresolved(image, stride, x, y, space):
     over 4: a share that falls with the fourth power of the distance in smooth images, and more slowly in coarse ones.
     """
     pixels, between, inner = space.pixels, space.between, space.side - 1
-    _cut(image.flat_pixels, stride, x, y, space.side, pixels)
+    _cut(image.pixels, stride, x, y, space.side, pixels)
     _cut(image.between, stride, x, y, space.side, between)
     s, ss, ee = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for r in range(_SIDE):
@@ -328,7 +327,7 @@ def search_rows(
         uniqueness: largest ratio ``(1 - best) / (1 - rival)``.
     """
     out = np.full((len(uv), 2), np.nan)
-    space = _Space.of(left.pixels.shape[1])
+    space = _Space.of(left.shape[1])
     _search_rows(left, right, uv, 0.5 * low, 0.5 * high, band, min_correlation, uniqueness, space, out)
     return out
 
@@ -336,12 +335,12 @@ def search_rows(
 @kernel
 def _search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, space, out):
     """The same into `out`, at half resolution."""
-    height, width = left.pixels.shape
+    height, width = left.shape
     least, most = np.float32(min_correlation), np.float32(uniqueness)
     for i in range(len(uv)):
         px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
         x, y = int(np.rint(px)), int(np.rint(py))
-        if not (_HALF <= x < width - _HALF and _HALF <= y < height - _HALF) or left.weight[y, x] == 0.0:
+        if not (_HALF <= x < width - _HALF and _HALF <= y < height - _HALF) or left.weight[y * width + x] == 0.0:
             continue
         found, row = x, y
         for back in range(2):  # to the right image, and from there to the left one again
@@ -355,8 +354,8 @@ def _search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, 
             if last <= first and not back:
                 break
             limits = least, most, _unresolved(here, width, found, row, space)
-            _take_patch(here.flat_pixels, width, found, row, space)
-            own = here.weight[row, found]
+            _take_patch(here.pixels, width, found, row, space)
+            own = here.weight[row * width + found]
             place, line = _search(there, (height, width), band, row, first, last, own, limits, space)
             if place < 0:
                 break
