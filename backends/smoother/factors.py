@@ -108,7 +108,8 @@ class FactorMaker:
         noise = gtsam.noiseModel.Diagonal.Sigmas(velocity_sigmas(self._models, float(dt[1]), first))
         for key, T in zip(rows[::2], poses):
             values.insert(key, gtsam.Pose3(T))
-        return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*rows, -r, noise), values)
+        rows += [-r, noise]
+        return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*rows), values)
 
     def point(self, z: Sequence[float]) -> gtsam.StereoPoint2:
         """A measurement (uL, vL, uR); uR may be NaN."""

@@ -215,7 +215,7 @@ class Landmarks:
         J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
         n, width = len(chosen), len(joint)
         C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
-        C += np.where((rows < 0).all(axis=1)[:, None, None], self.away[chosen], 0.0)
+        C += np.where(np.asarray((rows < 0).all(axis=1))[:, None, None], self.away[chosen], 0.0)
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from slam.data import Estimate, FrameResult
+from slam.evaluation.consistency import EXACT
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
@@ -22,6 +23,7 @@ from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
 from slam.third_party import checked, named_failures
+from slam.tracks.state import HIDDEN
 from slam.tracks.table import LandmarkTable
 
 
@@ -46,6 +48,7 @@ class RunRecord:
     depths: list[float] = field(default_factory=list)  # median of what each frame sees [m]
     bodies: set[int] = field(default_factory=set)
     repeated: int = 0  # frames with the images of the one before
+    hidden: int = 0  # frames in which something moved past a standing vehicle
     rejected: int = 0
     used: int = 0
     returned: int | None = None  # the first frame in which landmarks of an old place came back
@@ -61,6 +64,7 @@ class RunRecord:
         self.milliseconds.append(dict(result.milliseconds))
         self.times.append(working_time())
         self.repeated += result.reason == REPEATED
+        self.hidden += result.reason == HIDDEN
         self.features.append((len(result.features), int(result.features.has_stereo.sum())))
         self.bodies.update(thing.id for thing in result.objects)
         if not result.located:
@@ -139,6 +143,8 @@ def results_of(
         },
     }
     if isinstance(system, StereoSlam):
+        if found["consistency"].get("mean NEES") is not None and system.config.self_calibration.enabled:
+            found["consistency"] |= _exactness(sequence)
         found["self_calibration"] = system.calibration.summary()
         found["loops"] = system.atlas.summary()
         found["bodies"] = len(record.bodies)
@@ -152,6 +158,12 @@ def results_of(
     return {
         **found, "milliseconds": _timings(record), "frames_per_second": _rate(record), "compile_seconds": compiled,
     }  # fmt: skip
+
+
+def _exactness(sequence: Sequence | Recording) -> dict[str, bool]:
+    """Whether a world's cameras are those of its calibration; nothing of recordings, where nobody knows."""
+    values = getattr(sequence, "values", None)
+    return {} if values is None else {EXACT: not (values["focal_error"] or values["turn_error"])}
 
 
 def live_frames(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
