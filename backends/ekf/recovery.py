@@ -11,19 +11,20 @@ Then the prediction is wrong, not the observations. There are three cases, tried
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import bdtrc
 
-from backends.ekf.covariance import CAMERA
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
+from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 from slam.window.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
 
-#: The change of [r, φ] (6,) to a pose on which landmarks agree, if there is one.
+#: The pose (4, 4) on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]
 
 
@@ -104,7 +105,7 @@ def _gated(problem: Problem, noises: Sequence[Array]) -> tuple[Problem, Gated, A
     if len(problem.z) < most or first.used.sum() >= most:
         return problem, first, None
     for noise in (None, *noises):
-        wider = problem if noise is None else _wider(problem, noise)
+        wider = replace(problem, noise=noise)
         for at_guess in (False,) if problem.guess is None else (False, True):
             gated = gate(wider, at_guess) if noise is not None or at_guess else first
             if gated.used.sum() >= most:
@@ -115,36 +116,26 @@ def _gated(problem: Problem, noises: Sequence[Array]) -> tuple[Problem, Gated, A
 def _restarted(problem: Problem, search: Search, models: EstimatorModels) -> Agreement | None:
     """With a camera that is where the landmarks say, wherever it was before; None where most do not agree with it."""
     least = max(MIN_CONSENSUS, _half(problem))
-    change = search() if len(problem.z) >= least else None
-    if change is None:
+    finite = math.isfinite(problem.prior.P.trace())
+    T = search() if finite and len(problem.z) >= least else None
+    if T is None:
         return None
-    noise = restart_noise(change, models)
-    there = replace(_wider(problem, noise), guess=change)
+    there = replace(problem, guess=T, noise=restart_noise(problem.prior.T, T, models))
     try:
         solution = solve(there, gate(there, at_guess=True))
     except UnsolvableError:
         return None
     if solution is None or solution.used.sum() < least:
         return None
-    return Agreement(solution, noise)
+    return Agreement(solution, there.noise)
 
 
 def _half(problem: Problem) -> int:
     return (len(problem.z) + 1) // 2
 
 
-def _wider(problem: Problem, noise: Array) -> Problem:
-    P = problem.P.copy()
-    P[:CAMERA, :CAMERA] += noise
-    return replace(problem, P=P)
-
-
-def restart_noise(change: Array, models: EstimatorModels) -> Array:
-    """The noise (12, 12) of a camera that is elsewhere, by a change of [r, φ] (6,), and whose speed is unknown."""
-    sigmas = np.repeat(
-        [
-            float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])),
-            models.initial_velocity_sigma, models.initial_angular_velocity_sigma,
-        ], 3,
-    )  # fmt: skip
-    return np.diag(sigmas**2)
+def restart_noise(before: Array, after: Array, models: EstimatorModels) -> Array:
+    """The noise (12, 12) of a camera that is at a pose (4, 4) instead of another, and whose speed is unknown."""
+    far, turned = np.linalg.norm(after[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ after[:3, :3])
+    speeds = models.initial_velocity_sigma, models.initial_angular_velocity_sigma
+    return np.diag(np.repeat(np.array([far, turned, *speeds], float) ** 2, 3))

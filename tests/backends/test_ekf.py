@@ -200,10 +200,10 @@ def test_what_nothing_measures_stays_unknown(drive, landmarks, iterations):
     learnt = []
     for consistent in (True, False):
         backend, _ = halfway(drive, 25, models, landmarks=landmarks, consistent=consistent, iterations=iterations)
-        marks, camera = backend.state.landmarks, backend.state.camera
+        marks, camera = backend.state.landmarks, backend.state.camera.x
         shift = np.zeros((12 + 3 * len(marks), 6))
         shift[:3, :3], shift[:3, 3:] = np.eye(3), -se3.hat(camera[:3])
-        shift[3:6, 3:] = np.linalg.inv(turning(backend.state.R_world_angles, camera))
+        shift[3:6, 3:] = np.linalg.inv(turning(backend.state.camera.R_world_angles, camera))
         shift[6:9, 3:] = -se3.hat(camera[6:9])
         gauge = gauge_jacobian(COORDINATES[landmarks], marks.anchors, marks.c, marks.points)
         shift[12:] = gauge.reshape(-1, 6)
