@@ -1,6 +1,6 @@
 """NEES of the camera along a corridor without end: the papers' filter, the back ends, and what each claims to know.
 
-    python experiments/corridor.py [--quick] [--seeds 20] [--frames 1000] [--out DIR]
+    python experiments/corridor.py [--quick] [--seeds 4] [--frames 1000] [--out DIR]
 
 The world is the corridor of `experiments/long_run.py`, with true association. Every run starts at a pose drawn from the
 prior about the true one, with its own pixel noise; all back ends get the same. Nothing measures where the world is and
@@ -150,7 +150,7 @@ def write_csv(path: Path, done: Mapping[str, list[Run]]) -> None:
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "two seeds of forty frames")
-    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--filters", nargs="*", default=list(FILTERS), choices=list(FILTERS))
     given = parser.parse_args()

@@ -83,7 +83,7 @@ EXPERIMENTS = (
         },
     ),
     Experiment(
-        "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "10"), pictures={
+        "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "4"), pictures={
             "corridor": "Left: mean NEES and its band. Right: what is claimed of the heading, which nothing measures."
         },
     ),
