@@ -269,10 +269,10 @@ class EkfBackend:
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
-            after = s.corrected(self._coordinates, found, rows)
+            after = State.corrected(self._coordinates, found, rows)
         except UnsolvableError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self._form.name}: {error}")
-        used, w = found.solution.used, found.solution.system.w
+        used, w = found.used, found.system.w
         dof = int(np.isfinite(problem.z[used]).sum())
         return after, UpdateReport(
             UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], float(w @ w), dof
@@ -283,9 +283,7 @@ class EkfBackend:
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
         if not self._form.stereo:
             z[:, 2] = np.nan
-        view, model = partial(s.view, rows), Measurement(
-            self.rig, self._coordinates, s.landmarks.anchors[rows]
-        )
+        view, model = partial(s.view, rows), Measurement(self.rig, self._coordinates, s.landmarks.anchors[rows])
         return Problem(
             view, s.landmarks.c[rows], CAMERA + 3 * rows, z, self.models.pixel_sigma, model, self._form.iterations,
             self.models.gate_probability, guess,

@@ -24,60 +24,36 @@ _SMALL_TURN = 0.2  # numerics: of a step whose error may be carried as a turn ab
 class Camera(Protocol):
     """The camera's part of a filter's state, and what its error (12,) means: of the pose (6), of velocity and rate (6).
 
-    Attributes:
-        pose: ``T_world_left`` (4, 4).
-        invariant: whether landmarks' errors are what is left when the world is displaced by the error of the pose.
-        transports: whether the covariance is transported to the corrected state after an update.
+    - `pose`: ``T_world_left`` (4, 4).
+    - `invariant`: whether landmarks' errors are what is left when the world is displaced by the error of the pose.
+    - `transports`: whether the covariance is transported to the corrected state after an update.
+    - `by_error`: derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error.
+    - `world`: the displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose.
+    - `plain`: the error (12, 12) by errors of position, attitude (a turn about the world's axes), velocity, and rate.
+    - `moved`: after an error (12,) is corrected. `at`: at another pose (4, 4), with the same velocities.
+    - `seen_from`: the error (12,) that would bring the other camera here.
+    - `transport`: the error as seen from another camera, by the error (12, 12).
+    - `advanced`: after `dt` [s], with the error's covariance P (12, 12).
+    - `at_rest`: after a step of a camera that stands: the pose stays, and the velocity is zero for certain.
+    - `settled`: in coordinates in which nothing is near a singularity.
     """
 
     @property
+    def pose(self) -> Array: ...  # noqa: D102
+    @property
     def invariant(self) -> bool: ...  # noqa: D102
-
     @property
     def transports(self) -> bool: ...  # noqa: D102
-
-    @property
-    def pose(self) -> Array: ...  # noqa: D102
-
-    def by_error(self) -> Array:
-        """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
-        ...
-
-    def world(self) -> Array:
-        """Displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose."""
-        ...
-
-    def plain(self) -> Array:
-        """The error (12, 12) by errors of position, attitude (a turn about the world's axes), velocity, and rate."""
-        ...
-
-    def moved(self, error: Array) -> Any:
-        """After an error (12,) is corrected."""
-        ...
-
-    def at(self, T: Array) -> Any:
-        """At another pose (4, 4), with the same velocities."""
-        ...
-
-    def seen_from(self, other: Any) -> Array:
-        """The error (12,) that would bring the other camera here."""
-        ...
-
-    def transport(self, to: Any) -> Array:
-        """The error (12, 12), as seen from another camera."""
-        ...
-
-    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
-        """After `dt` [s], with the error's covariance P (12, 12)."""
-        ...
-
-    def at_rest(self) -> Motion:
-        """After a step of a camera that stands: the pose stays, and the velocity is zero for certain."""
-        ...
-
-    def settled(self) -> Motion:
-        """In coordinates in which nothing is near a singularity."""
-        ...
+    def by_error(self) -> Array: ...  # noqa: D102
+    def world(self) -> Array: ...  # noqa: D102
+    def plain(self) -> Array: ...  # noqa: D102
+    def moved(self, error: Array) -> Any: ...  # noqa: D102
+    def at(self, T: Array) -> Any: ...  # noqa: D102
+    def seen_from(self, other: Any) -> Array: ...  # noqa: D102
+    def transport(self, to: Any) -> Array: ...  # noqa: D102
+    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion: ...  # noqa: D102
+    def at_rest(self) -> Motion: ...  # noqa: D102
+    def settled(self) -> Motion: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)

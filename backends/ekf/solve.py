@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg.blas import dgemm, dtrmm
@@ -27,10 +28,8 @@ from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
-#: further than needed does harm: a landmark's Gaussian in world coordinates comes from pixels by a linearisation at its
-#: prediction and fits pixels linearised there; moving that point to where each noisy measurement wants it biases the
-#: estimate and claims information that is not there (simulated drives at 0.1: twice the rotation error, four times
-#: the NEES of 1.0). But a long step, or the first frames of a fast camera, cannot do without.
+#: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
+#: there (drives at 0.1: four times the NEES of 1.0). A long step, or a fast camera's first, cannot do without.
 _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its standard deviations: with a wide prior they all have the
 #: same sign, and each within its noise they moved it by 0.7 of them.
@@ -48,6 +47,7 @@ class View:
     """The prior as seen from a pose: errors of the state are taken from there.
 
     Attributes:
+        state: the prior itself (`backends.ekf.state.State`), with its covariance as seen from there.
         T: the pose T_world_left (4, 4).
         P: the covariance (n, n) of the state's error.
         mean: that of the state's error (n,): zero at the prior's own pose.
@@ -55,6 +55,7 @@ class View:
         go: the pose, and the changes (M, 3) of the measured landmarks' coordinates, after an error (n,).
     """
 
+    state: Any
     T: Array
     P: Array
     mean: Array
@@ -103,10 +104,9 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """Where the measurements are linearised: a view, and a change (M, 3) of the landmarks' coordinates.
+    """Where measurements are linearised: a view, and a change (M, 3) of the landmarks' coordinates.
 
-    Also what is predicted there (M, 3), its derivatives (M, 3, 3) by the coordinates, and how far (squared) it is from
-    the prior.
+    Also what is predicted (M, 3), its derivatives (M, 3, 3) by the coordinates, the squared distance from the prior.
     """
 
     view: View
@@ -250,14 +250,12 @@ class Solution:
         view: of the last linearisation.
         change: the error (n,) to correct, as seen from there.
         system: the last linear update, from which the covariance follows.
-        distances: of each landmark (M,): squared distance of its measurement from what all others predict.
     """
 
     used: BoolArray
     view: View
     change: Array
     system: System
-    distances: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,25 +298,23 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
     the worst one, until all that is left agrees.
 
-    Returns:
-        the solution, or None where no observation is left.
+    None where no observation is left.
 
     Raises:
-        UnsolvableError: S is not positive definite, the new state not finite, or a variance not positive.
+        UnsolvableError: S is not positive definite, the new state not finite, or the pose's covariance not positive.
     """
     if not gated.used.any():
         return None
     used, first = gated.used, System.of(gated.linear, gated.linear.rows & ~gated.used[:, None])
     while used.any():
         view, change, system = _iterate(problem, gated.start, first)
-        distances = system.distances()
-        excess = distances / gated.limits
+        excess = system.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
             left = view.P[:POSE, :POSE] - system.by_pose.T @ system.by_pose
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
-            return Solution(used, view, change, system, distances)
+            return Solution(used, view, change, system)
         used = used & (excess <= max(1.0, 0.5 * worst))
         first = first.without(~used[:, None] & np.ones(3, bool))
     return None
@@ -327,9 +323,8 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
 def _iterate(problem: Problem, now: Iterate, system: System) -> tuple[View, Array, System]:
     """The change of the state (n,), seen from a view, by an update whose first linearisation is `system`, and the last.
 
-    Gauss-Newton on the posterior (the iterated Kalman filter); a step that raises the cost, or takes a landmark
-    behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
-    With one iteration the step is taken as it is: the papers' filter.
+    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
+    is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
     """
     rows, reached = system.rows, None
     for iteration in range(1, problem.iterations + 1):
@@ -389,11 +384,8 @@ def _at_guess(problem: Problem) -> Iterate:
 def _descend(problem: Problem, rows: BoolArray, now: Iterate, s: Array, change: Array) -> tuple[Iterate, Array]:
     """The longest of the steps 1, 1/2, 1/4, ... towards ``change = mean + P s`` that does not raise the cost, else now.
 
-    The next linearisation is at the pose reached, so that the camera turns and the landmarks stay where they are. On
-    the way the squared distance from the prior, with d at the start and d' at the end, is that of (1 − a) d + a d'.
-
-    Returns:
-        where it ends, and the step (n,).
+    Where it ends, and the step (n,). The next linearisation is at the pose reached: the camera turns, and the landmarks
+    stay. On the way the distance from the prior, with d at the start and d' at the end, is that of (1 − a) d + a d'.
     """
     there = (change - now.view.mean)[problem.g]
     start = np.concatenate([np.zeros(POSE), now.change.reshape(-1)])

@@ -9,8 +9,7 @@ import numpy as np
 from backends.ekf.covariance import CAMERA, POSE, Covariance
 from backends.ekf.landmarks import Coordinates, Landmarks
 from backends.ekf.motion import Camera, Motion
-from backends.ekf.recovery import Agreement
-from backends.ekf.solve import UnsolvableError, View
+from backends.ekf.solve import Solution, UnsolvableError, View
 from slam.data import IdArray, IndexArray, RecentPoses
 from slam.geometry import se3
 from slam.geometry.se3 import Array
@@ -76,16 +75,6 @@ class State:
         """With another camera, whose error is that of this one and noise; the landmarks stay where they are."""
         K = self.levers(np.arange(self.covariance.count)) if self.camera.invariant else None
         return replace(self, camera=motion.camera, covariance=self.covariance.camera_moved(motion.J, motion.noise, K))
-
-    def _linearised_at(self, T: Array | None, noise: Array | None) -> State:
-        """As seen from a pose (4, 4), if there is one, with more noise (12, 12) of position, attitude, and rates."""
-        s, J = self, self.camera.plain()
-        if noise is not None:
-            s = s._carried(Motion(s.camera, noise=J @ noise @ J.T))
-        if T is not None:
-            camera = s.camera.at(T)
-            s = s._carried(Motion(camera, s.camera.transport(camera)))
-        return s
 
     def recent_poses(self, n: int) -> RecentPoses:
         """The last poses, as they were believed in their time, with their joint covariance; at most n."""
@@ -194,9 +183,12 @@ class State:
 
     def view(self, rows: IndexArray, T: Array | None, noise: Array | None) -> View:
         """The state as seen from a pose (4, 4), for an update by landmarks of some rows (M,); see `Problem.view`."""
-        s = self._linearised_at(T, noise)
-        camera, mean = s.camera, np.zeros(len(s.covariance.dense))
+        s, camera, S, mean = self, self.camera, self.camera.plain(), np.zeros(len(self.covariance.dense))
+        if noise is not None:
+            s = s._carried(Motion(camera, noise=S @ noise @ S.T))
         if T is not None:
+            camera = camera.at(T)
+            s = s._carried(Motion(camera, self.camera.transport(camera)))
             mean[:CAMERA] = self.camera.seen_from(camera)
             mean[CAMERA:] = -(s.levers(np.arange(s.covariance.count)) @ mean[:POSE]).reshape(-1)
         numbers, K = CAMERA + 3 * rows[:, None] + np.arange(3), s.levers(rows)
@@ -204,10 +196,11 @@ class State:
         def go(error: Array) -> tuple[Array, Array]:
             return camera.moved(error[:CAMERA]).pose, error[numbers] + K @ error[:POSE]
 
-        return View(camera.pose, s.covariance.dense, mean, s.relative(rows), go)
+        return View(s, camera.pose, s.covariance.dense, mean, s.relative(rows), go)
 
-    def corrected(self, coordinates: Coordinates, found: Agreement, rows: IndexArray) -> State:
-        """After an update by the landmarks of some rows (M,) of the table.
+    @staticmethod
+    def corrected(coordinates: Coordinates, solution: Solution, rows: IndexArray) -> State:
+        """After an update by the landmarks of some rows (M,) of the table, of the state as the solution sees it.
 
         A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on
         the state, though (how far the world's origin is, which way is depth), and an update moves the state. A filter
@@ -220,9 +213,7 @@ class State:
         Raises:
             UnsolvableError: the new state is not finite.
         """
-        solution = found.solution
-        T = None if solution.view.T is self.pose else solution.view.T
-        s = self._linearised_at(T, found.noise)
+        s: State = solution.view.state
         P, before, dense = s.covariance, s.camera, np.arange(s.covariance.count)
         error, J, K = solution.change, None, None
         camera = before.moved(error[:CAMERA])

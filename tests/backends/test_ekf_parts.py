@@ -14,7 +14,6 @@ from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, InverseDepth, Landmarks, gauge_jacobian
 from backends.ekf.measurement import Jacobian, Measurement
 from backends.ekf.motion import EulerCamera
-from backends.ekf.recovery import Agreement
 from backends.ekf.solve import Iterate, Linear, Problem, System, UnsolvableError, gate, solve
 from backends.ekf.state import State
 from slam.errors import MeasurementError
@@ -317,7 +316,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     K = np.linalg.solve(S, H @ P).T
     J = np.eye(len(P)) - K @ H
     joseph = J @ P @ J.T + 0.25 * K @ K.T
-    after = s.corrected(coordinates, Agreement(solution), rows)
+    after = s.corrected(coordinates, solution, rows)
     difference = in_deviations(after.covariance.dense - joseph, joseph)
     assert np.abs(difference).max() < 1e-5  # what the differences leave in H
     found = np.concatenate([after.camera.x, after.landmarks.c.reshape(-1)])
@@ -374,7 +373,7 @@ def ungated(problem: Problem):
 
 def corrected(s: State, problem: Problem) -> np.ndarray:
     """The change of the state (48,) that an update makes."""
-    after = s.corrected(Euclidean(), Agreement(ungated(problem)), np.arange(12))
+    after = s.corrected(Euclidean(), ungated(problem), np.arange(12))
     return np.concatenate([after.camera.x - s.camera.x, (after.landmarks.c - s.landmarks.c).reshape(-1)])
 
 

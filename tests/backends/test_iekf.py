@@ -11,7 +11,6 @@ from scipy.stats import chi2
 
 from backends.ekf.landmarks import InverseDepth
 from backends.ekf.measurement import Measurement
-from backends.ekf.recovery import Agreement
 from backends.ekf.solve import Problem, gate, solve
 from backends.ekf.state import State
 from backends.iekf import IekfBackend
@@ -109,7 +108,7 @@ def test_the_update_is_the_joseph_form_along_measured_columns_alone():
     K = np.linalg.solve(S, H @ P).T
     change = K @ (measured - model.predict(s.pose, c)).reshape(-1)
     np.testing.assert_allclose(solution.change, change, rtol=1e-4, atol=1e-7)
-    after = s.corrected(model.coordinates, Agreement(solution), rows)
+    after = s.corrected(model.coordinates, solution, rows)
     J, deviation = np.eye(len(P)) - K @ H, np.sqrt(np.diag(P))
     joseph = J @ P @ J.T + 0.25 * K @ K.T
     assert np.abs((after.covariance.dense - joseph) / np.outer(deviation, deviation)).max() < 1e-5
