@@ -31,8 +31,7 @@ from slam.geometry.se3 import Array
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
 #: there (drives at 0.1: four times the NEES of 1.0). A long step, or a fast camera's first, cannot do without.
 _LINEAR = 1.0
-#: Their errors together may move the pose by this share of its standard deviations: with a wide prior they all have the
-#: same sign, and each within its noise they moved it by 0.7 of them.
+#: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
 _SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
@@ -171,7 +170,7 @@ class System:
     def without(self, gone: BoolArray) -> System:
         """Without some more rows (mask (M, 3))."""
         columns = self.inverse[:, np.flatnonzero(gone & self.rows)]
-        more, _ = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))
+        more = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))[0]
         return replace(self, rows=self.rows & ~gone, taken=np.concatenate([self.taken, more], axis=1))
 
     def whiten(self, X: Array) -> Array:
@@ -211,8 +210,8 @@ class System:
         For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
         by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
         """
-        lost = self.taken.T @ self.inverse
-        found, used = kernels.conditional_distances(self.inverse, lost, self.y), self.rows.any(axis=1)
+        found = kernels.conditional_distances(self.inverse, self.taken.T @ self.inverse, self.y)
+        used = self.rows.any(axis=1)
         if not np.isfinite(found[used]).all():
             raise UnsolvableError("the innovation covariance is not positive definite")
         return np.where(used, found, 0.0)
@@ -340,8 +339,8 @@ def _iterate(problem: Problem, now: Iterate, system: System) -> tuple[View, Arra
             break
         reached = now.view, step, system
         if iteration < problem.iterations:
-            now = following
-            system = System.of(Linear.at(problem, rows, now), np.zeros_like(rows))
+            now, nothing = following, np.zeros_like(rows)
+            system = System.of(Linear.at(problem, rows, now), nothing)
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
