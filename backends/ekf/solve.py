@@ -295,9 +295,7 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
-    the worst one, until all that is left agrees.
-
-    None where no observation is left.
+    the worst one, until all that is left agrees; None where nothing is left.
 
     Raises:
         UnsolvableError: S is not positive definite, the new state not finite, or the pose's covariance not positive.
@@ -339,8 +337,8 @@ def _iterate(problem: Problem, now: Iterate, system: System) -> tuple[View, Arra
             break
         reached = now.view, step, system
         if iteration < problem.iterations:
-            now, nothing = following, np.zeros_like(rows)
-            system = System.of(Linear.at(problem, rows, now), nothing)
+            now = following
+            system = System.of(Linear.at(problem, rows, now), np.zeros_like(rows))
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
