@@ -210,6 +210,10 @@ class State:
         coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau and
         Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none.
 
+        An invariant error is corrected as a displacement of the world, exact however large it is, and what is left of
+        the landmarks' changes in the world: to first order that is the correction, and of second order there is nothing
+        where the camera moves among landmarks that stay.
+
         Raises:
             UnsolvableError: the new state is not finite.
         """
@@ -217,9 +221,15 @@ class State:
         P, before, dense = s.covariance, s.camera, np.arange(s.covariance.count)
         error, J, K = solution.change, None, None
         camera = before.moved(error[:CAMERA])
-        marks = s.landmarks.moved(coordinates, dense, error[CAMERA:].reshape(-1, 3))
-        if camera.invariant:
-            marks = marks.displaced(coordinates, dense, camera.pose @ se3.inverse(before.pose))
+        change, displacement = error[CAMERA:].reshape(-1, 3), np.zeros(CAMERA)
+        if camera.invariant and len(dense):
+            levers = s.levers(dense)
+            change = change + levers @ error[:POSE]  # in the world as it was
+            displacement[:POSE] = np.linalg.lstsq(levers.reshape(-1, POSE), change.reshape(-1), rcond=None)[0]
+            change = change - levers @ displacement[:POSE]
+        marks = s.landmarks.moved(coordinates, dense, change)
+        if displacement.any():
+            marks = marks.displaced(coordinates, dense, before.moved(displacement).pose @ se3.inverse(before.pose))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
         if camera.transports:

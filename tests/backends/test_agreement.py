@@ -30,8 +30,7 @@ def test_the_pose_and_its_covariance_are_the_filters(name):
     filtered, other = estimates
     deviation = np.sqrt(np.diag(filtered.covariance))
     difference = se3.log(se3.inverse(filtered.T_world_left) @ other.T_world_left) / deviation
-    # The invariant error is another to second order: a correction by 1 cm turns a landmark's by 1 cm over its depth.
-    assert np.abs(difference).max() < (2e-3 if name == "iekf" else 1e-3)  # standard deviations
+    assert np.abs(difference).max() < 1e-3  # standard deviations
     np.testing.assert_allclose(np.sqrt(np.diag(other.covariance)), deviation, rtol=1e-3)
     marginals = [np.sqrt(np.diagonal(e.covariances, axis1=1, axis2=2)) for e in estimates]
     np.testing.assert_allclose(marginals[1], marginals[0], rtol=0.02)
