@@ -92,6 +92,17 @@ def test_a_kidnapped_map_grows_anew_but_does_not_break(backend):
     assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.01
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_new_map_forgets_what_the_rig_s_error_does_to_the_landmarks_of_the_old_one(backend):
+    """By a baseline 33 times too long nothing is tracked, and map follows map, while the calibration goes on."""
+    sequence = slam.open_sequence("synthetic:desk?frames=12&baseline=0.075")
+    rig = slam.StereoRig.from_pinhole(sequence.rig.left.K, baseline=2.5, size=(320, 240))
+    system = StereoSlam(rig, backend=backend)
+    for frame in sequence:
+        system.process(frame)
+    assert len(system.restarted) >= 2
+
+
 def test_time_must_increase():
     cloud = Cloud()
     system = StereoSlam(RIG, None, "ekf", config=CONFIG)
