@@ -21,9 +21,10 @@ from slam.errors import SequenceError, SlamError
 from slam.files import lock_folder
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.map_io import load_map
+from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS
 from slam.run.recording import load_recording
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.sequences.base import Sequence
 from tests.fuzz.harness import Broken, Subject, require_line
 from tests.fuzz.hostile import choose
@@ -46,29 +47,29 @@ class Scripted:
     def __len__(self) -> int:
         return FRAMES
 
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[_Numbered]:
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Numbered]:
         for k in range(FRAMES):
             if self._error is not None and k == self._at:
                 raise self._error
-            yield _Numbered.of(k, self.features[k])
+            yield Numbered.of(k, self.features[k])
 
 
 @dataclass(frozen=True, eq=False)
-class _Numbered(StereoFrame):
+class Numbered(StereoFrame):
     """A frame that holds its features already."""
 
     features: object = None
 
     @classmethod
-    def of(cls, index: int, features: object) -> _Numbered:
+    def of(cls, index: int, features: object) -> Numbered:
         """Without an image."""
         return cls(index, 0.0, np.zeros((0, 0), np.uint8), None, features=features)
 
 
-class _Frontend:
+class Features:
     """Gives the features of a frame."""
 
-    def extract(self, frame: _Numbered) -> object:
+    def extract(self, frame: Numbered) -> object:
         return frame.features
 
 
@@ -95,7 +96,7 @@ def write_run(rng: np.random.Generator, folder: Path) -> None:
     raised: BaseException | None = None
     try:
         with disk_of(size):
-            run(sequence, options, frontend=_Frontend())  # type: ignore[arg-type]
+            run(sequence, options, frontend=Features())  # type: ignore[arg-type]
     except (SlamError, Interrupted) as caught:
         raised = caught
     finally:

@@ -21,10 +21,11 @@ from slam.config import SystemConfig
 from slam.mapping.map_io import SavedMap, decode, encode
 from slam.objects.config import ObjectsConfig
 from slam.objects.procedure1 import ObjectDatabase
+from slam.run.options import RunOptions
 from slam.run.recorded import record
 from slam.run.recording import load_recording, save_recording
 from slam.run.run_data import RunData, read_objects
-from slam.run.runner import RunOptions, run_recording
+from slam.run.runner import run_recording
 from slam.system import StereoSlam
 from tests.fuzz.harness import Broken, Subject
 from tests.fuzz.hostile import VALUES, broken_bytes, broken_text, choose
@@ -49,7 +50,7 @@ def _files() -> dict[str, bytes]:
     return {**kept, "a.map": encode(system.snapshot()), "rig.json": rig_errors.encode()}
 
 
-def _map() -> SavedMap:
+def small_map() -> SavedMap:
     return decode(_files()["a.map"], "a.map")
 
 
@@ -130,7 +131,7 @@ def large_map(rng: np.random.Generator, folder: Path) -> None:
         points, looks = rng.standard_normal((n, 3)), np.zeros((n, 64), np.float32)
         known = SavedMap(np.arange(n), points, covariances, looks, signs, ones, ones)
     else:
-        known, scale = _map(), 10.0 ** rng.integers(-20, 20)
+        known, scale = small_map(), 10.0 ** rng.integers(-20, 20)
         name = choose(rng, ("positions", "covariances", "descriptors"))
         known = replace(known, **{name: (getattr(known, name) * scale).astype(getattr(known, name).dtype)})
     _go_on(prior_map=known)
