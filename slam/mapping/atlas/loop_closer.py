@@ -334,7 +334,7 @@ class LoopCloser:
         chain = atlas.chain(rig, path())
         common = None if atlas.solved is None else atlas.solved.common_as(rig)
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
-        limit, off = self._config.gate_sigmas**2, disagreement(graph, loop)
+        limit, off = self._config.gate, disagreement(graph, loop)
         if off > limit and not (same_view and np.isfinite(off)):
             return self._refuse(atlas, chain, loop, seen, rig)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
@@ -360,7 +360,7 @@ class LoopCloser:
         from slam.mapping.atlas.consensus import agreeing, spaced
         from slam.mapping.atlas.pose_graph import PoseGraph
 
-        most, limit, refused = self._config.most_loops, self._config.gate_sigmas**2, {*atlas.refused, loop.pair}
+        most, limit, refused = self._config.most_loops, self._config.gate, {*atlas.refused, loop.pair}
         atlas = replace(atlas.with_inactive_loop(loop, most), refused=(*atlas.refused, loop.pair))
         left = self._config.return_depths * np.array([k.depth for k in atlas.keyframes])
         every, start = (*atlas.loops, *atlas.inactive_loops), atlas.in_map(chain)
@@ -388,7 +388,7 @@ class LoopCloser:
         expected = inverse(T_old) @ before.T_first_second @ T_new
         back, far = adjoint(inverse(T_new)), adjoint(inverse(expected))
         P = back @ before.covariance @ back.T + P_new + loop.covariance + far @ P_old @ far.T
-        return distance(expected, loop.T_first_second, P) < self._config.gate_sigmas**2
+        return distance(expected, loop.T_first_second, P) < self._config.gate
 
     def _returned(self, seen: Verified) -> Returned:
         """The old keyframe's inliers, in coordinates of the present left camera."""
