@@ -334,9 +334,9 @@ class LoopCloser:
         chain = atlas.chain(rig, path())
         common = None if atlas.solved is None else atlas.solved.common_as(rig)
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
-        limit, off = self._config.gate, disagreement(graph, loop)
+        limit, off = self._config.gate_sigmas**2, disagreement(graph, loop)
         if off > limit and not (same_view and np.isfinite(off)):
-            return self._refuse(atlas, chain, loop, seen, rig)
+            return self._left_out(atlas, chain, loop, seen, rig, off > self._config.refused_beyond)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
@@ -349,26 +349,31 @@ class LoopCloser:
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
-            return self._refuse(replace(atlas, pending=None), chain, loop, seen, rig)
+            return self._left_out(replace(atlas, pending=None), chain, loop, seen, rig)
         atlas = atlas.with_loop(loop, self._config.most_loops).solved_by(graph.solution(), rig)
         return atlas, self._returned(seen) if self._config.give_back else None
 
-    def _refuse(
-        self, atlas: Atlas, chain: Chain, loop: Loop, seen: Verified, rig: CommonError
+    def _left_out(
+        self, atlas: Atlas, chain: Chain, loop: Loop, seen: Verified, rig: CommonError, refused: bool = True
     ) -> tuple[Atlas, Returned | None]:
-        """Refuse a loop that contradicts the others, or refuse the others if fewer places support them."""
+        """Leave out a loop that contradicts the others, or the others if fewer places support them.
+
+        One that is not `refused` contradicts them by no more than may be: it does not count as another place.
+        """
         from slam.mapping.atlas.consensus import agreeing, spaced
         from slam.mapping.atlas.pose_graph import PoseGraph
 
-        most, limit, refused = self._config.most_loops, self._config.gate, {*atlas.refused, loop.pair}
-        atlas = replace(atlas.with_inactive_loop(loop, most), refused=(*atlas.refused, loop.pair))
+        most, limit = self._config.most_loops, self._config.gate_sigmas**2
+        atlas = atlas.with_inactive_loop(loop, most)
+        if refused:
+            atlas = replace(atlas, refused=(*atlas.refused, loop.pair))
         left = self._config.return_depths * np.array([k.depth for k in atlas.keyframes])
         every, start = (*atlas.loops, *atlas.inactive_loops), atlas.in_map(chain)
 
         def places(loops: Sequence[Loop]) -> list[Loop]:
             return spaced(loops, atlas.travelled, left)
 
-        if not atlas.loops or len(places([x for x in atlas.inactive_loops if x.pair in refused])) < 2:
+        if not atlas.loops or len(places(atlas.inactive_loops)) < 2:
             return atlas, None
         rival = agreeing(chain, every, loop, chain.poses, limit)
         if len(places(rival)) <= len(places(agreeing(chain, every, atlas.loops[-1], start, limit))):
@@ -388,7 +393,7 @@ class LoopCloser:
         expected = inverse(T_old) @ before.T_first_second @ T_new
         back, far = adjoint(inverse(T_new)), adjoint(inverse(expected))
         P = back @ before.covariance @ back.T + P_new + loop.covariance + far @ P_old @ far.T
-        return distance(expected, loop.T_first_second, P) < self._config.gate
+        return distance(expected, loop.T_first_second, P) < self._config.gate_sigmas**2
 
     def _returned(self, seen: Verified) -> Returned:
         """The old keyframe's inliers, in coordinates of the present left camera."""
