@@ -36,8 +36,8 @@ class AtlasConfig:
             image's width.
         agreeing: number of keyframes, 1 or 2, that must see the same loop before it is closed; the second at most three
             keyframes after the first.
-        gate_sigmas: a loop is closed if its distance from the path is at most this many standard deviations. Beyond what
-            is as rare as a Gaussian number so far off, it is refused; between the two it is left out.
+        gate_sigmas: a loop is closed if its distance from the path is at most this many standard deviations. Beyond
+            what is as rare as a Gaussian number so far off, it is refused; between the two it is left out.
         most_loops: largest number of loops in the pose graph, as each makes the next one slower; beyond it, those
             spread most evenly along the path are kept.
         give_back: landmarks of a revisited place return to the back end, if it can place landmarks.
