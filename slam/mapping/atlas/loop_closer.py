@@ -345,7 +345,7 @@ class LoopCloser:
             atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
             chain = atlas.chain(rig, path())
             graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
-        elif atlas.loops and not is_informative(graph, atlas.loops[-1], loop):
+        elif atlas.loops and not is_informative(graph, loop):
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
@@ -408,13 +408,12 @@ class LoopCloser:
         return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
 
 
-def is_informative(graph: PoseGraph, last: Loop, loop: Loop) -> bool:
-    """Whether a loop is more certain than the path since the last loop, in any direction.
+def is_informative(graph: PoseGraph, loop: Loop) -> bool:
+    """Whether a loop is more certain than what path and loops so far say of it, in any direction.
 
-    The path's uncertainty includes that of the common errors after the loops so far: in a place that is seen again and
-    again these are soon known, and most loops add nothing.
+    In a place that is seen again and again they soon know as much, and most loops add nothing.
     """
-    _, P = graph.relative_pose(last.second, loop.second)
+    _, P = graph.relative_pose(loop.first, loop.second)
     return bool(eigvalsh(P, loop.covariance)[-1] > 1.0)
 
 
