@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-
 from itertools import pairwise
 
 import gtsam
@@ -216,13 +215,10 @@ def test_one_loop_more_is_the_same_as_all_at_once():
 
 
 def test_a_loop_says_little_where_earlier_ones_have_told_as_much():
-    """Two loops a step apart are as good as one that is twice as sure; one that is much surer than both still counts."""
+    """Two equal loops are as good as one that is twice as sure."""
     true, chain, loops, _ = problem_with_common_errors(4)
-    chain = Chain(true, 1e-4 * chain.steps, chain.common[:, :, :0])
-    loop = loops[0]
-    other = replace(loop, T_first_second=inverse(true[loop.first]) @ true[loop.second])
-    untold, told = (PoseGraph.solved(chain, some, true, loop.pair) for some in ((), (loop, other)))
-    sure = replace(loop, covariance=0.1 * loop.covariance)
-    assert is_informative(untold, replace(loop, covariance=1e-6 * loop.covariance))
+    chain, loop = Chain(true, chain.steps), loops[0]
+    untold, told = (PoseGraph.solved(chain, some, true, loop.pair) for some in ((), (loop, loop)))
+    assert is_informative(untold, loop)
     assert not is_informative(told, loop)
-    assert is_informative(PoseGraph.solved(Chain(true, 1e4 * chain.steps), (loop,), true, loop.pair), sure)
+    assert is_informative(told, replace(loop, covariance=0.1 * loop.covariance))
