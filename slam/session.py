@@ -132,6 +132,7 @@ class Session:
         rig: the cameras.
         config: settings.
         backend: name of the back ends; None if the first one was given as an object, so that no other can be made.
+        first: the first back end.
         rig_prior: errors of the rig from earlier recordings.
 
     Attributes:
@@ -141,8 +142,9 @@ class Session:
     """
 
     def __init__(
-        self, rig: StereoRig, config: SystemConfig, backend: str | None, rig_prior: SavedCalibration | None
-    ) -> None:
+        self, rig: StereoRig, config: SystemConfig, backend: str | None, first: Backend,
+        rig_prior: SavedCalibration | None,
+    ) -> None:  # fmt: skip
         c = config
         self.rig, self.config, self._models = rig, c, c.models
         self._backend: str | None = backend
@@ -150,7 +152,7 @@ class Session:
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
         self.rig_error = RemainingRigError(self.calibration, c.models)
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
-        self.mapper = Mapper(rig, c.map, self.localizer)
+        self.mapper = Mapper(rig, c.map, self.localizer, first)
         self.loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
 
     def begin(self, first: Backend, prior_map: SavedMap | None) -> State:

@@ -115,7 +115,7 @@ class StereoSlam:
             if isinstance(backend, str)
             else registry.require_methods("backends", backend)
         )
-        self._session = Session(rig, c, names[1], rig_prior)
+        self._session = Session(rig, c, names[1], first, rig_prior)
         self._tracker = Tracker(self._session, detector_for(rig, c.objects, c.models))
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)

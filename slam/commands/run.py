@@ -64,7 +64,7 @@ def prepare(
     chosen = SystemConfig.for_kind(kind, frontend, backend)
     if before is not None:
         chosen = _repeated(before, chosen, frontend, backend)
-    chosen = chosen.with_settings(list(settings))
+    chosen = chosen.with_settings([*(["map.monocular=true"] if mono else []), *settings])
     if frames is not None:
         start, stop = parse_frames(frames)
     options = RunOptions(

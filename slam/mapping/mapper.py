@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
+from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
@@ -16,6 +17,7 @@ from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
 from slam.mapping.known_landmarks import in_front
+from slam.mapping.monocular import MonocularDepth, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
 from slam.tracks.localizer import LandmarkMatches, Localizer
@@ -68,13 +70,22 @@ class Mapper:
         rig: the cameras.
         config: settings.
         localizer: says which landmarks are seen from a similar viewpoint as before.
+        backend: the first one; it must have `place` if `config.monocular` is set.
+
+    Raises:
+        ConfigurationError: the back end cannot place landmarks.
     """
 
-    def __init__(self, rig: StereoRig, config: MapConfig, localizer: Localizer) -> None:
+    def __init__(self, rig: StereoRig, config: MapConfig, localizer: Localizer, backend: Backend) -> None:
         self.rig = rig
         self.config = config
         self.next_id = 0
         self._localizer = localizer
+        self._monocular: MonocularDepth | None = None
+        if config.monocular:
+            if not isinstance(backend, MapBackend):
+                raise ConfigurationError("map.monocular: this back end cannot place landmarks")
+            self._monocular = self._new_monocular()
 
     def update(self, backend: Backend, step: Step) -> Step:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
@@ -140,12 +151,17 @@ class Mapper:
         Returns:
             the rows that stay.
         """
+        if self._monocular is not None:
+            self._monocular = self._new_monocular()
         known = backend.estimate().ids
         kept = np.zeros(0, np.int64) if landmarks is None else landmarks.ids
         strangers = np.setdiff1d(known, kept)
         if len(strangers):
             backend.remove(strangers)
         return None if landmarks is None else landmarks.select(np.isin(kept, known))
+
+    def _new_monocular(self) -> MonocularDepth:
+        return MonocularDepth(self.rig, self._localizer.pixel_sigma, self.config.max_depth_error)
 
     def _view(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapView:
         """The map as the camera sees it."""
@@ -187,7 +203,36 @@ class Mapper:
         if len(added):
             backend.add(added.observations(features))
             landmarks = landmarks.with_new(step.index, added.ids, features, rows, step.estimate.T_world_left[:3, 3])
+        if self._monocular is not None:
+            return self._add_monocular(self._monocular, backend, landmarks, step, added, free)
         return landmarks, added
+
+    def _add_monocular(
+        self,
+        monocular: MonocularDepth,
+        backend: Backend,
+        landmarks: LandmarkTable,
+        step: Step,
+        added: LandmarkMatches,
+        free: BoolArray,
+    ) -> tuple[LandmarkTable, LandmarkMatches]:
+        """Turn features without a stereo match into landmarks once two views give their depth (paper B, 2.2)."""
+        features, matches = step.features, step.matches
+        if len(matches) < MINIMAL_POINTS:
+            return landmarks, added
+        estimate = backend.estimate(landmarks=False)
+        view = self._view(backend, landmarks, step)
+        rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
+        covariance = monocular.pose_covariance(estimate, view, landmarks, features, matches)
+        new = monocular.step(features, rows, estimate.T_world_left, covariance, step.index)
+        wanted = max(self.config.target_in_view - len(matches) - len(added), 0)
+        best = np.sort(np.argsort(-features.response[new.rows], kind="stable")[:wanted])
+        if not len(best):
+            return landmarks, added
+        ids = self._new_ids(len(best))
+        backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
+        landmarks = landmarks.with_new(step.index, ids, features, new.rows[best], step.estimate.T_world_left[:3, 3])
+        return landmarks, added.joined(LandmarkMatches(ids, new.rows[best]))
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

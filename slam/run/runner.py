@@ -124,6 +124,8 @@ def run(
     require_outputs(options.outputs, overwrite=True)
     if options.prior_map is not None and options.record is not None:
         raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
+    if options.config.map.monocular and options.record is not None:
+        raise SlamError("a run with map.monocular cannot be recorded: a recording holds stereo observations alone")
     frames = sequence.frames(options.start, options.stop)
     live = None
     if options.live or is_live(sequence):

@@ -56,16 +56,38 @@ def follow(
         config: the windows, and the largest descriptor distance in each.
         rows: the tracks' rows (M,) in `descriptors`, which the matches name; None if these are the tracks'.
     """
-    from slam.tracks import follow_kernels
-
     square = config.windows == "fixed"
     sizes = np.array(config.window_sizes if square else config.window_sigmas)
     bounds = (0.0, 0.0) if square else (config.window_min / sizes[0], config.window_max / sizes[0])
     rows = np.arange(len(pixels)) if rows is None else rows
-    order = np.argsort(features.uv_left[:, 0], kind="stable")
-    limits = np.array(config.d_match, np.float32)
+    every = np.arange(len(features))
+    return _followed(
+        pixels, innovation, bounds, sizes, config.d_match, config.ratio, descriptors, laplacian, rows, features, every
+    )
+
+
+def match_in_boxes(
+    centres: Array, reach: float, descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures,
+    rows: NDArray[np.intp], d_match: float, ratio: float,
+) -> Matches:  # fmt: skip
+    """`follow` tracks into square boxes of half size `reach` [px], to features `rows` (K,) of a frame only."""
+    sizes, none, every = np.array([reach]), np.zeros((len(centres), 2, 2)), np.arange(len(centres))
+    looks = descriptors, laplacian, every
+    return _followed(centres, none, (0.0, 0.0), sizes, (d_match,), ratio, *looks, features, rows)
+
+
+def _followed(
+    pixels: Array, innovation: Array, bounds: tuple[float, float], sizes: Array, d_match: tuple[float, ...],
+    ratio: float, descriptors: Descriptors, laplacian: NDArray[np.int8], rows: NDArray[np.intp],
+    features: StereoFeatures, among: NDArray[np.intp],
+) -> Matches:  # fmt: skip
+    """The kernel's answer as pairs; features `among` (K,) may be matched."""
+    from slam.tracks import follow_kernels
+
+    order = among[np.argsort(features.uv_left[among, 0], kind="stable")]
+    limits = np.array(d_match, np.float32)
     found = follow_kernels.follow(
-        np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), bounds, sizes, limits, np.float32(config.ratio),
+        np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), bounds, sizes, limits, np.float32(ratio),
         np.ascontiguousarray(descriptors), laplacian, rows, features.uv_left, features.descriptors, features.laplacian,
         order,
     )  # fmt: skip

@@ -64,7 +64,7 @@ def test_ranges_are_those_that_are_checked(every):
     assert ranges["surf", "frontend.layers"] == "[2, 3]"
     assert ranges["", "objects.mode"] == "detect, procedure1, off"
     assert ranges["", "objects.database"] == "text"
-    assert ranges["", "atlas.on_disk"] == "true or false"
+    assert ranges["", "map.monocular"] == "true or false"
     assert ranges["smoother", "backend.lag"].startswith("[2, ")
     assert ranges["smoother", "backend.lag"].endswith(" or null")
 

@@ -9,7 +9,7 @@ from slam.data import Prediction, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.tracks.config import AssociationConfig
-from slam.tracks.follow import crowded, follow, match_everywhere
+from slam.tracks.follow import crowded, follow, match_everywhere, match_in_boxes
 from tests.slam.scene import RIG, Cloud
 
 CONFIG = AssociationConfig()
@@ -77,13 +77,14 @@ def test_windows_are_the_innovations_ellipses(sigma):
     np.testing.assert_array_equal(inside[clear], (squared <= 25.0)[clear])
 
 
-def test_tracks_that_are_expected_nowhere_are_not_matched():
+def test_boxes_take_some_features_and_tracks_that_are_expected_somewhere():
     cloud = Cloud()
     features, ids = cloud.features(np.eye(4), 0.0)
     pixels, looks = features.uv_left + 2.0, (cloud.descriptors[ids], cloud.laplacian[ids], features)
     pixels[0] = np.nan
-    matches = follow(pixels, np.tile(np.eye(2), (len(ids), 1, 1)), *looks, CONFIG)
-    assert matches.landmarks.tolist() == matches.features.tolist() == list(range(1, len(ids)))
+    matches = match_in_boxes(pixels, 3.0, *looks, np.arange(10), 0.4, 0.8)
+    assert matches.landmarks.tolist() == matches.features.tolist() == list(range(1, 10))
+    assert not len(match_in_boxes(pixels, 1.0, *looks, np.arange(10), 0.4, 0.8))
 
 
 def test_larger_window_asks_for_a_better_descriptor():

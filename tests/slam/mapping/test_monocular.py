@@ -1,0 +1,157 @@
+"""Depth from two views of one moving camera, and running on left images alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slam
+from slam.config import SystemConfig
+from slam.data import FrameStatus
+from slam.geometry import se3
+from slam.mapping.map_io import SavedMap
+from slam.mapping.monocular import frame_covariance, two_view_depth
+from slam.models import EstimatorModels
+from slam.system import StereoSlam
+from slam.testing import GENERAL_RIG
+from slam.tracks.localizer import Localizer, nowhere
+from tests.slam.scene import RIG, Cloud
+
+BACKENDS = ("ekf", "smoother", "window")
+STEP = se3.exp(np.array([0.02, 0.05, -0.03, 0.3, 0.05, 0.1]))  # the camera now, in its coordinates then
+NOISE = np.diag(np.repeat([1e-3, 5e-3], 3) ** 2)
+SIGMA = 0.5
+
+
+def views(rig, count, rng, noise=0.0, motion=(0, 0, 0, 0, 0, 0)):
+    """Points (N, 3) before the camera now, and their pixels then and now."""
+    local = np.column_stack([rng.uniform(-1, 1, count), rng.uniform(-0.7, 0.7, count), rng.uniform(2, 5, count)])
+    then = rig.left.project(se3.transform(STEP @ se3.exp(np.array(motion, float)), local))
+    now = rig.left.project(local)
+    return local, then + noise * rng.standard_normal(then.shape), now + noise * rng.standard_normal(now.shape)
+
+
+@pytest.mark.parametrize("rig", [RIG, GENERAL_RIG], ids=["rectified", "general"])
+def test_without_noise_the_points_are_exact(rig):
+    local, then, now = views(rig, 30, np.random.default_rng(0))
+    found = two_view_depth(rig, then, now, STEP, NOISE, SIGMA)
+    np.testing.assert_allclose(found.local, local, atol=1e-6)
+    assert (found.misfit < 1e-6).all()
+
+
+def test_the_covariance_fits_the_errors():
+    """Pixel noise and an uncertain motion, drawn again each time: squared distances as χ² with three degrees."""
+    rng, distances, misfits = np.random.default_rng(1), [], []
+    for _ in range(300):
+        motion = np.linalg.cholesky(NOISE) @ rng.standard_normal(6)
+        local, then, now = views(RIG, 5, rng, SIGMA, motion)
+        found = two_view_depth(RIG, then, now, STEP, NOISE, SIGMA)
+        error = found.local - local
+        distances.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariances), error).mean())
+        misfits.append(found.misfit.mean())
+    # the mean of 300 times 5 (correlated) values is sure to 10 %; depth is a little skew
+    assert 2.5 < np.mean(distances) < 3.6
+    assert 0.8 < np.mean(misfits) < 1.25
+
+
+def test_what_cannot_be_told_is_not_good():
+    local, then, now = views(RIG, 10, np.random.default_rng(2))
+    good = two_view_depth(RIG, then, now, STEP, NOISE, SIGMA).good(0.2)
+    assert good.all()
+    turned = se3.exp(np.array([0.02, 0.05, -0.03, 0, 0, 0]))  # a camera that only turns sees no depth
+    same = RIG.left.project(se3.transform(turned, local))
+    assert not two_view_depth(RIG, same, now, turned, NOISE, SIGMA).good(0.2).any()
+    assert (
+        not two_view_depth(RIG, then + np.array([0, 30]), now, STEP, 1e-4 * NOISE, SIGMA).good(0.2).any()
+    )  # off the line
+    assert not two_view_depth(RIG, now, then, STEP, NOISE, SIGMA).good(0.2).any()  # rays meet behind the cameras
+    assert len(two_view_depth(RIG, then[:0], now[:0], STEP, NOISE, SIGMA).good(0.2)) == 0
+
+
+def test_a_frames_own_covariance_is_that_of_its_least_squares_pose():
+    from slam.geometry.pnp import find_consensus
+
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(-2, 2, 40), rng.uniform(-1, 1, 40), rng.uniform(3, 6, 40)])
+    z, _ = RIG.project_stereo(points)
+    stereo = rng.random(40) < 0.5
+    expected = frame_covariance(RIG, points, stereo, SIGMA)
+    errors = []
+    for _ in range(300):
+        measured = z + SIGMA * rng.standard_normal(z.shape)
+        measured[~stereo, 2] = np.nan
+        found = find_consensus(RIG, points, measured, np.eye(4), threshold=1e3, hypotheses=1, seed=0)
+        errors.append(se3.log(found.T_world_left))
+    share = np.mean([e @ np.linalg.solve(expected, e) for e in errors]) / 6
+    assert 0.85 < share < 1.15  # 300 draws of six degrees: sure to 3 %
+
+
+def test_the_pose_in_a_map_from_left_pixels_alone():
+    cloud, T = Cloud(120), se3.exp(np.array([0.05, -0.2, 0.1, 0.4, -0.1, 0.3]))
+    known = map_of(cloud)
+    features, _ = cloud.features(T, 0.0, 0.3)
+    localizer = Localizer(RIG, SystemConfig().association, EstimatorModels(pixel_sigma=0.5))
+    left = replace(features, uv_right=features.uv_right * np.nan)
+    found = localizer.match(nowhere(0.0, np.eye(4)), known.rows, known.positions, left, seed=0)
+    assert np.linalg.norm(se3.log(se3.inverse(T) @ found.T_world_left)[3:]) < 0.02
+    other, _ = Cloud(120, seed=5).features(T, 0.0)
+    assert not len(localizer.match(nowhere(0.0, np.eye(4)), known.rows, known.positions, other, seed=0))
+
+
+def map_of(cloud, rows=slice(None)):
+    n = len(cloud.points[rows])
+    return SavedMap(
+        np.arange(n), cloud.points[rows], np.tile(1e-4 * np.eye(3), (n, 1, 1)), cloud.descriptors[rows],
+        cloud.laplacian[rows], np.ones(n, np.int64), np.ones(n, np.int64),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_left_images_alone_in_a_prior_map_go_on_beyond_it(backend):
+    """A third of the points is known; the others join the map by two views, where they truly are."""
+    cloud = Cloud(150)
+    config = SystemConfig().with_settings(["map.monocular=true", "models.pixel_sigma=0.5"])
+    system = StereoSlam(RIG, None, backend, config=config, prior_map=map_of(cloud, slice(0, 50)))
+    owner: dict[int, int] = {}
+    for k in range(40):
+        T = se3.exp(np.array([0, 0, 0, 0.6 * k / 30, 0, 0]))  # sideways: forward motion shows little depth
+        features, ids = cloud.features(T, k / 30, 0.3)
+        result = system.process_features(replace(features, uv_right=features.uv_right * np.nan))
+        assert result.status is FrameStatus.TRACKED
+        assert np.linalg.norm(result.estimate.T_world_left[:3, 3] - T[:3, 3]) < 0.04
+        owner.update(zip(result.added.tolist(), ids[result.added_features].tolist()))
+    estimate = system.estimate()
+    rows = np.flatnonzero(np.isin(estimate.ids, list(owner)))
+    truth = cloud.points[[owner[i] for i in estimate.ids[rows].tolist()]]
+    error = estimate.positions[rows] - truth
+    distances = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimate.covariances[rows]), error)
+    assert len(rows) > 20
+    assert np.median(distances) < 6  # χ²₃: 2.4; they share the error of the camera's motion
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_desk_with_left_images_alone(backend):
+    """100 frames of the simulated desk in a quarter of an earlier run's map."""
+    one, two = slam.open_sequence("synthetic:desk?seed=1"), slam.open_sequence("synthetic:desk?seed=2")
+    config = SystemConfig.for_kind("handheld", None).with_settings(["models.pixel_sigma=0.7"])
+    first = StereoSlam(one.rig, None, backend, config=config)
+    for k in range(0, 100, 2):
+        first.process_features(one.observations(k))
+    whole = first.snapshot()
+    rows = np.arange(0, len(whole), 4)
+    names = ("ids", "positions", "covariances", "descriptors", "laplacian", "seen", "in_view")
+    known = SavedMap(*(getattr(whole, name)[rows] for name in names))
+    truth = np.linalg.inv(one.ground_truth.poses[0]) @ two.ground_truth.poses
+    config = config.with_settings(["map.monocular=true"])
+    system, errors = StereoSlam(one.rig, None, backend, config=config, prior_map=known), []
+    for k in range(60, 160):
+        features = two.observations(k)
+        result = system.process_features(replace(features, uv_right=features.uv_right * np.nan))
+        assert result.status is FrameStatus.TRACKED
+        errors.append(np.linalg.norm(result.estimate.T_world_left[:3, 3] - truth[k, :3, 3]))
+    # measured: mean 0.5 to 0.6 cm, worst 1.0 to 1.3
+    assert np.mean(errors) < 0.012 and max(errors) < 0.03
+    assert result.map_size > len(known) + 15
