@@ -10,8 +10,6 @@ from slam.calibration.model import RigModel
 from slam.data import StereoFeatures
 from slam.geometry.se3 import Array
 
-_ROUNDS = 4  # numerics: fixed-point iterations that undo a correction; each reduces the error some 30 times
-
 
 @dataclass(frozen=True, eq=False)
 class RigCorrection:
@@ -33,7 +31,7 @@ class RigCorrection:
     def undone(self, z: Array) -> Array:
         """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
         corrected = points = self.model.points(z)
-        for _ in range(_ROUNDS):
+        for _ in range(4):  # 4: fixed-point iterations that undo a correction; each reduces the error some 30 times
             points = corrected - self.model.shift(points, self.parameters)
         return self.model.rows(points)
 

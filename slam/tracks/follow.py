@@ -18,8 +18,6 @@ from slam.tracks.config import AssociationConfig
 
 Descriptors = NDArray[np.float32]
 
-_ROOM = 8  # cost: pairs a box for which there is room at once
-
 
 @dataclass(frozen=True, eq=False)
 class Matches:
@@ -126,7 +124,7 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
     order = np.argsort(uv[:, 0], kind="stable")
     x, y = uv[:, 0].take(order), uv[:, 1].take(order)
     boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach)
-    rows, places = np.empty((2, _ROOM * len(centres)), np.intp)
+    rows, places = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
     count = follow_kernels.pairs_in_boxes(*boxes, x, y, rows, places)
     if count > len(rows):
         rows, places = np.empty((2, count), np.intp)

@@ -25,8 +25,6 @@ from slam.tracks.state import NO_POSE, PoseHypotheses, TrackingState
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import similar_view
 
-_MOST = 0.5  # fixed: share of what is in view that makes a majority
-
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMatches:
@@ -184,7 +182,8 @@ class Localizer:
             return False
         view = self.rig.left.in_image(self.rig.left.project(transform(inverse(matches.T_world_left), positions)))
         shown = view & self._looked_for(matches.T_world_left, landmarks, positions)
-        enough = max(_MOST * min(int(shown.sum()), len(features)), 2 * self.config.minimum_consistent)
+        # 0.5: share of what is in view that makes a majority
+        enough = max(0.5 * min(int(shown.sum()), len(features)), 2 * self.config.minimum_consistent)
         return len(matches) >= enough
 
     def informative(
