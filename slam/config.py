@@ -37,10 +37,11 @@ OBJECTS = {
     "driving": ObjectsConfig(max_speed=25.0, min_speed=1.0, suspect=40.0, group_test=70.0, size=2.0),
 }
 
-#: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does.
+#: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does; nothing comes
+#: within a metre of the cameras of a car.
 FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
     ("handheld", "surf"): {"upright": False},
-    ("driving", "surf"): {"upright": True},
+    ("driving", "surf"): {"upright": True, "min_depth": 1.0},
 }
 
 #: Options of back ends that depend on the kind of motion. A vehicle's frames are a metre apart: each is worth a pose.

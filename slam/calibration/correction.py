@@ -36,16 +36,19 @@ class RigCorrection:
         return self.model.rows(points)
 
     def features(self, features: StereoFeatures) -> StereoFeatures:
-        """Features with both pixels corrected; the right row keeps the remaining vertical disparity."""
+        """Features with both pixels corrected."""
+        uv_left, uv_right = self.pixels(features.uv_left, features.uv_right)
+        return replace(features, uv_left=uv_left, uv_right=uv_right)
+
+    def pixels(self, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
+        """Corrected pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
         rectified_rig = self.model.rig.rectified
-        left, right = rectified_rig.rectify_left(features.uv_left), rectified_rig.rectify_right(features.uv_right)
+        left, right = rectified_rig.rectify_left(uv_left), rectified_rig.rectify_right(uv_right)
         z = np.column_stack([left, right[:, 0]])
         vertical = right[:, 1] - left[:, 1] + self.model.vertical(self.model.points(z)) @ self.parameters
         z = self.rows(z)
         new_right = np.column_stack([z[:, 2], z[:, 1] + vertical])
-        return replace(
-            features, uv_left=rectified_rig.unrectify_left(z[:, :2]), uv_right=rectified_rig.unrectify_right(new_right)
-        )
+        return rectified_rig.unrectify_left(z[:, :2]), rectified_rig.unrectify_right(new_right)
 
 
 @dataclass(frozen=True, eq=False)

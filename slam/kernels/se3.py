@@ -70,9 +70,12 @@ def exp(step, out):
 @helper
 def move(T, step):
     """``T ← T exp ξ`` by a tangent vector (6,)."""
-    change = np.empty((3, 4))
+    change, before = np.empty((3, 4)), np.empty((4, 4))
     exp(step, change)
-    compose(T.copy(), change, T)
+    for i in range(4):  # `copy` takes longer to compile
+        for j in range(4):
+            before[i, j] = T[i, j]
+    compose(before, change, T)
 
 
 @helper

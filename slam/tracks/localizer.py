@@ -302,12 +302,16 @@ class Localizer:
     def _consensus(
         self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False
     ) -> PoseConsensus:
-        measured = measurement_rows(features.uv_left[matches.features], features.uv_right[matches.features])
+        """The pose on which matches agree, found in rectified pixels: lenses would be the larger part of its cost."""
+        r, rows = self.rig.rectified, matches.features
+        measured = measurement_rows(r.rectify_left(features.uv_left[rows]), r.rectify_right(features.uv_right[rows]))
         threshold = self.config.consistency_sigmas * self.pixel_sigma
         if wide and len(matches) < self.config.minimum_consistent:
             return PoseConsensus(guess, np.zeros(len(matches), bool))
         hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses
-        return find_consensus(self.rig, positions[matches.landmarks], measured, guess, threshold, hypotheses, seed)
+        X, points = r.T_left_rectified, positions[matches.landmarks]
+        found = find_consensus(r.rig, points, measured, guess @ X, threshold, hypotheses, seed)
+        return PoseConsensus(found.T_world_left @ X.T, found.inliers)
 
     def _expected(
         self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkTable, positions: Array
