@@ -82,6 +82,11 @@ EXPERIMENTS = (
             "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."
         },
     ),
+    Experiment(
+        "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "4"), pictures={
+            "corridor": "Left: mean NEES and its band. Right: what is claimed of the heading, which nothing measures."
+        },
+    ),
     Experiment("calibration", "honesty", "Self-calibration: wrong rigs, and one rig on two drives"),
     Experiment(
         "detector", "papers", "D_threshold, octaves, radius (A, III.A)",

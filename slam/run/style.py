@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import cycle
 
-_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#00838f"}
+_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#00838f", "iekf": "#ad1457"}
 _OTHERS = ("#2e7d32", "#c62828", "#5d4037", "#9e9d24")
 
 _BODIES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))  # BGR
