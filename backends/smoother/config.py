@@ -25,7 +25,7 @@ class SmootherConfig:
         ConfigurationError: a value is out of its range.
     """
 
-    motion: float = 0.0
+    motion: float = 0.02
     overlap: float = 0.9
     track: int = 20
     lag: int | None = 16
