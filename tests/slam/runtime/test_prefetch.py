@@ -11,14 +11,15 @@ import pytest
 from slam.runtime.prefetch import prefetch
 
 
-def threads() -> int:
-    return sum(thread.name == "prefetch" for thread in threading.enumerate())
+def threads() -> set[threading.Thread]:
+    return {thread for thread in threading.enumerate() if thread.name == "prefetch"}
 
 
 def test_the_same_items_in_the_same_order():
+    before = threads()
     assert list(prefetch(range(100))) == list(range(100))
     assert list(prefetch([])) == []
-    assert threads() == 0
+    assert threads() <= before
 
 
 def test_an_item_is_made_while_the_one_before_is_used():
@@ -35,6 +36,7 @@ def test_an_item_is_made_while_the_one_before_is_used():
 
 
 def test_no_more_than_asked_for_is_made_beforehand():
+    before = threads()
     made = []
 
     def items():
@@ -46,10 +48,11 @@ def test_no_more_than_asked_for_is_made_beforehand():
     assert next(work) == 0
     assert len(made) <= 5
     work.close()
-    assert threads() == 0
+    assert threads() <= before
 
 
 def test_an_exception_comes_where_its_item_would():
+    before = threads()
     def items():
         yield 1
         raise ValueError("broken")
@@ -58,14 +61,15 @@ def test_an_exception_comes_where_its_item_would():
     assert next(work) == 1
     with pytest.raises(ValueError, match="broken"):
         next(work)
-    assert threads() == 0
+    assert threads() <= before
 
 
 def test_a_caller_that_stops_early_leaves_no_thread():
+    before = threads()
     for item in prefetch(range(1000)):
         if item == 3:
             break
-    assert threads() == 0
+    assert threads() <= before
 
 
 @pytest.mark.parametrize("source", ["prefetch(endless())", "LiveFrames(endless(), paced=False)"])
