@@ -35,7 +35,7 @@ from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors, associate
 from slam.geometry.trajectory import Trajectory
-from slam.objects.metrics import labels_in_images, score_for
+from slam.evaluation.objects import labels_in_images, score_for
 
 BACKENDS = ("ekf", "smoother")
 FACTORS = (0.5, 2.0)

@@ -48,6 +48,7 @@ class Body:
         measured: whether it was in this frame.
         moving: whether it moves now.
         evidence: that it has moved, given all that is uncertain; see `slam.objects.proof`.
+        far: whether it was followed for farther than it is wide before it became a body.
         proven: whether it has moved for certain by its tracks, and
         moved: by its estimate, see `slam.objects.estimator`: only then it is reported.
         alike: number of frames in which it moved as an older body did, as a part of that would.
@@ -82,6 +83,7 @@ class Body:
     measured: bool = True
     moving: bool = True
     evidence: float = 0.0
+    far: bool = False
     proven: bool = False
     moved: bool = False
     alike: int = 0

@@ -38,7 +38,7 @@ from slam.objects.following import follow
 from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
-from slam.objects.proof import PROVEN, with_frame
+from slam.objects.proof import Way, with_frame
 from slam.objects.recovery import locate
 from slam.objects.regions import Scene, classify_scene
 from slam.objects.revision import CorrectRows, revise_tracks
@@ -211,11 +211,24 @@ class MovingObjectDetector:
             members = np.flatnonzero((tracks.body == body.id) & tracks.seen)
             members = members[tracks.count(members) >= c.min_frames - 1]
             moved = displacements(tracks, members, ages, self._poses[self.slot, :3, 3])
-            evidence = with_frame(body.evidence, moved, scene)
-            body = replace(body, evidence=evidence, proven=body.proven or evidence >= PROVEN)
+            evidence, proven = with_frame(body.evidence, moved, scene, self._way(body), body.far)
+            body = replace(body, evidence=evidence, proven=body.proven or proven)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
                 self._drop(body)
+
+    def _way(self, body: Body) -> Way:
+        """Where a body was in the frames of the window in which it was measured."""
+        seen = np.flatnonzero(body.known & np.isfinite(self._stamps))
+        middle = 0.5 * (body.lower + body.upper)
+        places = body.history[seen, :3, :3] @ middle + body.history[seen, :3, 3]
+        times, cameras = self._stamps[seen], self._poses[seen]
+        # By a wrong disparity a point seems farther along its ray, the more so the deeper it is.
+        rays = places - cameras[:, :3, 3]
+        depth = np.einsum("ni,ni->n", rays, cameras[:, :3, 2])
+        off = depth[:, None] * rays * self.sigma / (self.rig.left.fu * self.rig.baseline)
+        by_rig = (off[np.argmax(times)] - off[np.argmin(times)]) / max(len(times) - 1, 1) if len(times) else np.zeros(3)
+        return Way(places, times, by_rig)
 
     def _drop(self, body: Body) -> None:
         """Let a body's tracks go; they need proof to become members of another one."""
@@ -265,26 +278,22 @@ class MovingObjectDetector:
         return scene
 
     def _found(
-        self, group: MovingGroup, initializer: BodyInitializer, whole: int | None = None, evidence: float = 0.0
+        self, group: MovingGroup, initializer: BodyInitializer, whole: int | None = None, far: bool = False
     ) -> None:
-        """Make a body of tracks with a common twist, or add them to the body that they belong to.
+        """Make a body of tracks with a common twist; where they belong to another one, they are merged later.
 
-        There may be evidence already that it moves.
-
-        If they are a part of the body `whole` with a motion of its own, they are not added to that one.
+        Args:
+            group: the tracks.
+            initializer: of bodies.
+            whole: id of the body that they are a part of, with a motion of their own; None for none.
+            far: whether they were followed for farther than they are wide already.
         """
         tracks, members = self.tracks, group.members
         assert tracks is not None
-        body = replace(initializer.body(self._next_body, tracks, group), evidence=evidence, proven=evidence >= PROVEN)
-        others = {id: other for id, other in self.bodies.items() if id != whole}
-        known = membership.body_around(others, tracks, members, body)
-        known = known or membership.body_with_part(others, tracks, members, body)
-        if known is None:
-            body = replace(self._again(self._grown(body, members), whole), apart_from=whole)
-            self.bodies[body.id] = body
-            self._next_body = max(self._next_body, body.id + 1)
-        else:
-            body = self.bodies[known.id] = membership.with_reach(known, tracks, members)
+        body = replace(initializer.body(self._next_body, tracks, group), far=far)
+        body = replace(self._again(body, whole), apart_from=whole)
+        self.bodies[body.id] = body
+        self._next_body = max(self._next_body, body.id + 1)
         membership.add_members(body, tracks, members, sure=True)
 
     def _again(self, body: Body, whole: int | None) -> Body:
@@ -294,24 +303,12 @@ class MovingObjectDetector:
         """
         tracks, known = self.tracks, None
         assert tracks is not None
-        if body.id not in self.bodies:
-            parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
-            known = membership.reappeared(parts, body)
+        parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
+        known = membership.reappeared(parts, body)
         if known is None:
             return body
         tracks.give_up(np.flatnonzero(tracks.body == known.id))
         return continued(body, known)
-
-    def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
-        """A new body, or a known one that is a part of it: then it keeps that one's id and takes over its members."""
-        tracks = self.tracks
-        assert tracks is not None
-        for known in self.bodies.values():
-            mine = np.flatnonzero((tracks.body == known.id) & tracks.seen)
-            fewer = known.measured and len(mine) < len(members)
-            if fewer and membership.is_part_of(body, members, tracks, mine, known):
-                return self._in_place_of(known, body, mine)
-        return body
 
     def _in_place_of(self, known: Body, body: Body, mine: NDArray[np.intp]) -> Body:
         """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
@@ -342,7 +339,7 @@ class MovingObjectDetector:
             else:
                 centre = tracks.position[candidate.members].mean(axis=0)
                 twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
-                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), initializer, evidence=PROVEN)
+                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), initializer, far=True)
 
     def _shared_error(self, place: Array, T_world_left: Array) -> Array:
         """Covariance (3, 3) of a place (3,) as seen from the camera, given that of the camera's pose."""

@@ -89,7 +89,7 @@ def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Bod
 
     A constant velocity is only the first guess for a body that starts to move: poses and points are improved in turn.
     """
-    body = _with_poses_fitted(body, tracks, rows)
+    body = _with_poses_fitted(replace(body, known=tracks.dof[rows].any(axis=0)), tracks, rows)
     points, A, _ = in_body_axes(body, tracks, rows)
     return with_extent(replace(body, T=body.history[slot]), _means(points, A))
 
@@ -312,11 +312,6 @@ def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
     return best
 
 
-def is_part_of(whole: Body, theirs: NDArray[np.intp], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> bool:
-    """Whether the members `rows` of the body `own`, near another one, make one rigid body with its members `theirs`."""
-    return moves_with(whole, tracks, rows) and distinctness(whole, theirs, own, rows, tracks) < 1.0
-
-
 def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
     """Whether the members `rows` of another body, near this one, have moved with it all the time.
 
@@ -349,18 +344,6 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     _, _, known = in_body_axes(one, tracks, every)
     still = float(_squares(tracks.p[every], np.where(known[..., None, None], tracks.A[every], 0.0)).sum())
     return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
-
-
-def body_with_part(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
-    """The measured body of which tracks are a part, if it has more seen members than they are; else None.
-
-    `own` is a body made of them alone.
-    """
-    for body in bodies.values():
-        theirs = np.flatnonzero(tracks.seen & (tracks.body == body.id))
-        if body.measured and len(theirs) >= len(rows) and is_part_of(body, theirs, tracks, rows, own):
-            return body
-    return None
 
 
 def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float) -> Array:

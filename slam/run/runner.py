@@ -21,7 +21,7 @@ from slam.files import noting_inputs
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
-from slam.objects.metrics import ObjectScore, labels_in_images, score_for
+from slam.evaluation.objects import ObjectScore, labels_in_images, score_for
 from slam.outputs import Output, require_outputs
 from slam.run.outcome import median_depth, motion_doubt, outcome
 from slam.run.outputs import NAMES, RunFiles

@@ -11,7 +11,7 @@ from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import inverse, transform
 from slam.objects.config import ObjectsConfig
-from slam.objects.metrics import score_for
+from slam.evaluation.objects import score_for
 
 
 def system_for(sequence, mode="detect", **settings):
