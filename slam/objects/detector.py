@@ -204,31 +204,19 @@ class MovingObjectDetector:
         """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        ages = (self.slot - np.arange(c.window)) % c.window
+        ages, stands = (self.slot - np.arange(c.window)) % c.window, bool(tracks.still.any())
         for body in list(self.bodies.values()):
             if not body.measured:
                 continue
             members = np.flatnonzero((tracks.body == body.id) & tracks.seen)
             members = members[tracks.count(members) >= c.min_frames - 1]
             moved = displacements(tracks, members, ages, self._poses[self.slot, :3, 3])
-            evidence, proven = with_frame(body.evidence, moved, scene, self._way(body), body.far)
+            way = Way.of(body, self._stamps, self._poses, self.rig, self.sigma)
+            evidence, proven = with_frame(body.evidence, moved, scene, way, body.far, stands)
             body = replace(body, evidence=evidence, proven=body.proven or proven)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
                 self._drop(body)
-
-    def _way(self, body: Body) -> Way:
-        """Where a body was in the frames of the window in which it was measured."""
-        seen = np.flatnonzero(body.known & np.isfinite(self._stamps))
-        middle = 0.5 * (body.lower + body.upper)
-        places = body.history[seen, :3, :3] @ middle + body.history[seen, :3, 3]
-        times, cameras = self._stamps[seen], self._poses[seen]
-        # By a wrong disparity a point seems farther along its ray, the more so the deeper it is.
-        rays = places - cameras[:, :3, 3]
-        depth = np.einsum("ni,ni->n", rays, cameras[:, :3, 2])
-        off = depth[:, None] * rays * self.sigma / (self.rig.left.fu * self.rig.baseline)
-        by_rig = (off[np.argmax(times)] - off[np.argmin(times)]) / max(len(times) - 1, 1) if len(times) else np.zeros(3)
-        return Way(places, times, by_rig)
 
     def _drop(self, body: Body) -> None:
         """Let a body's tracks go; they need proof to become members of another one."""

@@ -89,7 +89,7 @@ def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Bod
 
     A constant velocity is only the first guess for a body that starts to move: poses and points are improved in turn.
     """
-    body = _with_poses_fitted(replace(body, known=tracks.dof[rows].any(axis=0)), tracks, rows)
+    body = _with_poses_fitted(replace(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
     points, A, _ = in_body_axes(body, tracks, rows)
     return with_extent(replace(body, T=body.history[slot]), _means(points, A))
 

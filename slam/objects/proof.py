@@ -24,15 +24,18 @@ from scipy.special import chdtrc, fdtrc
 
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, points_by_pose
+from slam.objects.bodies import Body
 from slam.objects.displacements import Displacements
 from slam.objects.regions import Scene
 
-PROVEN = 20.0  #: −log10 of the chance from which a body has moved for certain
+PROVEN = 20.0  #: −log10 of the chance from which a body has moved for certain; chance of jumps in step is some 1e-15
+PROVEN_AT_REST = 12.0  #: the same where the camera stands: nothing slides then, and only noise is left
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
 _LEAST = 4  # members and frames, for a scatter
-_MEDIAN = chi_square_limit(3, 0.5)
+_MEDIAN = chi_square_limit(3, 0.5)  # of χ²(3)
 _WEAK = 1e-9  # numerics: of information [1/m²], of variance [m²]
 
 
@@ -50,8 +53,29 @@ class Way:
     times: Array
     by_rig: Array
 
+    @classmethod
+    def of(cls, body: Body, stamps: Array, cameras: Array, rig: StereoRig, sigma: float) -> Way:
+        """Of a body in those frames in which it was measured.
 
-def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
+        Args:
+            body: the body.
+            stamps: of the window's slots (W,) [s]; NaN where there is none yet.
+            cameras: poses T_world_left (W, 4, 4) in them.
+            rig: the cameras.
+            sigma: pixel noise [px].
+        """
+        seen = np.flatnonzero(body.known & np.isfinite(stamps))
+        seen = seen[np.argsort(stamps[seen])]
+        places = body.history[seen, :3, :3] @ (0.5 * (body.lower + body.upper)) + body.history[seen, :3, 3]
+        rays = places - cameras[seen, :3, 3]
+        depth = np.einsum("ni,ni->n", rays, cameras[seen, :3, 2])
+        off = depth[:, None] * rays * sigma / (rig.left.fu * rig.baseline)  # by a disparity that is wrong by sigma
+        return cls(places, stamps[seen], (off[-1] - off[0]) / max(len(seen) - 1, 1) if len(seen) else np.zeros(3))
+
+
+def with_frame(
+    evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool, stands: bool = False
+) -> tuple[float, bool]:
     """The evidence that a body moves still, after one more frame, and whether it is proven to have moved.
 
     The evidence is a cumulative sum of −log10 of the p-values; the better test counts, and it fades while a body rests.
@@ -63,12 +87,14 @@ def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, fa
         scene: the still world, as it appears to move.
         way: where the body was.
         far: whether it was followed for farther than it is wide: then its way alone counts.
+        stands: whether the camera stands.
     """
+    bar = PROVEN_AT_REST if stands else PROVEN
     by_frames = -float(np.log10(max(_by_frames(way), 10.0**-_MOST)))
     if len(moved.d) < _LEAST:
-        return evidence, far and by_frames >= PROVEN
+        return evidence, far and by_frames >= bar
     by_members = -float(np.log10(max(_by_members(moved, scene, way.by_rig), 10.0**-_MOST)))
-    proven = by_frames >= PROVEN and (far or by_members >= PROVEN)
+    proven = by_frames >= bar and (far or by_members >= bar)
     return max(0.0, evidence + max(by_frames, by_members) - _ALLOWANCE), proven
 
 

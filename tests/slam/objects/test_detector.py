@@ -9,9 +9,9 @@ import slam
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
+from slam.evaluation.objects import score_for
 from slam.geometry.se3 import inverse, transform
 from slam.objects.config import ObjectsConfig
-from slam.evaluation.objects import score_for
 
 
 def system_for(sequence, mode="detect", **settings):

@@ -47,7 +47,9 @@ def result(
 def test_still_groups_are_not_proven(n, scatter):
     """Whatever the size of the members' errors."""
     rng = np.random.default_rng(n)
-    runs = [with_frame(0.0, group(n, 0.0, 0.01, rng, scatter), scene(), way(0.0, 0.01, rng), False) for _ in range(1000)]
+    runs = [
+        with_frame(0.0, group(n, 0.0, 0.01, rng, scatter), scene(), way(0.0, 0.01, rng), False) for _ in range(1000)
+    ]
     assert not any(proven for _, proven in runs)
 
 
@@ -68,6 +70,14 @@ def test_what_a_wrong_disparity_explains_is_still():
 def test_what_jumps_instead_of_going_on_is_no_body():
     """A junction of two edges at different depths: its features agree, but not its places in successive frames."""
     assert not result(0.05, jumps=0.3)[1]
+
+
+def test_where_the_camera_stands_less_is_asked():
+    """Nothing slides with the camera then; a way that is no chance is enough."""
+    rng = np.random.default_rng(1)
+    moved, jumpy = group(10, 0.05, 0.01, rng), way(0.05, 0.09, rng)
+    proven = [with_frame(0.0, moved, scene(), jumpy, False, stands)[1] for stands in (False, True)]
+    assert proven == [False, True]
 
 
 def test_what_went_farther_than_it_is_wide_is_proven_by_its_way():
