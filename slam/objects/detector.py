@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import IndexArray, among, median
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.interfaces import Backend
@@ -24,6 +25,7 @@ from slam.objects.bodies import (
     Body,
     advanced,
     continued,
+    hidden,
     with_evidence,
     with_extent,
 )
@@ -99,7 +101,7 @@ class MovingObjectDetector:
         """See `slam.objects.modes.ObjectDetector`."""
         if not 0 <= self._frame < self.config.window - 1:
             return np.zeros(0, np.int64)
-        pixels, now = membership.measured(features, rows), self._frame + 1
+        pixels, now = measurement_rows(features.uv_left[rows], features.uv_right[rows]), self._frame + 1
         self._first = self._first.after(ids, places, np.maximum(now - ages, 0))
         return ids[moving_landmarks(self.rig, T_world_left, self._first.of(ids), pixels, now, self.sigma, self.config)]
 
@@ -178,6 +180,9 @@ class MovingObjectDetector:
         """Locate the bodies by their members, and add this frame's measurements to the tracks, in world coordinates."""
         c = self.config
         for body in list(self.bodies.values()):
+            mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
+            front = (other for other in self.bodies.values() if other.proven and other.id != body.id)
+            tracks.row[mine[hidden(front, T_world_left[:3, 3], tracks.position[mine])]] = -1
             located = locate(body, tracks, features, local, T_world_left, self.rig, self.sigma, c, self._frame)
             if located is not None:
                 times_seen = body.seen + 1
@@ -187,7 +192,7 @@ class MovingObjectDetector:
             tracks.position[mine] = transform(body.T, tracks.local[mine])
         make_room(tracks, self.slot)
         seen = np.flatnonzero(tracks.seen)
-        z = membership.measured(features, tracks.row[seen])
+        z = measurement_rows(features.uv_left[tracks.row[seen]], features.uv_right[tracks.row[seen]])
         record(tracks, seen, self.slot, *measure(self.rig, T_world_left, tracks.position[seen], z, self.sigma))
 
     def _fit(self, tracks: Tracks, times: Array) -> None:
@@ -204,7 +209,7 @@ class MovingObjectDetector:
         """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        ages, stands = (self.slot - np.arange(c.window)) % c.window, bool(tracks.still.any())
+        ages = (self.slot - np.arange(c.window)) % c.window
         for body in list(self.bodies.values()):
             if not body.measured:
                 continue
@@ -212,7 +217,7 @@ class MovingObjectDetector:
             members = members[tracks.count(members) >= c.min_frames - 1]
             moved = displacements(tracks, members, ages, self._poses[self.slot, :3, 3])
             way = Way.of(body, self._stamps, self._poses, self.rig, self.sigma)
-            evidence, proven = with_frame(body.evidence, moved, scene, way, body.far, stands)
+            evidence, proven = with_frame(body.evidence, moved, scene, way, body.far)
             body = replace(body, evidence=evidence, proven=body.proven or proven)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
@@ -408,7 +413,7 @@ class MovingObjectDetector:
         self._next_track += len(rows)
         new = tracks.begin(ids, features, rows, points)
         tracks.landmark[new] = landmark[rows]
-        z = membership.measured(features, rows)
+        z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
         record(tracks, new, self.slot, *measure(self.rig, T_world_left, points, z, self.sigma))
         fit_positions(tracks, new)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
-from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.data import BoolArray, IdArray
 from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
@@ -47,11 +47,6 @@ _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is
 _WEAK = 1e-8  # numerics: variance that is added to a known pose's [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
-
-
-def measured(features: StereoFeatures, rows: NDArray[np.intp]) -> Array:
-    """Measurements (N, 3) = (uL, vL, uR) of features; uR is NaN where there is none."""
-    return np.concatenate([features.uv_left[rows], features.uv_right[rows, :1]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,8 @@ from slam.objects.bodies import Body
 from slam.objects.displacements import Displacements
 from slam.objects.regions import Scene
 
-PROVEN = 20.0  #: −log10 of the chance from which a body has moved for certain; chance of jumps in step is some 1e-15
-PROVEN_AT_REST = 12.0  #: the same where the camera stands: nothing slides then, and only noise is left
+PROVEN = 8.0  #: −log10 of the chance from which a body has moved for certain, where it went farther than the camera
+_SLIDES = 20.0  # the same elsewhere: what slides with the camera agrees by up to some 1e-19
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
 _LEAST = 4  # members and frames, for a scatter
@@ -47,11 +47,13 @@ class Way:
         places: of its middle in some of them (K, 3), in world coordinates [m].
         times: of these frames (K,) [s].
         by_rig: how far it seems to go in a frame by a disparity that is wrong by the deviation of a pixel (3,) [m].
+        of_camera: how far the camera went in these frames [m].
     """
 
     places: Array
     times: Array
     by_rig: Array
+    of_camera: float
 
     @classmethod
     def of(cls, body: Body, stamps: Array, cameras: Array, rig: StereoRig, sigma: float) -> Way:
@@ -70,12 +72,18 @@ class Way:
         rays = places - cameras[seen, :3, 3]
         depth = np.einsum("ni,ni->n", rays, cameras[seen, :3, 2])
         off = depth[:, None] * rays * sigma / (rig.left.fu * rig.baseline)  # by a disparity that is wrong by sigma
-        return cls(places, stamps[seen], (off[-1] - off[0]) / max(len(seen) - 1, 1) if len(seen) else np.zeros(3))
+        shift = off[-1] - off[0] if len(seen) else np.zeros(3)
+        camera = float(np.linalg.norm(np.ptp(cameras[seen, :3, 3], axis=0))) if len(seen) else 0.0
+        return cls(places, stamps[seen], shift / max(len(seen) - 1, 1), camera)
+
+    @property
+    def bar(self) -> float:
+        """−log10 of the chance that is asked for: what goes farther than the camera does not slide with it."""
+        length = float(np.linalg.norm(np.ptp(self.places, axis=0))) if len(self.places) else 0.0
+        return PROVEN if length > self.of_camera else _SLIDES
 
 
-def with_frame(
-    evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool, stands: bool = False
-) -> tuple[float, bool]:
+def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
     """The evidence that a body moves still, after one more frame, and whether it is proven to have moved.
 
     The evidence is a cumulative sum of −log10 of the p-values; the better test counts, and it fades while a body rests.
@@ -87,14 +95,12 @@ def with_frame(
         scene: the still world, as it appears to move.
         way: where the body was.
         far: whether it was followed for farther than it is wide: then its way alone counts.
-        stands: whether the camera stands.
     """
-    bar = PROVEN_AT_REST if stands else PROVEN
     by_frames = -float(np.log10(max(_by_frames(way), 10.0**-_MOST)))
     if len(moved.d) < _LEAST:
-        return evidence, far and by_frames >= bar
+        return evidence, far and by_frames >= way.bar
     by_members = -float(np.log10(max(_by_members(moved, scene, way.by_rig), 10.0**-_MOST)))
-    proven = by_frames >= bar and (far or by_members >= bar)
+    proven = by_frames >= way.bar and (far or by_members >= way.bar)
     return max(0.0, evidence + max(by_frames, by_members) - _ALLOWANCE), proven
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -29,7 +31,7 @@ def way(velocity: float, jumps: float, rng: np.random.Generator, by_rig: np.ndar
     """Twelve frames along x, each place off by so much."""
     times = 0.1 * np.arange(12)
     places = velocity * np.arange(12)[:, None] * np.array([1.0, 0, 0]) + jumps * rng.standard_normal((12, 3))
-    return Way(places, times, by_rig)
+    return Way(places, times, by_rig, 0.0)
 
 
 def result(
@@ -72,12 +74,12 @@ def test_what_jumps_instead_of_going_on_is_no_body():
     assert not result(0.05, jumps=0.3)[1]
 
 
-def test_where_the_camera_stands_less_is_asked():
-    """Nothing slides with the camera then; a way that is no chance is enough."""
+def test_what_goes_farther_than_the_camera_does_not_slide_with_it():
+    """So less is asked of it; the camera's way is the only difference."""
     rng = np.random.default_rng(1)
-    moved, jumpy = group(10, 0.05, 0.01, rng), way(0.05, 0.09, rng)
-    proven = [with_frame(0.0, moved, scene(), jumpy, False, stands)[1] for stands in (False, True)]
-    assert proven == [False, True]
+    moved, jumpy = group(10, 0.05, 0.01, rng), way(0.05, 0.05, rng)
+    proven = [with_frame(0.0, moved, scene(), replace(jumpy, of_camera=far), False)[1] for far in (0.3, 3.0)]
+    assert proven == [True, False]
 
 
 def test_what_went_farther_than_it_is_wide_is_proven_by_its_way():
