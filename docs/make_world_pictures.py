@@ -21,7 +21,7 @@ PICTURES = {
     "boxes": ("", (60, 200, 330)),
     "people": ("", (5, 45, 85)),
     "street": ("", (10, 125, 190)),
-    "town": ("cars=other", (150, 870, 1200)),
+    "town": ("", (150, 870, 1200)),
 }
 WIDE = ("people", "street", "town")  #: worlds whose images are wide
 HEIGHT = 300  #: of a frame in a picture [px]

@@ -53,10 +53,12 @@ class MotionModel:
     Attributes:
         acceleration: density of the linear velocity noise [m/s / √s].
         angular_acceleration: density of the angular velocity noise [rad/s / √s].
+        wheels: the camera is on a vehicle, which does not move sideways, and looks ahead.
     """
 
     acceleration: float = 1.0
     angular_acceleration: float = 1.0
+    wheels: bool = False
 
     __pydantic_config__ = FORBID_UNKNOWN
 
@@ -122,7 +124,7 @@ KINDS = {
         objects=ObjectModels(drift=0.7),
     ),
     "driving": EstimatorModels(
-        MotionModel(acceleration=1.0, angular_acceleration=0.3),
+        MotionModel(acceleration=1.0, angular_acceleration=0.3, wheels=True),
         pixel_sigma=0.7,
         initial_velocity_sigma=15.0,
         initial_angular_velocity_sigma=0.3,

@@ -13,6 +13,7 @@ from slam.input.warnings import REPEATED
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
 from slam.rig_error import CommonError, Revision
+from slam.tracks.state import HIDDEN
 
 
 def frame_result(
@@ -81,5 +82,6 @@ def frame_status(step: Step, mapped_before: bool) -> tuple[FrameStatus, str]:
     reason = REPEATED if step.repeated else step.report.reason
     if step.matches.doubted:
         reason = f"{step.matches.doubted} landmarks agree on a pose too far from the prediction to be believed at once"
+        reason = reason if step.tracking.hidden_at is None else HIDDEN
     reason = reason or f"only {len(step.report.used)} of {len(step.matches)} matched landmarks were used"
     return (FrameStatus.LOST if step.tracking.lost else FrameStatus.PREDICTED), reason

@@ -259,17 +259,22 @@ class Session:
             standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
             atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), place)
         path = old.trajectory().select(slice(None, -1))
+        hidden = elsewhere.T_world_left is None and state.tracking.stood and self._models.motion.wheels
         state = replace(
             state, backend=new, landmarks=landmarks, atlas=atlas, standing=standing,
-            tracking=state.tracking.believing(T, stamp), past=(*state.past, path),
+            tracking=state.tracking.believing(T, stamp, T if hidden else None), past=(*state.past, path),
             restarted=(*state.restarted, state.index + 1),
         )  # fmt: skip
         return state, prediction
 
     def left_behind(self, before: State, step: Step) -> IdArray:
-        """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began."""
+        """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began.
+
+        What the rig's uncertainty does to those is forgotten.
+        """
         if before.landmarks is None or step.report.reason != NEW_MAP:
             return step.erased
+        self.rig_error.uncertainty.keep(step.landmarks.ids)
         return np.concatenate([np.setdiff1d(before.landmarks.ids, step.landmarks.ids), step.erased])
 
     def _start(self, T_world_left: Array) -> Backend:

@@ -107,10 +107,11 @@ class Tracker:
         asked, left_out = localizer.informative(step.prediction, step.matches, positions, dt)
         answer = state.backend.update(asked.observations(step.features), asked.T_world_left)
         report: UpdateReport = checked(state.backend, "update", answer)
-        tracking = localizer.state_after(step.tracking, step.prediction, step.features, asked, report)
+        stands = step.standing.stands
+        tracking = localizer.state_after(step.tracking, step.prediction, step.features, asked, report, stands)
         if state.begins_at(step.index):
             report = replace(report, reason=report.reason if len(step.landmarks) else NEW_MAP)
-        elif not step.standing.stands and self._session.may_begin_new_map(state, tracking):
+        elif not step.standing.holds(tracking.lost) and self._session.may_begin_new_map(state, tracking):
             return Elsewhere(None)
         return replace(step, report=report, left_out=left_out, tracking=tracking)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import runpy
 import shlex
@@ -26,7 +25,6 @@ from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
-from slam.registry import ONLINE
 from slam.sequences.calibration_files import write_opencv
 from tests.scripts import load_script
 
@@ -37,8 +35,6 @@ PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
     *(page for page in sorted(DOCS.rglob("*.md")) if page.name != "results.md" and page.parent.name != "results"),
 ]
-#: Sections of the results page that the README quotes.
-SECTIONS = ("The bookshelf aisle", "Do the back ends know", "Moving box")
 
 
 def pose_fit():
@@ -142,68 +138,8 @@ def test_every_page_links_to_what_exists():
                 assert (page.parent / target).exists(), f"{page.relative_to(ROOT)}: {target}"
 
 
-def table_rows(text, columns):
-    """Cells of the table rows of a Markdown text that have so many columns; an empty first cell is the row's above."""
-    rows, name = [], ""
-    for line in text.splitlines():
-        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
-        if line.startswith("|") and len(cells) == columns and set(cells[1]) - set("-: "):
-            name = cells[0] or name
-            rows.append([name, *cells[1:]])
-    return rows
-
-
-def results():
-    """All pages of results in one text."""
-    return "\n".join(page.read_text(encoding="utf-8") for page in sorted((DOCS / "results").glob("*.md")))
-
-
-def test_the_figures_in_the_readme_are_those_of_the_results_page():
-    page = results()
-    section = page.split("\n## Real sequences")[1].split("\n## ")[0]
-    measured = {(row[0], row[1]): [*row[2:5], row[6]] for row in table_rows(section, 9)}
-    readme = (DOCS.parent / "README.md").read_text(encoding="utf-8")
-    shown = [row for row in table_rows(readme, 6) if row[1] in ONLINE]
-    assert len(shown) == 4 * len(ONLINE)
-    for name, backend, *cells in shown:
-        own = next(values for (short, other), values in measured.items() if name.startswith(short) and other == backend)
-        for cell, value in zip(cells, own):
-            digits = len(cell.partition(".")[2])
-            assert cell == (f"{float(value):.{digits}f}" if digits else value), (name, backend, cell, value)
-    cost = page.split("\n## What a frame costs, next to others")[1].split("\n## ")[0]
-    times = [int(row[2]) for row in table_rows(cost, 10) if row[1] in ("ekf", "smoother")]
-    assert f"[{min(times)} to {max(times)} ms]" in readme
-
-
-def test_the_figures_of_worlds_in_the_readme_are_those_of_the_results_page():
-    page = results()
-    section = {text.split("\n")[0]: text for text in page.split("\n## ")}
-    of = {name: next(text for title, text in section.items() if title.startswith(name)) for name in SECTIONS}
-    aisle = {row[0]: row for row in table_rows(of["The bookshelf aisle"], 11)}
-    consistency = table_rows(of["Do the back ends know"], 10)
-    nees = table_rows(of["Do the back ends know"], 8)
-    bodies = {row[1]: row for row in table_rows(of["Moving box"], 12) if row[0].startswith("box?") and row[2] == "1"}
-    cars = [row for row in table_rows(of["Moving box"], 10) if row[2] in ("0", "1") and row[4] not in ("1", "–")]
-    worlds = ("desk", "aisle")
-    for column, backend in ((1, "ekf"), (2, "smoother")):
-        bound = [row[3] for world in worlds for row in consistency if row[:2] == [world, backend]]
-        honest = [f"{float(row[2].split()[0]):.1f}" for world in worlds for row in nees if row[:2] == [world, backend]]
-        body = bodies[backend]
-        speeds = [f"{float(row[7]):.1f} %" for row in cars if row[0] == backend]
-        expected = [
-            f"{aisle[backend][2]}, {aisle[backend][3]} cm",
-            ", ".join(bound),
-            ", ".join(honest),
-            f"{float(body[7]):.2f}°, {float(body[8]):.1f} mm",
-            ", ".join(speeds),
-        ]
-        readme = table_rows((DOCS.parent / "README.md").read_text(encoding="utf-8"), 3)
-        assert [row[column] for row in readme if row[1] != "ekf"] == expected
-
-
 # What pages say that can be typed: commands, settings, worlds, scripts, snippets.
 
-SCRIPTS = ("experiments", "benchmarks")
 FENCE = re.compile(r"^```[ {.]*(\w*)[^\n]*\n(.*?)^```", re.M | re.S)
 SETTING = re.compile(r"[a-z_]+\.[a-z_]+=\S+")
 
@@ -235,10 +171,6 @@ def commands(page, *languages):
                 words = words[end + 1 :]
 
 
-def options_of(command):
-    return {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
-
-
 def require_accepted(settings, backend=None):
     """Raise where a setting is refused by the configuration, the front end, or every back end that it could be for."""
     needed = ["objects.database=FILE.npz"] if "objects.mode=procedure1" in settings else []
@@ -267,21 +199,6 @@ def test_commands_in_blocks_are_understood_by_the_command_line(page):
 
 
 @each_page
-def test_commands_in_the_text_name_what_exists(page):
-    group = typer.main.get_command(app)
-    scripts = [path.read_text(encoding="utf-8") for folder in SCRIPTS for path in (ROOT / folder).glob("*.py")]
-    for span in spans(page):
-        words = span.split()
-        if words[0] == "slam" and len(words) > 1:
-            used = {word.partition("=")[0] for word in words[2:] if word.startswith("--")}
-            assert used - {"--help"} <= options_of(group.commands[words[1]]), span
-        elif words[0].startswith("--"):
-            name = words[0].partition("=")[0]
-            known = any(name in options_of(command) for command in group.commands.values())
-            assert known or name == "--help" or any(f'"{name}"' in text for text in scripts), span
-
-
-@each_page
 def test_settings_in_the_text_are_accepted(page):
     sections = {field.name for field in fields(SystemConfig)}
     for span in spans(page):
@@ -300,27 +217,6 @@ def test_worlds_and_scripts_exist(page):
         worlds.parse_query(name, "" if "key=" in query else query, worlds.options(name))
     for script in re.findall(r"\b(?:python|pytest)(?: -\S+)* ((?:experiments|benchmarks|docs|tests)/\S+?\.py)", text):
         assert (ROOT / script).is_file(), script
-
-
-def named(dotted):
-    """What a full name such as ``slam.data.StereoFrame`` stands for; fields of dataclasses count."""
-    parts = dotted.split(".")
-    found = importlib.import_module(parts[0])
-    for i, part in enumerate(parts[1:], start=2):
-        module = ".".join(parts[:i])
-        if hasattr(found, "__path__") and importlib.util.find_spec(module):
-            found = importlib.import_module(module)
-        else:
-            found = getattr(found, part) if hasattr(found, part) else found.__annotations__[part]
-    return found
-
-
-@each_page
-def test_names_of_the_code_in_the_text_exist(page):
-    for span in spans(page):
-        match = re.match(r"((?:slam|backends|frontends)(?:\.[A-Za-z_]\w*)+)(?:\(.*\))?$", span)
-        if match and match[1] not in ("slam.backends", "slam.frontends"):  # groups of entry points
-            assert named(match[1]) is not None, span
 
 
 #: What is put in place of what the reader has, by page. On all pages worlds have a few frames.

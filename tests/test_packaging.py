@@ -31,18 +31,6 @@ def test_the_changelog_has_a_date_for_every_release():
         assert first.startswith(f"{slam.__version__} ")
 
 
-def test_the_readme_of_the_package_index_has_absolute_links():
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    for substitution in PROJECT["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]["substitutions"]:
-        readme, count = re.subn(substitution["pattern"], substitution["replacement"], readme)
-        assert count
-    assert not re.findall(r"\]\((?!https?:|#)[^)]*\)", readme)
-    own = re.findall(r"\]\(https://\S+?/surf-stereo-slam/surf-stereo-slam/(?:blob/)?main/([^)#]+)", readme)
-    assert own
-    for path in own:
-        assert (ROOT / path).exists(), path
-
-
 @pytest.mark.parametrize("folder", ["slam", "frontends", "backends", "docs"])
 def test_extras_that_are_named_exist(folder):
     extras = {"", *PROJECT["project"]["optional-dependencies"]}

@@ -61,13 +61,3 @@ def test_rendered_world(world, backend, tmp_path):
     summary = run(sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind), tmp_path))
     assert summary["status"] == {"started": 1, "tracked": len(sequence) - 1}
     assert summary["accuracy"]["online"]["ATE RMSE [m]"] < RENDERED[world]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
-def test_faults_are_survived(backend, tmp_path):
-    """Black frames, a missing right image, missing frames: the run goes on, and its status says what happened."""
-    sequence = open_sequence("synthetic:desk?frames=40&black=12:15&dropright=20:22&drop=27")
-    summary = run(sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind), tmp_path))
-    assert summary["status"] == {"started": 1, "predicted": 3, "tracked": 35}
-    assert summary["accuracy"]["online"]["ATE RMSE [m]"] < 0.02

@@ -70,7 +70,7 @@ class Mapper:
         rig: the cameras.
         config: settings.
         localizer: says which landmarks are seen from a similar viewpoint as before.
-        backend: the first one; it must have `place` if `config.monocular` is set.
+        backend: the first one; it must have `place` if `config.monocular` is true.
 
     Raises:
         ConfigurationError: the back end cannot place landmarks.
@@ -82,16 +82,18 @@ class Mapper:
         self.next_id = 0
         self._localizer = localizer
         self._monocular: MonocularDepth | None = None
-        if config.monocular:
-            if not isinstance(backend, MapBackend):
-                raise ConfigurationError("map.monocular: this back end cannot place landmarks")
+        if config.monocular and not isinstance(backend, MapBackend):
+            raise ConfigurationError("map.monocular: this back end cannot place landmarks")
+        if config.monocular is not False and isinstance(backend, MapBackend):
             self._monocular = self._new_monocular()
 
     def update(self, backend: Backend, step: Step) -> Step:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
         view = self._view(backend, step.landmarks, step)
         landmarks = self._count(step.landmarks, view, step)
-        bad = bad_landmarks(landmarks, self.config) | isin(landmarks.ids, step.labels.landmarks)
+        bad = isin(landmarks.ids, step.labels.landmarks)
+        if step.features.has_stereo.any() or not len(step.features):  # else little can take their place
+            bad |= bad_landmarks(landmarks, self.config)
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
         known = known_features(view, landmarks, step.features, self.config)
@@ -203,7 +205,7 @@ class Mapper:
         if len(added):
             backend.add(added.observations(features))
             landmarks = landmarks.with_new(step.index, added.ids, features, rows, step.estimate.T_world_left[:3, 3])
-        if self._monocular is not None:
+        if self._monocular is not None and (self.config.monocular or not features.has_stereo.any()):
             return self._add_monocular(self._monocular, backend, landmarks, step, added, free)
         return landmarks, added
 

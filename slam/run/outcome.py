@@ -9,11 +9,11 @@ import numpy as np
 
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import inverse, log
+from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED, baseline_doubt
 from slam.models import MotionModel
 from slam.run.summary import RunRecord
-from slam.tracks.state import ENOUGH_FEATURES
+from slam.tracks.state import ENOUGH_FEATURES, HIDDEN
 
 _TRACKED = "tracked"
 
@@ -23,6 +23,11 @@ _JERKY = 3.0
 _LEAST_CHANGES = 10  # guard: changes of velocity of which a median is taken
 
 _ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
+
+#: guard: Median speeds [m/s] that no camera in a hand and no vehicle has, and median distances [m] that neither sees.
+_FASTEST = {False: 10.0, True: 100.0}
+_NEAREST = {False: 0.05, True: 1.0}
+_WIDEST = {False: 1.0, True: np.inf}  # guard: baseline [m] that no hand carries
 
 _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is said
 
@@ -85,6 +90,11 @@ def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
     kind = "" if driving else "a vehicle's camera without --kind driving, "
     depths = np.array(record.depths)[np.isfinite(record.depths)]
     seen = f" and what they see is {_rounded(float(np.median(depths)))} m away in the median" if len(depths) else ""
+    if rig.baseline > _WIDEST[driving]:
+        return (
+            f"by the calibration the cameras are {rig.baseline:.3g} m apart{seen}, which no hand carries: a baseline "
+            "in another unit (unit=cm, unit=mm), or a vehicle's camera without --kind driving"
+        )
     return (
         f"features are found in both images, but not again in the next frame: {kind}frames too far apart"
         f"{_speed(record)}, images that are not in order of time or have other times than theirs (fps=…, times=…), or "
@@ -97,17 +107,43 @@ def _rounded(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def _speed(record: RunRecord) -> str:
-    """How fast the camera was where two successive frames were tracked; empty where there are none."""
+def _speeds(record: RunRecord) -> Array:
+    """Turn rates [rad/s] and speeds [m/s] (N, 2) where two successive frames were tracked."""
     measured = np.array(record.measured, bool)
     both = measured[1:] & measured[:-1]
-    if not both.any():
-        return ""
     poses = np.array(record.poses).reshape(-1, 4, 4)
     moved = log(inverse(poses[:-1]) @ poses[1:])[both] / np.diff(record.stamps)[both, None]
-    turn, way = np.linalg.norm(moved[:, :3], axis=1).max(), np.linalg.norm(moved[:, 3:], axis=1).max()
+    return np.linalg.norm(moved.reshape(-1, 2, 3), axis=2)
+
+
+def _speed(record: RunRecord) -> str:
+    """How fast the camera was where two successive frames were tracked; empty where there are none."""
+    speeds = _speeds(record)
+    if not len(speeds):
+        return ""
+    turn, way = speeds.max(axis=0)
     fastest = f"{_rounded(way)} m/s and turned at up to {_rounded(np.degrees(turn))}°/s"
     return f" (where it was tracked the camera moved at up to {fastest})"
+
+
+def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str:
+    """What to say where speed or distance are impossible in their medians, as by a baseline in another unit.
+
+    A baseline that is k times too long makes path, speed and distances k times too large, and no residual shows it.
+    Empty where they are possible, or too few are known.
+    """
+    speeds, depths = _speeds(record), np.array(record.depths)[np.isfinite(record.depths)]
+    if len(speeds) < _LEAST_CHANGES or not len(depths):
+        return ""
+    speed, depth = float(np.median(speeds[:, 1])), float(np.median(depths))
+    if speed <= _FASTEST[driving] and depth >= _NEAREST[driving] and rig.baseline <= _WIDEST[driving]:
+        return ""
+    carrier = "no vehicle does" if driving else "no camera in a hand does (is it a vehicle's: --kind driving?)"
+    return (
+        f"the camera moved at {_rounded(speed)} m/s and saw things {_rounded(depth)} m away in the median, which "
+        f"{carrier}: by the calibration the cameras are {rig.baseline:.3g} m apart; is that in metres? "
+        "(unit=cm, unit=mm)"
+    )
 
 
 def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
@@ -167,6 +203,8 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
     features, stereo = np.median(np.array(record.features)[untracked], axis=0)
     if features < ENOUGH_FEATURES:
         return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
+    if 2 * record.hidden > len(untracked):
+        return f"in {record.hidden} of them {HIDDEN}"
     if in_map:
         return "the camera is not where the map was made, or the place looks different now"
     missing = _by_missing_images(record, untracked)

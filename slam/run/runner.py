@@ -23,7 +23,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
 from slam.outputs import Output, require_outputs
-from slam.run.outcome import median_depth, motion_doubt, outcome
+from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
 from slam.run.outputs import NAMES, RunFiles
 from slam.run.recorded import RecordedFrame, Recording
 from slam.run.recording import save_recording
@@ -126,6 +126,9 @@ def run(
         raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
     if options.config.map.monocular and options.record is not None:
         raise SlamError("a run with map.monocular cannot be recorded: a recording holds stereo observations alone")
+    if options.record is not None:
+        config = replace(options.config, map=replace(options.config.map, monocular=False))
+        options = replace(options, config=config)
     frames = sequence.frames(options.start, options.stop)
     live = None
     if options.live or is_live(sequence):
@@ -318,7 +321,8 @@ class _Run:
         options, record, sequence = self.options, self.record, self.sequence
         warnings = getattr(self.system, "warnings", ())
         driving = options.origin.get("kind") == "driving"
-        doubt = motion_doubt(record, options.config.models.motion, driving)
+        doubt = scale_doubt(record, sequence.rig, driving)
+        doubt = doubt or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
         tracking = outcome(record, sequence.rig, warnings, in_map, dropped, doubt, driving)
         if doubt and not tracking:

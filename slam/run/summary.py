@@ -22,6 +22,7 @@ from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
 from slam.third_party import checked, named_failures
+from slam.tracks.state import HIDDEN
 from slam.tracks.table import LandmarkTable
 
 
@@ -46,6 +47,7 @@ class RunRecord:
     depths: list[float] = field(default_factory=list)  # median of what each frame sees [m]
     bodies: set[int] = field(default_factory=set)
     repeated: int = 0  # frames with the images of the one before
+    hidden: int = 0  # frames in which something moved past a standing vehicle
     rejected: int = 0
     used: int = 0
     returned: int | None = None  # the first frame in which landmarks of an old place came back
@@ -61,6 +63,7 @@ class RunRecord:
         self.milliseconds.append(dict(result.milliseconds))
         self.times.append(working_time())
         self.repeated += result.reason == REPEATED
+        self.hidden += result.reason == HIDDEN
         self.features.append((len(result.features), int(result.features.has_stereo.sum())))
         self.bodies.update(thing.id for thing in result.objects)
         if not result.located:

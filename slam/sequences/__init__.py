@@ -26,14 +26,15 @@ _SYNTHETIC = "synthetic:"
 _CAMERA = "camera:"
 _KINDS = ("driving", "handheld")
 
-#: Formats on disk, in the order in which they are tried: module and description.
+#: Formats on disk, in the order in which they are tried: module, the end of its functions' names, and description.
 _FORMATS = {
-    "euroc": ("slam.sequences.euroc", "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
-    "kitti-raw": ("slam.sequences.kitti_raw", "KITTI raw drives: image_00/data, image_01/data"),
-    "kitti": ("slam.sequences.kitti", "KITTI odometry sequences: image_0, image_1, calib.txt"),
-    "ros": ("slam.sequences.ros", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
+    "euroc": ("slam.sequences.euroc", "folder", "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
+    "kitti-raw": ("slam.sequences.kitti", "drive", "KITTI raw drives: image_00/data, image_01/data"),
+    "kitti": ("slam.sequences.kitti", "folder", "KITTI odometry sequences: image_0, image_1, calib.txt"),
+    "ros": ("slam.sequences.ros", "folder", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
     "folders": (
         "slam.sequences.folders",
+        "folder",
         "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
     ),
 }
@@ -45,7 +46,7 @@ _CAMERA_OPTIONS = frozenset({"kind", "mask"})
 
 def formats() -> dict[str, str]:
     """Names of the formats with a line on each."""
-    known = {name: description for name, (_, description) in _FORMATS.items()}
+    known = {name: description for name, (*_, description) in _FORMATS.items()}
     camera = "live cameras: camera:0 (both images side by side), camera:0,1, or addresses"
     return {**known, "camera": camera, "synthetic": "built-in worlds: synthetic:NAME?key=value&key=value"}
 
@@ -92,7 +93,7 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
     _check_options(name, options, OPTIONS | getattr(module, "OPTIONS", frozenset()))
     note_input(folder)
     given = Given(options)
-    opened: RecordedSequence = module.open_folder(folder, given)
+    opened: RecordedSequence = getattr(module, f"open_{_FORMATS[name][1]}")(folder, given)
     masks = read_masks(given.get("mask"), folder if folder.is_dir() else folder.parent, opened.rig)
     given.require_read(f"{folder} is read as {name}")
     return replace(opened, masks=masks)
@@ -252,7 +253,7 @@ def _two_cameras(folder: Path) -> str:
 
 def _is_ros(path: Path) -> bool:
     """Whether a path is a ROS recording, which may be a file."""
-    return bool(import_module(_FORMATS["ros"][0]).matches(path))
+    return _matches("ros", path)
 
 
 def _sequences_below(folder: Path) -> list[Path]:
@@ -268,7 +269,13 @@ def _sequences_below(folder: Path) -> list[Path]:
 
 def _format_of(folder: Path) -> str | None:
     """The first format that a folder looks like; None for no sequence."""
-    return next((name for name, (module, _) in _FORMATS.items() if import_module(module).matches(folder)), None)
+    return next((name for name in _FORMATS if _matches(name, folder)), None)
+
+
+def _matches(name: str, folder: Path) -> bool:
+    """Whether a folder, or a file, looks like a format."""
+    module, end, _ = _FORMATS[name]
+    return bool(getattr(import_module(module), f"matches_{end}")(folder))
 
 
 def _known(format: str) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -16,6 +17,7 @@ from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.door import Masks, at_the_door
 from slam.sequences.faults import FaultLog
+from slam.sequences.images import halves
 from slam.showing import sequence_html, sequence_line
 
 
@@ -78,6 +80,13 @@ def is_live(frames: object) -> bool:
     return bool(getattr(frames, "live", False))
 
 
+#: An image as it was read, or why it could not be; None where there is none.
+Image = np.ndarray | SequenceError | None
+
+#: The left and the right image of each frame.
+Images = Generator[tuple[Image, Image], None, None]
+
+
 class FrameSource(Protocol):
     """Where a recorded sequence's images come from."""
 
@@ -86,27 +95,14 @@ class FrameSource(Protocol):
         """Times of the frames (N,) [s], strictly increasing."""
         ...
 
-    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
-        """Decode frames `start` to `stop`; unreadable images are reported to `faults` and skipped."""
+    @property
+    def halves(self) -> bool:
+        """Whether left images hold both, side by side."""
         ...
 
-
-Image = np.ndarray | SequenceError | None
-
-
-def delivered(index: int, stamp: float, left: Image, right: Image, faults: FaultLog) -> Iterator[StereoFrame]:
-    """The frame of two images, of which each may be the error of reading it: a left one costs the frame, a right one
-    itself.
-    """
-    if isinstance(left, SequenceError):
-        faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {left}")
-        return
-    if isinstance(right, SequenceError):
-        line = f"frame {index} is given without its right image: {right}"
-        faults.report("right images unreadable, frames given without them", line)
-        right = None
-    if left is not None:
-        yield StereoFrame(index, stamp, left, right)
+    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
+        """Decode the left and right images of frames `start` to `stop`; they may end early, with a fault."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +154,19 @@ class RecordedSequence:
         return self._read(start, stop)
 
     def _read(self, start: int, stop: int) -> Iterator[StereoFrame]:
-        """Decode lazily and sum up repeated faults at the end, also where the caller stops early."""
-        with FaultLog(self.warnings) as faults:
-            for frame in self.source.read(start, stop, faults):
-                yield at_the_door(frame, self.rig, self.masks)
+        """Decode lazily and sum up repeated faults at the end, also where the caller stops early.
+
+        A left image that cannot be read costs the frame, a right one itself.
+        """
+        with FaultLog(self.warnings) as faults, closing(self.source.images(start, stop, faults)) as images:
+            for index, (left, right) in zip(range(start, stop), images):
+                if isinstance(left, np.ndarray) and self.source.halves:
+                    left, right = halves(left, f"frame {index}")
+                if isinstance(right, SequenceError) and not isinstance(left, SequenceError):
+                    line = f"frame {index} is given without its right image: {right}"
+                    faults.report("right images unreadable, frames given without them", line)
+                if isinstance(left, SequenceError):
+                    faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {left}")
+                elif left is not None:
+                    right = right if isinstance(right, np.ndarray) else None
+                    yield at_the_door(StereoFrame(index, float(self.stamps[index]), left, right), self.rig, self.masks)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,16 +38,36 @@ NO_NUMBERS = (ValueError, TypeError, OverflowError)
 _MOST = 1e9
 
 
-def require_possible(numbers: Array, name: str) -> None:
-    """Raise where a number of a calibration is not finite, or larger than any in a calibration.
+def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
+    """A finite array of the shape; flat where that is None. OpenCV's matrices are ``{rows, cols, data}``.
 
     Raises:
-        CalibrationError: one is.
+        CalibrationError: it is none, or a number is larger than any in a calibration.
     """
+    data = value.get("data") if isinstance(value, Mapping) else value
+    try:
+        numbers = np.array(data.split() if isinstance(data, str) and shape != () else data, dtype=float)
+        numbers = numbers.reshape(-1 if shape is None else shape)
+    except NO_NUMBERS:
+        what = "no number" if shape == () else "no matrix" + (f" of shape {shape}" if shape else "")
+        raise CalibrationError(f"{name} is {what}") from None
     if not np.isfinite(numbers).all():
         raise CalibrationError(f"{name} is not finite: {numbers.tolist()}")
     if np.abs(numbers).max(initial=0) > _MOST:
         raise CalibrationError(f"{name} is impossibly large: {numbers.tolist()}")
+    return numbers
+
+
+def rigid(T: Array, name: str) -> Array:
+    """The rigid motion (4, 4).
+
+    Raises:
+        CalibrationError: its rotation is none.
+    """
+    R = T[:3, :3]
+    if np.abs(R).max() > 1.01 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise CalibrationError(f"{name} is not a rigid motion: its rotation is {R.tolist()}")
+    return T
 
 
 # ------------------------------------------------------------------------------------------------ KITTI
@@ -76,11 +97,7 @@ def kitti_matrix(rows: Mapping[str, Array], name: str, shape: tuple[int, ...]) -
     """One finite matrix of a KITTI calibration."""
     if name not in rows:
         raise CalibrationError(f"{name} is missing")
-    value = rows[name]
-    if value.size != np.prod(shape):
-        raise CalibrationError(f"{name} has {value.size} numbers, {int(np.prod(shape))} expected")
-    require_possible(value, name)
-    return value.reshape(shape)
+    return array(rows[name], name, shape)
 
 
 def rig_from_projections(P_left: Array, P_right: Array, size: tuple[int, int]) -> StereoRig:

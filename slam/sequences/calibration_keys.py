@@ -18,11 +18,11 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, pose, so3_exp
 from slam.sequences.calibration import (
-    NO_NUMBERS,
+    array,
     projection_offset,
-    require_possible,
     rig_from_projections,
     rig_from_transform,
+    rigid,
 )
 from slam.sequences.calibration_forms import read_form
 from slam.sequences.images import Size
@@ -176,9 +176,9 @@ def body_pose(entries: Entries, side: int) -> Array:
     """``T_body_camera`` (4, 4) of a camera; where no body is named, it is the left camera."""
     found = entries.numbers("T_BS", side, (4, 4))
     if found is not None:
-        return _rigid(found, "T_BS")
+        return rigid(found, "T_BS")
     found = entries.numbers("T_cam_imu", side, (4, 4))
-    return np.eye(4) if found is None else inverse(_rigid(found, "T_cam_imu"))
+    return np.eye(4) if found is None else inverse(rigid(found, "T_cam_imu"))
 
 
 def _require(entries: Entries, there: Sequence[bool], *names: str) -> None:
@@ -206,7 +206,7 @@ def _extrinsics(entries: Entries, unit: float) -> Array | None:
     for role, turned in (("T_cn_cnm1", False), ("T_c1_c2", True)):
         T = entries.numbers(role, None, (4, 4))
         if T is not None:
-            return inverse(_rigid(T, role)) if turned else _rigid(T, role)
+            return inverse(rigid(T, role)) if turned else rigid(T, role)
     left, right = (entries.numbers("R_rect", side, (3, 3)) for side in (0, 1))
     offset = _rectified_offset(entries, unit)
     return None if left is None or right is None or offset is None else pose(right.T @ left, right.T @ offset)
@@ -318,26 +318,6 @@ def _number(entry: tuple[str, Any]) -> float:
     if isinstance(value, bool) or value is None:
         raise CalibrationError(f"{name} is no number")
     return float(array(value, name, ())[()])
-
-
-def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
-    """A finite array of the shape; flat where that is None. OpenCV's matrices are ``{rows, cols, data}``."""
-    data = value.get("data") if isinstance(value, Mapping) else value
-    try:
-        array = np.array(data.split() if isinstance(data, str) and shape != () else data, dtype=float)
-        array = array.reshape(-1 if shape is None else shape)
-    except NO_NUMBERS:
-        what = "no number" if shape == () else "no matrix" + (f" of shape {shape}" if shape else "")
-        raise CalibrationError(f"{name} is {what}") from None
-    require_possible(array, name)
-    return array
-
-
-def _rigid(T: Array, name: str) -> Array:
-    """The rigid motion (4, 4), where it is one."""
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T[:3, :3]) < 0:
-        raise CalibrationError(f"{name} is not a rigid motion")
-    return T
 
 
 def _flat(node: Mapping[str, Any], written: str, plain: str) -> Iterator[tuple[str, tuple[str, Any]]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.data import StereoFrame
-from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.errors import ConfigurationError, SequenceError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -19,7 +19,7 @@ from slam.sequences import devices, rigs
 from slam.sequences.door import at_the_door, read_masks
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import flag, number
-from slam.sequences.images import halves, size_text
+from slam.sequences.images import halves, require_same_size, size_text
 
 #: Options besides ``kind``.
 OPTIONS = frozenset({"left", "right", "swap", "width", "height", "fps", "wait"}) | rigs.OPTIONS
@@ -68,24 +68,15 @@ class CameraSequence:
         self._origin = time.time() - time.monotonic()
         self._cameras: _Cameras | None = self._open()
         try:
-            paths = self._calibration_files(options)
+            missing = f"{self.name}: there is no calibration.yaml or the like in {Path.cwd()}"
+            missing += f"; name the file: '{self.name}?calibration=FILE'"
+            paths = rigs.calibration_files(Path.cwd(), options, missing)
             _, left, _ = self._first(self._cameras)
             self.rig: StereoRig = self._rig(paths, (left.shape[1], left.shape[0]), options)
             self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
         except BaseException:
             self._cameras.release()
             raise
-
-    def _calibration_files(self, options: Mapping[str, str]) -> list[Path]:
-        """Those that are named, or that lie in the working folder."""
-        folder = Path.cwd()
-        try:
-            return rigs.calibration_files(folder, options)
-        except CalibrationError:
-            if "calibration" in options:
-                raise
-            missing = f"{self.name}: there is no calibration.yaml or the like in {folder}"
-            raise CalibrationError(f"{missing}; name the file: '{self.name}?calibration=FILE'") from None
 
     def __len__(self) -> int:
         raise TypeError(f"{self.name}: a camera has no number of frames")
@@ -225,9 +216,7 @@ class _Cameras:
         if len(images) < len(self._devices):
             return None
         left, right = halves(images[0], self._name) if len(images) == 1 else (images[0], images[1])
-        if left.shape != right.shape:
-            sizes = " and ".join(size_text(image.shape[::-1]) for image in (left, right))
-            raise SequenceError(f"{self._name}: left and right images differ in size: {sizes}")
+        require_same_size(left.shape[::-1], right.shape[::-1], f"{self._name}, left", f"{self._name}, right")
         return (stamp, right, left) if self._swap else (stamp, left, right)
 
     def release(self) -> None:

@@ -1,17 +1,32 @@
-"""Cameras as OpenCV opens them: by number, by a GStreamer pipeline, or by an address in a network."""
+"""What OpenCV captures: cameras by number, by a GStreamer pipeline or by an address in a network, and video files."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from slam.errors import SequenceError
-from slam.sequences.quiet import quiet_libraries
 
 _TIMEOUT = 5000  # [ms] for an answer from the network
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Keep OpenCV, and ffmpeg below it, from printing what is about to be reported as an error of ours."""
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    logging = cv2.utils.logging
+    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        logging.setLogLevel(before)
 
 
 class Device(Protocol):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +38,7 @@ _TRUTH = ("state_groundtruth_estimate0", "mocap0")  # both give the body's (IMU'
 _CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "../camchain.yaml", "../dso/camchain.yaml")
 
 
-def matches(folder: Path) -> bool:
+def matches_folder(folder: Path) -> bool:
     """Whether a folder looks like EuRoC's: it, or its ``mav0``, holds ``cam0`` or ``cam1`` with data in it."""
     return any((_root(folder) / cam / part).exists() for cam in ("cam0", "cam1") for part in ("data", "data.csv"))
 
@@ -57,10 +56,10 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
         left, right = _listings(root, faults)
         path = times_file(folder, options)
         _, source = pair_up(left, right, options, faults, read_times(path, faults))
-        own, size = _calibration(root), source.first_size()
+        own, missing = _calibration(root), f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing"
+        missing += " (nor is there a Kalibr camchain.yaml): add calibration=FILE"
         named = "calibration" in options or not own
-        rig = read_rig(_named(folder, root, options) if named else own, size, options)
-        source = replace(source, size=size)
+        rig = read_rig(calibration_files(folder, options, missing) if named else own, source.size, options)
         truth = _ground_truth(root, own, faults)
     name = folder.parent.name if folder.name == "mav0" else folder.name
     kind = options.get("kind", "handheld")
@@ -103,17 +102,6 @@ def _calibration(root: Path) -> list[Path]:
     if any(file.exists() for file in files):
         return files
     return next(([root / name] for name in _CAMCHAINS if (root / name).is_file()), [])
-
-
-def _named(folder: Path, root: Path, options: Given) -> list[Path]:
-    """The calibration by option, or in the sequence's folder under a usual name."""
-    try:
-        return calibration_files(folder, options)
-    except CalibrationError:
-        if "calibration" in options:
-            raise
-        missing = f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing (nor is there a Kalibr camchain.yaml)"
-        raise CalibrationError(f"{missing}: add calibration=FILE") from None
 
 
 def _ground_truth(root: Path, calibration: list[Path], faults: FaultLog) -> Trajectory | None:

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import SequenceError
 from slam.files import expanded
 from slam.sequences.base import RecordedSequence
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import Given
+from slam.sequences.given import Given, layout_of
 from slam.sequences.images import IMAGE_SUFFIXES
-from slam.sequences.names import of_sides
+from slam.sequences.names import SIDES, of_sides
 from slam.sequences.rigs import calibration_files, read_rig
 from slam.sequences.source import ImagePairs, by_names, image_names, pair_up, read_times, times_file
 from slam.sequences.videos import VIDEO_SUFFIXES, VideoPairs, open_videos
 
-_NAMES = (("left", "right"), ("image_left", "image_right"), ("cam0", "cam1"))
+_NAMES = (*SIDES, ("image_left", "image_right"))
 _TIMES = ("times.txt", "timestamps.txt")
-_LAYOUTS = ("sbs",)
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class _Side:
     names: list[str] | None = None
 
 
-def matches(folder: Path) -> bool:
+def matches_folder(folder: Path) -> bool:
     """Whether a folder holds a left or a right camera by one of the usual names, as folders, videos or images."""
     return any(_by_convention(folder, side) is not None for side in (0, 1))
 
@@ -53,25 +52,19 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
             raise SequenceError(f"{left.path} and {right.path}: one is a video and the other is not")
         if left.names is None:
             source = open_videos(left.path, None if right is None else right.path, options.rate(), faults)
-            size = source.size
         else:
             path = times_file(home, options, *(home / name for name in _TIMES))
             listings = by_names([s.path for s in sides], [s.names or [] for s in sides], faults)
             times = read_times(path, faults)
             _, source = pair_up(listings[0], listings[1] if right else None, options, faults, times)
-            size = source.first_size()
-            source = replace(source, size=size)
-        rig = read_rig(calibration_files(home, options), size, options)
+        rig = read_rig(calibration_files(home, options), source.size, options)
     return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 
 def _sides(folder: Path, options: Given) -> list[_Side]:
     """Both cameras, or the one place where both are side by side."""
-    layout = options.get("layout")
-    if layout is None:
+    if layout_of(options) is None:
         return [_side(folder, side, options) for side in (0, 1)]
-    if layout not in _LAYOUTS:
-        raise ConfigurationError(f"layout must be {' or '.join(_LAYOUTS)} (side by side), got {layout!r}")
     if folder.is_file():
         return [_Side(folder)]
     return [_found(folder / expanded(options["left"]) if "left" in options else _only(folder))]

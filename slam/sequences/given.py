@@ -83,3 +83,15 @@ def flag(options: Mapping[str, str], name: str) -> bool:
     if text not in _YES:
         raise ConfigurationError(f"{name} must be yes or no, got {text!r}")
     return _YES[text]
+
+
+def layout_of(options: Mapping[str, str]) -> str | None:
+    """The option ``layout``; None where it is not given.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    layout = options.get("layout")
+    if layout not in (None, "sbs"):
+        raise ConfigurationError(f"layout must be sbs (side by side), got {layout!r}")
+    return layout

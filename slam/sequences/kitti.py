@@ -1,42 +1,49 @@
-"""KITTI odometry: ``sequences/06`` with ``image_0``, ``image_1``, ``calib.txt``, ``times.txt``; ``poses/06.txt``."""
+"""KITTI's recordings as downloaded: odometry, tracking, raw (synchronised drives) and KITTI-360."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from slam.errors import CalibrationError, SequenceError, TrajectoryError
+from slam.errors import CalibrationError, SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, pose
-from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.geometry.trajectory import TruthNoise
 from slam.sequences.base import RecordedSequence
-from slam.sequences.calibration import (
-    kitti_matrix,
-    naming,
-    projection_offset,
-    read_kitti,
-    rig_from_projections,
-)
+from slam.sequences.calibration import kitti_matrix, naming, projection_offset, read_kitti, rig_from_projections, rigid
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given
-from slam.sequences.images import Size
+from slam.sequences.images import Size, size_text
+from slam.sequences.kitti_truth import Frames, drive_truth, read_gps, read_poses
 from slam.sequences.rigs import calibration_files, read_rig
-from slam.sequences.source import Listing, numbered, pair_up, read_times, times_file
-from slam.sequences.truth import require_truth
+from slam.sequences.source import numbered, pair_up, read_times, times_file
+from slam.sequences.tables import date_time, read_rows
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 2 cm, 0.03° in roll and pitch, and 0.1°
 #: in heading, which changes slowly. That, and how the camera stands to the unit, is left to be found.
 OXTS_NOISE = TruthNoise(rotation=float(np.radians(0.03)), translation=0.02, mounting=float(np.radians(1.0)))
 
+#: Synchronised drives have one of a hundred OXTS records a second for each frame, the nearest one [s].
+_OXTS_TIME = 0.01 / np.sqrt(12)
+
 _PAIRS = (("0", "1"), ("2", "3"))  # grey first, colour where there is no grey
 
 
-class _Layout(NamedTuple):
-    """Where the files of a sequence are: of the images, the calibration and the times; the first that is there of
-    `poses` has the truth. The cameras are numbers.
+class Layout(NamedTuple):
+    """Where the files of a sequence are.
+
+    Attributes:
+        name: of the sequence.
+        left, right: folders of images.
+        cameras: their numbers, as the calibration writes them.
+        calibration: the file, where it is or should be.
+        times: the file, which may be missing.
+        poses: files of poses of the reference camera; the first that is there counts.
+        drive: the folder of a drive of KITTI raw or KITTI-360; None for odometry and tracking.
     """
 
     name: str
@@ -45,33 +52,20 @@ class _Layout(NamedTuple):
     cameras: tuple[str, str]
     calibration: Path
     times: Path
-    poses: tuple[Path, ...]
+    poses: tuple[Path, ...] = ()
+    drive: Path | None = None
 
 
-def matches(folder: Path) -> bool:
+def matches_folder(folder: Path) -> bool:
     """Whether a folder looks like a KITTI odometry sequence, or like the left images of one of KITTI tracking."""
     return any((folder / f"image_{i}").exists() for i in range(4)) or _is_tracking(folder)
 
 
-def _is_tracking(folder: Path) -> bool:
-    """Whether a folder is ``image_02/0000`` with ``image_03/0000`` beside it."""
-    return folder.parent.name == "image_02" and (folder.parent.parent / "image_03" / folder.name).is_dir()
-
-
-def _layout(folder: Path) -> _Layout:
-    """Where the files are, of KITTI odometry or of KITTI tracking."""
-    if not _is_tracking(folder):
-        a, b = choose_pair(folder, _PAIRS)
-        poses = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
-        left, right = (folder / f"image_{camera}" for camera in (a, b))
-        return _Layout(folder.name, left, right, (a, b), folder / "calib.txt", folder / "times.txt", poses)
-    root, name = folder.parent.parent, folder.name
-    calibration = root / "calib" / f"{name}.txt"
-    if not calibration.exists():  # as downloaded: data_tracking_calib/training beside data_tracking_image_2/training
-        others = sorted(root.parent.parent.glob(f"*/{root.name}/calib/{name}.txt"))
-        calibration = others[0] if others else calibration
-    right = root / "image_03" / name
-    return _Layout(name, folder, right, ("2", "3"), calibration, root / f"times_{name}.txt", ())
+def matches_drive(folder: Path) -> bool:
+    """Whether a folder looks like a drive of KITTI raw or KITTI-360; KITTI tracking has folders of sequences there."""
+    cameras = [path for i in range(4) if (path := folder / f"image_{i:02d}").exists()]
+    inside = islice(cameras[0].iterdir(), 10) if cameras and cameras[0].is_dir() else ()
+    return bool(cameras) and not any(path.name.isdecimal() and path.is_dir() for path in inside)
 
 
 def open_folder(folder: Path, options: Given) -> RecordedSequence:
@@ -79,24 +73,74 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
 
     Raises:
         SequenceError: a camera or all its images are missing, or nothing can be paired.
-        CalibrationError: ``calib.txt`` is missing, unreadable or impossible.
+        CalibrationError: the calibration is missing, unreadable or impossible.
     """
+    return _open(folder, _tracking(folder) if _is_tracking(folder) else _odometry(folder), options)
+
+
+def open_drive(folder: Path, options: Given) -> RecordedSequence:
+    """Open one drive of KITTI raw or KITTI-360; stamps count from its first row of times. Raises as `open_folder`."""
+    return _open(folder, _drive(folder), options)
+
+
+def _open(folder: Path, where: Layout, options: Given) -> RecordedSequence:
     warnings: list[str] = []
     with FaultLog(warnings) as faults:
-        where = _layout(folder)
-        left_all, right_all = (numbered(side, faults) for side in (where.left, where.right))
+        listings = [numbered(side, faults) for side in (where.left, where.right)]
         path = times_file(folder, options, where.times)
-        left, source = pair_up(left_all, right_all, options, faults, read_times(path, faults), by_number=True)
-        size = source.first_size()
-        rig, T_reference_left = _rig(folder, where, size, options)
-        poses = next((path for path in where.poses if path.is_file()), None)
-        truth = None if poses is None else read_poses(poses, left, source.stamps, T_reference_left, faults)
+        dated = path is not None and where.drive is not None and "times" not in options
+        origin, times = _dates(path, faults) if path and dated else (None, read_times(path, faults))
+        left, source = pair_up(listings[0], listings[1], options, faults, times, by_number=True)
+        assert source.size is not None
+        rig, T_left_reference = _rig(folder, where, source.size, options)
+        frames, gps = Frames(left.keys, source.stamps, left.folder.parent.name == "image_00"), None
+        if where.drive is None:
+            poses = next((path for path in where.poses if path.is_file()), None)
+            truth = None if poses is None else read_poses(poses, frames, T_left_reference, faults)
+        else:
+            gps = read_gps(where.drive / "ego_gps_m.txt", None if times is None else times[1], faults)
+            truth = drive_truth(where.drive, where.calibration.parent, origin, T_left_reference, frames, faults)
     kind = options.get("kind", "driving")
-    noise = replace(OXTS_NOISE, wheels=kind == "driving")
-    return RecordedSequence(where.name, "kitti", kind, rig, replace(source, size=size), truth, None, warnings, noise)
+    time = 0.0 if where.drive is None or (where.drive / "oxts").is_dir() else _OXTS_TIME
+    noise = replace(OXTS_NOISE, time=time, wheels=kind == "driving")
+    name = "kitti" if where.drive is None else "kitti-raw"
+    return RecordedSequence(where.name, name, kind, rig, source, truth, gps, warnings, noise)
 
 
-def choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
+def _is_tracking(folder: Path) -> bool:
+    """Whether a folder is ``image_02/0000`` with ``image_03/0000`` beside it."""
+    return folder.parent.name == "image_02" and (folder.parent.parent / "image_03" / folder.name).is_dir()
+
+
+def _odometry(folder: Path) -> Layout:
+    a, b = _choose_pair(folder, _PAIRS)
+    poses = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
+    left, right = (folder / f"image_{camera}" for camera in (a, b))
+    return Layout(folder.name, left, right, (a, b), folder / "calib.txt", folder / "times.txt", poses)
+
+
+def _tracking(folder: Path) -> Layout:
+    root, name = folder.parent.parent, folder.name
+    calibration = root / "calib" / f"{name}.txt"
+    if not calibration.exists():  # as downloaded: data_tracking_calib/training beside data_tracking_image_2/training
+        others = sorted(root.parent.parent.glob(f"*/{root.name}/calib/{name}.txt"))
+        calibration = others[0] if others else calibration
+    return Layout(name, folder, root / "image_03" / name, ("2", "3"), calibration, root / f"times_{name}.txt")
+
+
+def _drive(folder: Path) -> Layout:
+    """Of KITTI raw the calibration is in the day's folder, or in the drive's own; of KITTI-360 in ``calibration``."""
+    cameras = _choose_pair(folder, tuple((f"0{a}", f"0{b}") for a, b in _PAIRS))
+    is_360 = (folder / f"image_{cameras[0]}" / "data_rect").exists()
+    left, right = (folder / f"image_{camera}" / ("data_rect" if is_360 else "data") for camera in cameras)
+    raw = [where / "calib_cam_to_cam.txt" for where in (folder.parent, folder)]
+    usual = [where / "calibration" / "perspective.txt" for where in (folder.parent.parent, folder.parent)]
+    usual = [*usual, *raw] if is_360 else [*raw, *usual]
+    calibration = next((path for path in usual if path.exists()), usual[0])
+    return Layout(folder.name, left, right, cameras, calibration, left.parent / "timestamps.txt", drive=folder)
+
+
+def _choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
     """The first pair of cameras of which both folders are there.
 
     Raises:
@@ -115,34 +159,37 @@ def choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, 
     raise SequenceError(f"{folder}: two cameras are needed ({wanted}), {found}")
 
 
-def _rig(folder: Path, where: _Layout, size: Size, options: Given) -> tuple[StereoRig, Array]:
-    """The rig, and the left camera's pose (4, 4) in the frame of reference (camera 0), which the poses are of."""
+def _dates(path: Path, faults: FaultLog) -> tuple[int, tuple[Path, Array]]:
+    """The first row's time [ns since 1970] and the times by frame number (T,) [s] from there on."""
+    rows = read_rows(path, date_time, faults)
+    origin = next(row for row in rows if row is not None)
+    return origin, (path, np.array([np.nan if row is None else (row - origin) * 1e-9 for row in rows]))
+
+
+def _rig(folder: Path, where: Layout, size: Size, options: Given) -> tuple[StereoRig, Array]:
+    """The rig, and the pose (4, 4) of the reference camera 0 (of a drive before rectification) in the left one."""
     named = calibration_files(folder, options) if "calibration" in options else None
-    if named and not where.calibration.exists():
-        return read_rig(named, size, options), np.eye(4)
     if not where.calibration.exists():
-        raise CalibrationError(f"{where.calibration}: the calibration is missing: add calibration=FILE")
+        if named is None:
+            raise CalibrationError(f"{where.calibration}: the calibration is missing: add calibration=FILE")
+        return read_rig(named, size, options), np.eye(4)
+    T: Array = np.eye(4)
     rows = read_kitti(where.calibration)
     with naming(where.calibration):
-        P_left, P_right = (kitti_matrix(rows, f"P{c}", (3, 4)) for c in where.cameras)
-        T_reference_left = pose(np.eye(3), -projection_offset(P_left))
-        rig = read_rig(named, size, options) if named else rig_from_projections(P_left, P_right, size)
-        return rig, T_reference_left
+        name = "P" if where.drive is None else "P_rect_"
+        P_left, P_right = (kitti_matrix(rows, f"{name}{camera}", (3, 4)) for camera in where.cameras)
+        if where.drive is not None:
+            _require_rectified(rows, size, where.cameras[0])
+            T = rigid(pose(kitti_matrix(rows, "R_rect_00", (3, 3)), np.zeros(3)), "R_rect_00")
+        T = pose(np.eye(3), projection_offset(P_left)) @ T
+        return read_rig(named, size, options) if named else rig_from_projections(P_left, P_right, size), T
 
 
-def read_poses(
-    path: Path, left: Listing, stamps: Array, T_reference_left: Array, faults: FaultLog
-) -> Trajectory | None:
-    """Poses of the left camera from rows of 12, one for each frame number; a fault of the file is reported."""
-    try:
-        table = Trajectory.read_kitti(path)
-        inside = left.keys < len(table)
-        if not inside.all():
-            line = f"{path}: {len(table)} poses, {int((~inside).sum())} frames are beyond them"
-            faults.report("ground truth", line)
-        truth = Trajectory(stamps[inside], table.poses[left.keys[inside]])
-        require_truth(truth, path)
-        return Trajectory(truth.stamps, truth.poses @ T_reference_left)
-    except TrajectoryError as error:
-        faults.report("ground truth", f"{error}; there is no ground truth")
-        return None
+def _require_rectified(rows: dict[str, Array], size: Size, camera: str) -> None:
+    """Raise where images are of another size than the rectified ones: perhaps those of an unrectified drive."""
+    expected = kitti_matrix(rows, f"S_rect_{camera}", (2,)).astype(int)
+    if tuple(expected) != size:
+        text = f"images are {size_text(size)}, S_rect_{camera} says {size_text(tuple(expected))}"
+        if tuple(rows.get(f"S_{camera}", ())) == size:
+            text += ": this is an unrectified (extract) drive, take the rectified (sync) one"
+        raise CalibrationError(text)

@@ -16,7 +16,9 @@ MOST_FRAMES = 10**12
 _SHORTEST = 10**6  # [ns] between frames: no camera is faster, and no count of frames has such steps
 _LONGEST = 10**11  # [ns] between frames: a hundred seconds
 _FIRST = 10**8  # [s] since 1970 of a stamp with a fraction in a longer name: the year 1973
-_SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("l", "r"))
+
+#: Words for the left and the right camera, in names of folders, videos and topics.
+SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"))
 
 _DATE = re.compile(
     r"(?<!\d)(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_T ]?([0-2]\d)[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)"
@@ -46,7 +48,7 @@ def same_order(sides: Sequence[Sequence[str]]) -> bool:
 
 def of_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
     """The left and the right images of one folder by words such as left and right in their names; None for neither."""
-    for words in _SIDES:
+    for words in (*SIDES, ("l", "r")):
         ends = (rf"(?<![a-z]){word}(?![{'0-9' if word[-1].isdigit() else 'a-z'}])" for word in words)
         left, right = ([n for n in names if re.search(end, stem(n), re.IGNORECASE)] for end in ends)
         if left and right and not set(left) & set(right):

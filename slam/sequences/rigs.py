@@ -106,12 +106,13 @@ def metres_per_unit(options: Mapping[str, str]) -> float:
     return _UNITS[unit]
 
 
-def calibration_files(folder: Path, options: Mapping[str, str]) -> list[Path]:
+def calibration_files(folder: Path, options: Mapping[str, str], missing: str = "") -> list[Path]:
     """The file, or the two files, by the option ``calibration`` (names joined by a comma) or under usual names.
 
     Args:
         folder: of the sequence, or of the file that it is; of a camera the working folder. Names are relative to it.
         options: those that are given.
+        missing: what is said where there is none.
 
     Raises:
         CalibrationError: there is none.
@@ -124,7 +125,8 @@ def calibration_files(folder: Path, options: Mapping[str, str]) -> list[Path]:
         return files
     found = _usual(folder, (*((name,) for name in _ONE_FILE), *_TWO_FILES))
     if not found:
-        raise CalibrationError(f"{folder}: the calibration is missing: calibration.yaml, or add calibration=FILE")
+        missing = missing or f"{folder}: the calibration is missing: calibration.yaml, or add calibration=FILE"
+        raise CalibrationError(missing)
     return found
 
 

@@ -5,30 +5,26 @@ They are read by the package rosbags (``pip install 'surf-stereo-slam[ros]'``), 
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Generator, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Generator
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
 from slam.sequences import rigs
-from slam.sequences.base import RecordedSequence, delivered
+from slam.sequences.base import Images, RecordedSequence
 from slam.sequences.calibration import naming
-from slam.sequences.camera_info import rig_from_camera_infos
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given, flag
-from slam.sequences.images import Size
-from slam.sequences.ros_images import grey_image, naming_recording
-from slam.sequences.ros_topics import Topics, choose_topics
+from slam.sequences.images import Size, halved
+from slam.sequences.ros_bag import Bag, naming_recording, open_bag
+from slam.sequences.ros_topics import Topics, choose_topics, rig_from_camera_infos
 from slam.sequences.source import Listing, hardware_tolerance, in_order, in_seconds, pair_listings, require_size
 
 #: Options besides ``kind``.
@@ -43,7 +39,7 @@ _LATE = 10  # messages in a row that are out of order; more, or the last ones, a
 _LATEST = 10**9  # [ns] that a message is late; more is a wrong stamp, or the clock
 
 
-def matches(path: Path) -> bool:
+def matches_folder(path: Path) -> bool:
     """Whether a path is a ROS recording by its ending or, for a folder, by its ``metadata.yaml``."""
     if not path.is_dir():
         return path.name.lower().endswith(SUFFIXES) and path.is_file()
@@ -65,17 +61,19 @@ def open_folder(path: Path, options: Given) -> RecordedSequence:
     with FaultLog(warnings) as faults:
         with open_bag(path) as bag:
             topics = choose_topics(bag, options)
-            left_all, right_all = (_listing(bag, topic, faults) for topic in (topics.left, topics.right))
+            messages = [_listing(bag, topic, faults) for topic in dict.fromkeys((topics.left, topics.right))]
             size = _first_size(bag, topics.left)
-        ordered = _in_time((left_all, right_all), faults)
-        told = options.tolerance()
-        tolerance = hardware_tolerance(ordered[0]) if told is None else told
-        left, partners = pair_listings(ordered[0], ordered[1], tolerance, faults)
+        left, *right = _in_time(messages, faults)
+        partners: list[str | None] = [None] * len(left)
+        if right:
+            told = options.tolerance()
+            tolerance = hardware_tolerance(left) if told is None else told
+            left, partners = pair_listings(left, right[0], tolerance, faults)
         left, partners, stamps = in_seconds(left, partners, faults)
-        rig = _rig(path, topics, size, options)
+        rig = _rig(path, topics, size if right else halved(size, topics.left), options)
     rows = np.array([int(name) for name in left.names])
     right_rows = np.array([-1 if name is None else int(name) for name in partners])
-    source = RosPairs(stamps, path, left_all, right_all, rows, right_rows, size)
+    source = RosPairs(stamps, path, messages[0], messages[-1], rows, right_rows, size)
     return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 
@@ -100,10 +98,10 @@ class RosPairs:
     Attributes:
         stamps: times (N,) [s], strictly increasing.
         path: of the recording.
-        left, right: the messages of the topics.
+        left, right: the messages of the topics; the same of images that are side by side in one.
         left_rows: which of them are the frames (N,).
         right_rows: the same for the right images, -1 where there is none (N,).
-        size: width and height that every image must have.
+        size: width and height that every message's image must have.
     """
 
     stamps: Array
@@ -114,19 +112,20 @@ class RosPairs:
     right_rows: IntArray
     size: Size
 
-    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
-        """Decode frames `start` to `stop`; a damaged left image costs its frame, a right one itself."""
+    @property
+    def halves(self) -> bool:
+        """Both images are in one topic."""
+        return self.right is self.left
+
+    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
+        """Decode the images of frames `start` to `stop`; an error in place of one that is damaged."""
         right_rows = self.right_rows[start:stop]
         with ExitStack() as stack:
             bags = [stack.enter_context(open_bag(self.path)) for _ in range(2)]  # each goes its own way through it
             left = stack.enter_context(closing(self._images(bags[0], self.left, self.left_rows[start:stop])))
             right = stack.enter_context(closing(self._images(bags[1], self.right, right_rows[right_rows >= 0])))
-            for index, right_row in zip(range(start, stop), right_rows.tolist()):
-                image = next(left, None)
-                partner = next(right, None) if right_row >= 0 else None
-                if image is None:
-                    return
-                yield from delivered(index, float(self.stamps[index]), image, partner, faults)
+            for image, right_row in zip(left, right_rows.tolist()):
+                yield image, next(right, None) if right_row >= 0 else None
 
     def _images(
         self, bag: Bag, messages: Messages, rows: IntArray
@@ -152,78 +151,7 @@ class RosPairs:
                 return
 
 
-class Bag:
-    """An open recording, whatever its kind; every fault of it is a `SequenceError` with its name."""
-
-    def __init__(self, path: Path, reader: Any) -> None:
-        self.path, self._reader = path, reader
-        self.kinds: dict[str, str] = {connection.topic: connection.msgtype for connection in reader.connections}
-
-    def messages(self, topics: list[str], since: int | None = None) -> Generator[tuple[int, str, bytes], None, None]:
-        """Time of recording [ns], type and bytes of all messages of some topics, from a time on."""
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        messages = iter(self._reader.messages(connections, start=since)) if connections else iter(())
-        while True:
-            with naming_recording(self.path):
-                found = next(messages, None)
-            if found is None:
-                return
-            yield int(found[1]), found[0].msgtype, found[2]
-
-    def message(self, raw: bytes, kind: str) -> Any:
-        """A message of its bytes."""
-        with naming_recording(self.path):
-            return self._reader.deserialize(raw, kind)
-
-    def image(self, raw: bytes, kind: str, what: str, size: Size | None = None) -> np.ndarray:
-        """The image (H, W) of a message's bytes, see `grey_image`."""
-        with naming_recording(self.path):
-            return grey_image(self._reader.deserialize(raw, kind), kind, what, size)
-
-    def first(self, topic: str) -> Any:
-        """The first message of a topic; None where there is none."""
-        with closing(self.messages([topic])) as messages:
-            found = next(messages, None)
-        return None if found is None else self.message(found[2], found[1])
-
-
-@contextmanager
-def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a recording, and close it in the end.
-
-    Raises:
-        SequenceError: rosbags is not installed, or the recording cannot be read.
-    """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise SequenceError(
-            f"{path}: ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
-        ) from None
-    with ExitStack() as stack:
-        with naming_recording(path):
-            if path.name.lower().endswith(".zstd"):
-                path = _unpacked(path, Path(stack.enter_context(TemporaryDirectory())))
-            reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            stack.enter_context(reader)
-            bag = Bag(path, reader)
-        yield bag
-
-
-def _unpacked(path: Path, folder: Path) -> Path:
-    """A compressed file, decompressed into a folder, by what rosbags does it with."""
-    try:
-        from compression import zstd  # type: ignore[import-not-found, unused-ignore]
-    except ImportError:
-        from backports import zstd
-    target = folder / path.stem
-    with zstd.open(path, "rb") as packed, target.open("wb") as file:
-        shutil.copyfileobj(packed, file)
-    return target
-
-
-def _in_time(topics: tuple[Messages, Messages], faults: FaultLog) -> list[Listing]:
+def _in_time(topics: list[Messages], faults: FaultLog) -> list[Listing]:
     """The messages of both topics in order of time; the names are their rows.
 
     Messages out of order are sorted. Where a clock was set back, time goes on as the recording's own clock did, by

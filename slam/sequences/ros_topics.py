@@ -1,33 +1,85 @@
-"""Which topics of a ROS recording are the two cameras of a stereo rig."""
+"""Which topics of a ROS recording are the two cameras of a stereo rig, and the rig by their CameraInfo messages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.naming import suggestion
-from slam.sequences.calibration import naming
-from slam.sequences.camera_info import CameraInfo
-from slam.sequences.ros_images import COMPRESSED, DEPTH, RAW, naming_recording
+from slam.sequences.calibration import array, naming
+from slam.sequences.calibration_keys import Entries, rig_of
+from slam.sequences.given import layout_of
+from slam.sequences.names import SIDES
+from slam.sequences.ros_bag import COMPRESSED, DEPTH, RAW, Bag, naming_recording
 
 _INFO = "sensor_msgs/msg/CameraInfo"
-_NAMES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"))
 _SAME_PLACE = 1e-6  # [m] from a pair's left camera
 _LISTED = 12  # topics named in a message
 
 
-class Recording(Protocol):
-    """What is asked of a recording."""
+@dataclass(frozen=True, eq=False)
+class CameraInfo:
+    """A CameraInfo message of ROS 1 or 2.
 
-    path: Path
-    kinds: dict[str, str]
+    Attributes:
+        size: width and height [px].
+        model: name of the distortion model.
+        K: camera matrix (3, 3) of the raw image.
+        D: its distortion coefficients.
+        R: rotation (3, 3) from raw to rectified camera axes.
+        P: projection (3, 4) of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair.
+    """
 
-    def first(self, topic: str) -> Any:
-        """The first message of a topic; None where there is none."""
-        ...
+    size: tuple[int, int]
+    model: str
+    K: Array
+    D: Array
+    R: Array
+    P: Array
+
+    @classmethod
+    def of(cls, message: Any) -> CameraInfo:
+        """A message as it was read; ROS 1 writes its matrices in capitals.
+
+        Raises:
+            CalibrationError: it holds what no calibration holds, or only a part of the image is given.
+        """
+        shapes = {"K": (3, 3), "D": None, "R": (3, 3), "P": (3, 4)}
+        matrices = {n: array(getattr(message, n, getattr(message, n.lower(), None)), n, s) for n, s in shapes.items()}
+        size = int(message.width), int(message.height)
+        roi = int(message.roi.width), int(message.roi.height)
+        if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):
+            raise CalibrationError("binning and regions of interest are not supported")
+        return cls(size, str(message.distortion_model), **matrices)
+
+    @property
+    def baseline_term(self) -> float:
+        """``-P[0, 3] / P[0, 0]``: how far the camera stands to the right of the pair's left one [m]; NaN for no P."""
+        return float(-self.P[0, 3] / self.P[0, 0]) if self.P[0, 0] > 0 else float("nan")
+
+
+def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool, unit: float = 1.0) -> StereoRig:
+    """The rig of the rectified or of the raw images; the baseline in ``P`` is in units of so many metres.
+
+    Raises:
+        CalibrationError: a camera is not calibrated, or not as one of a pair; or the rig is impossible.
+    """
+    for side, info in (("left", left), ("right", right)):
+        if not (info.P[0, 0] > 0 and info.K[0, 0] > 0):
+            raise CalibrationError(f"the {side} camera is not calibrated: K or P is zero")
+    if left.size != right.size:
+        raise CalibrationError("the images of the two cameras differ in size")
+    names = "cameramatrix", "distcoeffs", "rectificationmatrix", "projectionmatrix", "distortionmodel", "size"
+    files = [
+        {name: (name, value) for name, value in zip(names, (i.K, i.D, i.R, i.P, i.model, i.size))}
+        for i in (left, right)
+    ]
+    return rig_of(Entries(files), left.size, unit, rectified, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +87,7 @@ class Topics:
     """The topics of a stereo rig.
 
     Attributes:
-        left, right: of the images.
+        left, right: of the images; the same where they are side by side.
         left_info, right_info: the cameras' calibrations; None where a file is named in their place.
         info_names: the topics of these.
     """
@@ -52,7 +104,7 @@ class Topics:
         return all("rect" in _base(topic).rpartition("/")[2] for topic in (self.left, self.right))
 
 
-def choose_topics(recording: Recording, options: Mapping[str, str]) -> Topics:
+def choose_topics(recording: Bag, options: Mapping[str, str]) -> Topics:
     """The topics by the options ``left``, ``right``, ``left_info``, ``right_info``; without them those of a pair.
 
     A pair are two cameras whose messages say so: the same size and focal length of the rectified images, and a baseline
@@ -63,6 +115,8 @@ def choose_topics(recording: Recording, options: Mapping[str, str]) -> Topics:
         CalibrationError: there is no calibration.
         ConfigurationError: one of the two images is named and the other is not.
     """
+    if layout_of(options) is not None:
+        return _both_in_one(recording, options)
     if ("left" in options) != ("right" in options):
         raise ConfigurationError("name both topics: left=/…&right=/…")
     if "left" in options:
@@ -73,7 +127,17 @@ def choose_topics(recording: Recording, options: Mapping[str, str]) -> Topics:
     return _one(list(_pairs_by_messages(recording)), recording)
 
 
-def _with_infos(recording: Recording, left: str, right: str, options: Mapping[str, str]) -> Topics:
+def _both_in_one(recording: Bag, options: Mapping[str, str]) -> Topics:
+    """The topic whose images hold both cameras side by side: the one that is named, or the only one."""
+    images = [topic for topic in _of_kind(recording, (RAW, COMPRESSED)) if not _is_depth(recording, topic)]
+    if "left" not in options and len(images) != 1:
+        there = f"{len(images)} topics of images, where layout=sbs needs one"
+        raise SequenceError(f"{recording.path}: {there}: add left=/… of {_listed(images)}")
+    topic = _named(recording, options["left"], (RAW, COMPRESSED)) if "left" in options else images[0]
+    return Topics(topic, topic) if "calibration" in options else _with_infos(recording, topic, topic, options)
+
+
+def _with_infos(recording: Bag, left: str, right: str, options: Mapping[str, str]) -> Topics:
     """Named images with their cameras' messages, named or in the same name space."""
     names = []
     for side, topic in (("left", left), ("right", right)):
@@ -91,7 +155,7 @@ def _with_infos(recording: Recording, left: str, right: str, options: Mapping[st
     return Topics(left, right, infos[0], infos[1], " and ".join(names))
 
 
-def _pairs_by_messages(recording: Recording) -> Iterator[Topics]:
+def _pairs_by_messages(recording: Bag) -> Iterator[Topics]:
     """All pairs of cameras that say that they are one."""
     cameras = []
     for name in _of_kind(recording, (_INFO,)):
@@ -106,12 +170,12 @@ def _pairs_by_messages(recording: Recording) -> Iterator[Topics]:
                 yield Topics(left, right, a, b, f"{left_name} and {right_name}")
 
 
-def _pairs_by_name(recording: Recording) -> list[tuple[str, str]]:
+def _pairs_by_name(recording: Bag) -> list[tuple[str, str]]:
     """Pairs of topics of images that differ in one of the usual names for left and right, one of each two cameras."""
     images = sorted(_of_kind(recording, (RAW, COMPRESSED)), key=_preference(recording))
     found: dict[tuple[str, str], tuple[str, str]] = {}
     for topic in images:
-        for names in _NAMES:
+        for names in SIDES:
             other = topic.replace(*names)
             if other != topic and other in images and not _is_depth(recording, topic):
                 spaces = _space(topic), _space(other)
@@ -119,7 +183,7 @@ def _pairs_by_name(recording: Recording) -> list[tuple[str, str]]:
     return list(found.values())
 
 
-def _one(pairs: list[Topics], recording: Recording) -> Topics:
+def _one(pairs: list[Topics], recording: Bag) -> Topics:
     """The only pair.
 
     Raises:
@@ -139,7 +203,7 @@ def _one(pairs: list[Topics], recording: Recording) -> Topics:
     )
 
 
-def _named(recording: Recording, topic: str, kinds: tuple[str, ...]) -> str:
+def _named(recording: Bag, topic: str, kinds: tuple[str, ...]) -> str:
     """A topic that must be there, and of one of these types."""
     known = _of_kind(recording, kinds)
     if topic not in known:
@@ -149,7 +213,7 @@ def _named(recording: Recording, topic: str, kinds: tuple[str, ...]) -> str:
     return topic
 
 
-def _info(recording: Recording, topic: str) -> CameraInfo:
+def _info(recording: Bag, topic: str) -> CameraInfo:
     message = recording.first(topic)
     if message is None:
         raise CalibrationError(f"{recording.path}: topic {topic} has no messages")
@@ -157,11 +221,11 @@ def _info(recording: Recording, topic: str) -> CameraInfo:
         return CameraInfo.of(message)
 
 
-def _of_kind(recording: Recording, kinds: tuple[str, ...]) -> list[str]:
+def _of_kind(recording: Bag, kinds: tuple[str, ...]) -> list[str]:
     return sorted(topic for topic, kind in recording.kinds.items() if kind in kinds)
 
 
-def _is_depth(recording: Recording, topic: str) -> bool:
+def _is_depth(recording: Bag, topic: str) -> bool:
     """Whether a topic holds depth images, or nothing."""
     message = recording.first(topic)
     if message is None or recording.kinds[topic] == COMPRESSED:
@@ -170,7 +234,7 @@ def _is_depth(recording: Recording, topic: str) -> bool:
         return message.encoding in DEPTH
 
 
-def _preference(recording: Recording) -> Any:
+def _preference(recording: Bag) -> Any:
     """The order in which a camera's topics are chosen: rectified, raw before compressed, grey before colour."""
 
     def key(topic: str) -> tuple[bool, bool, bool, str]:

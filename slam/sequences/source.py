@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.files import expanded, note_input
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
-from slam.sequences.base import delivered
+from slam.sequences.base import Images
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import WIDEST_TOLERANCE, Given
-from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, size_text
+from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, require_same_size, size_text
 from slam.sequences.names import MOST_FRAMES, keys_of, natural, same_order, stem
 from slam.sequences.tables import read_rows, seconds
 
@@ -74,18 +72,11 @@ class ImagePairs:
     size: Size | None = None
     halves: bool = False
 
-    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
-        """Decode frames `start` to `stop`.
-
-        A frame whose left image is unreadable or of another size is skipped; one whose right image is, is given
-        without it.
-        """
-        for index in range(start, stop):
-            left, name = self._read_one(self.left_folder / self.left[index]), self.right[index]
-            right = None if self.halves or name is None else self._read_one(self.right_folder / name)
-            if self.halves and isinstance(left, np.ndarray):
-                left, right = halves(left, self.left[index])
-            yield from delivered(index, float(self.stamps[index]), left, right, faults)
+    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
+        """Decode the images of frames `start` to `stop`; an error in place of one that is unreadable."""
+        for name, partner in zip(self.left[start:stop], self.right[start:stop]):
+            right = None if self.halves or partner is None else self._read_one(self.right_folder / partner)
+            yield self._read_one(self.left_folder / name), right
 
     def _read_one(self, path: Path) -> np.ndarray | SequenceError:
         size = self.size
@@ -111,9 +102,7 @@ class ImagePairs:
             except SequenceError as error:
                 reason = str(error)
                 continue
-            if left.shape != right.shape:
-                sizes = f"{left_path} is {size_text(left.shape[::-1])}, {right_path} is {size_text(right.shape[::-1])}"
-                raise SequenceError(f"left and right images differ in size: {sizes}")
+            require_same_size(left.shape[::-1], right.shape[::-1], left_path, right_path)
             return left.shape[1], left.shape[0]
         raise SequenceError(f"{self.left_folder}: no pair of images can be read: {reason}")
 
@@ -240,7 +229,7 @@ def pair_up(
         The left images that are left, and the pairs.
 
     Raises:
-        SequenceError: nothing pairs, or hardly a frame has a time.
+        SequenceError: nothing pairs, hardly a frame has a time, or no pair can be read.
     """
     rate = None if times else options.rate()
     kept, partners = left, list[str | None](left.names)
@@ -263,7 +252,8 @@ def pair_up(
         if rate is None:
             faults.assume(f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
         stamps = numbers / (rate or RATE)
-    return kept, ImagePairs(stamps, left.folder, kept.names, (right or left).folder, partners, halves=right is None)
+    pairs = ImagePairs(stamps, left.folder, kept.names, (right or left).folder, partners, halves=right is None)
+    return kept, replace(pairs, size=pairs.first_size())
 
 
 def in_seconds(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -11,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import StereoFrame
 from slam.errors import SequenceError
 from slam.files import require_content
 from slam.geometry.se3 import Array
+from slam.sequences.base import Images
+from slam.sequences.devices import quiet_libraries, read_image
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import FASTEST, SLOWEST
-from slam.sequences.images import MOST_PIXELS, Size, halves
-from slam.sequences.quiet import quiet_libraries
+from slam.sequences.images import MOST_PIXELS, Size, halved, require_same_size
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -41,7 +40,12 @@ class VideoPairs:
     right: Path | None
     size: Size
 
-    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
+    @property
+    def halves(self) -> bool:
+        """Both images are in the left file."""
+        return self.right is None
+
+    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode frames `start` to `stop`, in grey; a video that ends too early ends the sequence with a line.
 
         A video cannot be entered in the middle without errors, so what is skipped is passed over, though not
@@ -55,15 +59,13 @@ class VideoPairs:
                     for video in videos:
                         video.grab()
             for index in range(start, stop):
-                images = [_next_grey(video) for video in videos]
+                images = [read_image(video) if video.grab() else None for video in videos]
                 for path, image in zip(paths, images):
                     if image is None:
                         faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
-                there = [image for image in images if image is not None]
-                if len(there) < len(images):
+                if any(image is None for image in images):
                     return
-                left, right = there if len(there) == 2 else halves(there[0], str(self.left))
-                yield StereoFrame(index, float(self.stamps[index]), left, right)
+                yield images[0], images[1] if len(images) > 1 else None
 
 
 def open_videos(left: Path, right: Path | None, rate: float | None, faults: FaultLog) -> VideoPairs:
@@ -75,14 +77,10 @@ def open_videos(left: Path, right: Path | None, rate: float | None, faults: Faul
     (count_left, rate_left, size_left) = _describe(left)
     count_right, size_right = count_left, size_left
     if right is None:
-        size_left = size_right = halves(np.empty(size_left[::-1], bool), str(left))[0].shape[::-1]
+        size_left = size_right = halved(size_left, str(left))
     else:
         count_right, _, size_right = _describe(right)
-    if size_left != size_right:
-        raise SequenceError(
-            f"left and right images differ in size: {left} is {size_left[0]}x{size_left[1]}, "
-            f"{right} is {size_right[0]}x{size_right[1]}"
-        )
+    require_same_size(size_left, size_right, left, right)
     if count_left != count_right:
         line = f"{left} has {count_left} frames, {right} has {count_right}: the surplus is left out"
         faults.report("videos", line)
@@ -102,7 +100,6 @@ def open_video(path: Path) -> Iterator[Any]:
     import cv2
 
     require_content(path)  # a pipe would be waited for
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # faults are reported by us, once
     with quiet_libraries():
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # others take a name for a pattern
     try:
@@ -123,7 +120,7 @@ def _describe(path: Path) -> tuple[int, float, Size]:
     with open_video(path) as video:
         claimed, rate = video.get(cv2.CAP_PROP_FRAME_COUNT), float(video.get(cv2.CAP_PROP_FPS))
         count = int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 0
-        first = _next_grey(video)
+        first = read_image(video) if video.grab() else None
         if first is None:
             raise SequenceError(f"{path}: no frame of the video can be decoded")
         if count <= 0:
@@ -132,17 +129,3 @@ def _describe(path: Path) -> tuple[int, float, Size]:
                 while count < _MOST_FRAMES and video.grab():
                     count += 1
     return count, rate, (first.shape[1], first.shape[0])
-
-
-def _next_grey(video: Any) -> np.ndarray | None:
-    """The next frame in grey (H, W) uint8; None at the end or where it cannot be decoded."""
-    import cv2
-
-    try:
-        with quiet_libraries():
-            good, image = video.read()
-    except cv2.error:
-        return None
-    if not good or image is None:
-        return None
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))

@@ -21,7 +21,7 @@ from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import Matches, follow, match_everywhere
 from slam.tracks.informative import most_informative
 from slam.tracks.standing import Standing
-from slam.tracks.state import NO_POSE, TrackingState
+from slam.tracks.state import NO_POSE, PoseHypotheses, TrackingState
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import similar_view
 
@@ -125,7 +125,8 @@ class Localizer:
                     at, witnessed = standing.T_world_left, standing.witnessed(features)
                     found = self.match_around(at, prediction, landmarks, positions, witnessed, seed)
                     found = replace(found, rows=standing.witnesses[found.rows])
-                return found, tracking, standing
+                if len(found) or standing.holds(tracking.lost):
+                    return found, tracking, standing
         found, tracking = self.localize(prediction, landmarks, positions, features, tracking, seed, elsewhere)
         return found, tracking, standing
 
@@ -157,13 +158,18 @@ class Localizer:
                 return matches, replace(tracking, doubted=NO_POSE)
             if jump(prediction, T) <= farthest:
                 matches = self.match_around(T, *here)
+        carried = tracking.carried(T)
+        if carried:  # two, so that the place does not count as unknown: it is what hides the view
+            none = replace(LandmarkMatches.nothing(), doubted=len(matches))
+            return none, replace(tracking, doubted=PoseHypotheses(2, features.stamp, T))
+        hidden_at = tracking.hidden_at if carried is None else None
         allowed = jump(prediction, T) <= farthest
         if not allowed and tracking.believed.after(T, features.stamp, self._models).count > 1:
             around = self.match_around(T, *here)
             allowed = self._most_agree(around, landmarks, positions, features)
             matches = around if allowed else matches
         if allowed and len(matches):
-            return matches, tracking.believing(T, features.stamp)
+            return matches, tracking.believing(T, features.stamp, hidden_at)
         doubted = tracking.doubted.after(T, features.stamp, self._models)
         if doubted.count < self.config.kidnapped_after:
             return replace(LandmarkMatches.nothing(), doubted=len(matches)), replace(tracking, doubted=doubted)
@@ -199,6 +205,7 @@ class Localizer:
         features: StereoFeatures,
         matches: LandmarkMatches,
         report: UpdateReport,
+        stands: bool,
     ) -> TrackingState:
         """The tracking state after a frame, by whether its pose was measured.
 
@@ -210,7 +217,7 @@ class Localizer:
         measured = len(report.used) >= least and 2 * len(report.used) >= len(matches)
         uncertain = median_deviation(prediction) > self.config.tight_window
         enough = 0 if tracking.doubted.count > 1 else int(features.has_stereo.sum())
-        return tracking.after(measured, uncertain, enough, self._lost_after)
+        return tracking.after(measured, stands, uncertain, enough, self._lost_after)
 
     def match(
         self,

@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from importlib import import_module
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -23,12 +21,11 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
 from slam.naming import unknown
 from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
+from slam.worlds.scenes import SCENES, Scene, build
 from slam.worlds.sequence import WorldSequence
 from slam.worlds.world import World
 
 __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world", "options"]
-
-_NAMES = ("aisle", "box", "boxes", "desk", "drive", "field", "people", "startup", "street", "town")
 
 #: Options that change the world itself; the others only change how it is recorded.
 _RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"} | {
@@ -40,7 +37,7 @@ _RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"densit
 
 def names() -> list[str]:
     """The built-in worlds."""
-    return list(_NAMES)
+    return list(SCENES)
 
 
 def open_world(text: str) -> WorldSequence:
@@ -72,7 +69,7 @@ def _true_rig(told: StereoRig, values: Mapping[str, Any]) -> StereoRig:
 def options(name: str) -> dict[str, Option]:
     """All options of a world by name; raises UnknownNameError."""
     scene = _scene(name)
-    return option_table(scene.OPTIONS, scene.DEFAULTS)
+    return option_table(scene.options, scene.defaults)
 
 
 def describe(name: str) -> str:
@@ -83,23 +80,22 @@ def describe(name: str) -> str:
     """
     scene = _scene(name)
     table = options(name)
-    own = [o.name for o in scene.OPTIONS]
-    changed = [o for o in scene.DEFAULTS if o not in own]
-    return "\n".join([f"{name}: {scene.TEXT}", *(_line(table[key]) for key in (*own, *changed))])
+    own = [o.name for o in scene.options]
+    changed = [o for o in scene.defaults if o not in own]
+    return "\n".join([f"{name}: {scene.text}", *(_line(table[key]) for key in (*own, *changed))])
 
 
-def _scene(name: str) -> ModuleType:
-    """The module of a world."""
-    if name not in _NAMES:
-        raise UnknownNameError(unknown("world", name, _NAMES))
-    return import_module(f"slam.worlds.scenes.{name}")
+def _scene(name: str) -> Scene:
+    """A built-in world."""
+    if name not in SCENES:
+        raise UnknownNameError(unknown("world", name, tuple(SCENES)))
+    return SCENES[name]
 
 
 @lru_cache(maxsize=8)
 def _build(name: str, key: tuple[tuple[str, Any], ...]) -> World:
     """A world, kept for the next recording of it: Monte-Carlo runs differ in `seed` alone."""
-    world: World = _scene(name).build(dict(key))
-    return world
+    return build(name, dict(key))
 
 
 def describe_common() -> str:

@@ -1,4 +1,4 @@
-"""Paths to drive along: read from a file, sampled at a frame rate, levelled, and what of them is new road."""
+"""Drives along any path: read from a file, levelled, sampled at a frame rate, and what of them is new road."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from slam.errors import SequenceError, TrajectoryError
 from slam.files import expanded, read_text
 from slam.geometry.se3 import Array, pose
 from slam.geometry.trajectory import Trajectory
+from slam.worlds.paths import camera_poses, sway
 
 STEP = 0.5  #: distance between samples of a road [m]
 SAME_ROAD = 5.0  #: a later drive within this distance of a road's middle runs along that road [m]
-
 _FILE_RATE = 10.0  # of paths without stamps, KITTI's [Hz]
 _SHORTEST, _LONGEST = 10.0, 100_000.0  # of a path [m]
 _LONGEST_STEP = 50.0  # from one pose to the next [m]
@@ -169,3 +169,55 @@ def _new_road(xy: Array, way: Array) -> BoolArray:
         others = np.array(rows)
         new[i] = not (new[others] & (way[others] < way[i] - _TURNED)).any()
     return new
+
+
+PACE = 8.0  #: driving speed of the built-in drive [m/s]
+#: Where its streets meet [m]: once around both blocks, on around the first one, and back.
+CORNERS = (
+    (0, -20), (0, 110), (180, 110), (180, 0), (0, 0), (0, 110), (90, 110), (90, 0), (180, 0), (180, 110), (60, 110)
+)  # fmt: skip
+EYE = 1.65  #: height of the camera above the ground [m]
+_LANE = 1.5  # from the middle of a street to the right [m]
+_ROUND = 8.0  # standard deviation of the filter that rounds the corners [m]: their radius is 7 m
+_SIDEWAYS = 2.0  # greatest acceleration in a bend [m/s²]
+_STEP = 0.1  # [m]
+
+
+def around_blocks(layout: int) -> Trajectory:
+    """The built-in drive around the blocks of a town, at the usual pace."""
+    way = _way()
+    heading = np.gradient(way, _STEP, axis=0)
+    yaw = np.unwrap(np.arctan2(-heading[:, 0], heading[:, 1]))
+    bend = np.abs(np.gradient(yaw, _STEP))
+    pace = np.minimum(PACE, np.sqrt(_SIDEWAYS / np.maximum(bend, 1e-9)))
+    pace = gaussian_filter1d(pace, 6.0 / _STEP, mode="nearest")
+    stamps = np.concatenate([[0.0], np.cumsum(2 * _STEP / (pace[1:] + pace[:-1]))])
+    rng = np.random.default_rng([layout, 47])
+    aside = 0.15 * sway(stamps, rng, 0.03, 0.15)
+    across = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    height = EYE + 0.01 * sway(stamps, rng, 0.8, 2)
+    positions = np.column_stack([way + aside[:, None] * across, height])
+    pitch, roll = 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2)
+    return Trajectory(stamps, camera_poses(positions, yaw, pitch, roll))
+
+
+def _way() -> Array:
+    """Places (N, 2) [m] along the drive in equal steps: in the right lane, with rounded corners."""
+    corners = _in_lane(np.array(CORNERS, float))
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    fine = np.arange(0.0, length[-1], _STEP)
+    polygon = np.stack([np.interp(fine, length, x) for x in corners.T], axis=1)
+    smooth = gaussian_filter1d(polygon, _ROUND / _STEP, axis=0, mode="nearest")
+    run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
+    even = np.arange(2 * _ROUND, run[-1] - 2 * _ROUND, _STEP)
+    return np.stack([np.interp(even, run, x) for x in smooth.T], axis=1)
+
+
+def _in_lane(corners: Array) -> Array:
+    """Corners (N, 2) of a polygon, moved to the right of both streets that meet in each."""
+    ahead = np.diff(corners, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    right = _LANE * np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
+    straight = (ahead[1:] * ahead[:-1]).sum(axis=1) > 0.9
+    middle = np.where(straight[:, None], right[1:], right[1:] + right[:-1])
+    return corners + np.concatenate([right[:1], middle, right[-1:]])

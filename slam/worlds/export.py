@@ -15,7 +15,7 @@ from slam.errors import SequenceError
 from slam.files import write_png
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.euler import angles
-from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.se3 import Array, inverse
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.sequence import WorldSequence
@@ -25,6 +25,7 @@ DEPTH_STEPS = {"handheld": 2000, "driving": 256}
 
 #: Folder in which a recording is written.
 FOLDER = "mav0"
+_IMAGES = ("cam0", "cam1", "depth0", "objects0")
 
 OBJECT_COLUMNS = (
     "stamp", "id", "x", "y", "z", "roll", "pitch", "yaw",
@@ -86,16 +87,21 @@ def _write(
     _write_table(root / "landmarks.csv", ("id", "x", "y", "z", "object", "size"), _landmark_rows(sequence, frames[0]))
     (root / "world.txt").write_text(f"synthetic:{sequence.name}\n", encoding="utf-8")
     with ExitStack() as stack:
-        lists = {name: _ImageList(root / name, stack) for name in _folders(truth_images)}
+        lists = [_ImageList(root / name, stack) for name in _IMAGES[: 4 if truth_images else 2]]
         for done, k in enumerate(frames, start=1):
-            _write_images(sequence, k, lists, steps, truth_images)
+            frame = sequence.frame(k)
+            images = [frame.left, frame.right]
+            if truth_images:
+                depth = np.rint(sequence.depth(k) * steps)
+                images += [
+                    np.where(depth < 65536, depth, 0).astype(np.uint16),
+                    sequence.object_ids(k).astype(np.uint16),
+                ]
+            for folder, image in zip(lists, images):
+                if image is not None:
+                    folder.add(round(frame.stamp * 1e9), image)
             if progress is not None:
                 progress(done)
-
-
-def _folders(truth_images: bool) -> tuple[str, ...]:
-    """Folders of images."""
-    return ("cam0", "cam1", "depth0", "objects0") if truth_images else ("cam0", "cam1")
 
 
 class _ImageList:
@@ -113,21 +119,6 @@ class _ImageList:
         write_png(self._data / name, image)
         self._table.write(f"{nanoseconds},{name}\n")
         self._table.flush()
-
-
-def _write_images(
-    sequence: WorldSequence, k: int, lists: dict[str, _ImageList], steps: int, truth_images: bool
-) -> None:
-    """All images of one frame."""
-    frame = sequence.frame(k)
-    stamp = round(frame.stamp * 1e9)
-    lists["cam0"].add(stamp, frame.left)
-    if frame.right is not None:
-        lists["cam1"].add(stamp, frame.right)
-    if truth_images:
-        depth = np.rint(sequence.depth(k) * steps)
-        lists["depth0"].add(stamp, np.where(depth < 65536, depth, 0).astype(np.uint16))
-        lists["objects0"].add(stamp, sequence.object_ids(k).astype(np.uint16))
 
 
 def _camera_node(camera: PinholeCamera, T_body_camera: Array, rate: float) -> dict[str, Any]:
@@ -175,13 +166,6 @@ def _object_rows(sequence: WorldSequence, frames: range) -> Iterable[list[str]]:
 def _landmark_rows(sequence: WorldSequence, frame: int) -> Iterable[list[str]]:
     """Id, place in the world, object and size of every landmark."""
     landmarks = sequence.landmarks
-    poses = {0: np.eye(4), **dict(zip(*_objects(sequence, frame)))}
-    for i, (position, body, size) in enumerate(zip(landmarks.positions, landmarks.object, landmarks.size)):
-        place = transform(poses[int(body)], position[None])[0]
+    places = landmarks.world_positions(sequence.world.T_world_body(sequence.source(frame)))
+    for i, (place, body, size) in enumerate(zip(places, landmarks.object, landmarks.size)):
         yield [str(i), *(f"{x:.9g}" for x in place), str(int(body)), f"{size:.6g}"]
-
-
-def _objects(sequence: WorldSequence, frame: int) -> tuple[list[int], Array]:
-    """Ids and poses of the objects in a frame."""
-    objects = sequence.objects(frame)
-    return [int(i) for i in objects.ids], objects.T_world_object

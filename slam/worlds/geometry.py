@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,10 +31,6 @@ class Texture(Protocol):
 
     def marks(self) -> Array:
         """Points (M, 3) where something stands out: x, y from the top-left corner, and its size [m]."""
-        ...
-
-    def paint(self, density: float) -> np.ndarray:
-        """The picture (round(height · density), round(width · density), 3), BGR uint8, for texels per metre."""
         ...
 
 
@@ -124,6 +120,21 @@ def cuboid(
         start = transform(T, (origin + lowest)[None])[0]
         out.append(rectangle(texture, start, T[:3, :3] @ along, T[:3, :3] @ down, body, True))
     return out
+
+
+class Parts(NamedTuple):
+    """What a scene describes of its world.
+
+    Attributes:
+        stamps, poses: of the left camera (N,) [s], (N, 4, 4).
+        rectangles: every surface.
+        objects: poses of the moving objects (B, N, 4, 4), or None.
+    """
+
+    stamps: Array
+    poses: Array
+    rectangles: list[Rectangle]
+    objects: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -77,3 +78,42 @@ def carried(t: Array, rng: np.random.Generator, gait: float = 1.8, amount: float
         axis=1,
     )
     return amount * offsets, amount * angles
+
+
+def clock(values: Mapping[str, Any], duration: float) -> tuple[Array, Array]:
+    """Stamps [s] of the frames, and where they are on the path: its time [s] at the usual pace.
+
+    `duration` [s] is the path's at the usual pace; the option `frames` cuts it short (or runs it on).
+    """
+    frames = values["frames"] or max(1, round(duration * values["rate"] / values["speed"]))
+    stamps = np.arange(frames) / values["rate"]
+    return stamps, stamps * values["speed"]
+
+
+#: How the camera moves in worlds where objects do: the words of the option ``camera``.
+CAMERAS = ("still", "sway", "moving")
+
+
+def watching(t: Array, stamps: Array, way: str, rng: np.random.Generator) -> Array:
+    """Poses (N, 4, 4) of a camera at the world's origin that looks along +y.
+
+    Args:
+        t: path times (N,) [s].
+        stamps: times (N,) [s] of the sway.
+        way: still; sway, as a robot that stands; or moving, half a metre to and fro.
+        rng: of its sway.
+    """
+    zero = np.zeros(len(t))
+    if way == "still":
+        return camera_poses(np.zeros((len(t), 3)), zero, zero, zero)
+    offsets, angles = carried(stamps, rng, gait=1.1, amount=0.3)
+    x = 0.25 * np.sin(2 * np.pi * t / 8.0) if way == "moving" else zero
+    y = 0.10 * np.sin(2 * np.pi * t / 13.0) if way == "moving" else zero
+    positions = offsets + np.stack([x, y, zero], axis=1)
+    return camera_poses(positions, 0.5 * x + angles[:, 0], angles[:, 1], angles[:, 2])
+
+
+def placed(place: Sequence[Array | float], angles: Sequence[Array | float]) -> Array:
+    """Poses (N, 4, 4) from coordinates x, y, z (N,) [m] and yaw, pitch, roll (N,) [rad], or one number for all."""
+    xyz, turns = (np.stack(np.broadcast_arrays(*columns), axis=-1) for columns in (place, angles))
+    return pose(np.array([yaw_pitch_roll(*a) for a in np.broadcast_to(turns, xyz.shape)]), xyz)

@@ -1,17 +1,26 @@
-"""Where the rectangles of a world lie in a view: which may be seen, and which samples each would cover."""
+"""Where the rectangles of a world lie in a view: which may be seen, which samples each covers, and which it shows."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from slam.geometry.se3 import Array
 from slam.worlds.geometry import RectangleArrays
-from slam.worlds.lens import View
 
 NEAR = 0.02  #: what is nearer than this is not drawn [m]
 _OVERLAP = 1e-4  # rectangles reach over their edges by this share, so that no sample falls between two that meet
+
+
+class View(NamedTuple):
+    """An undistorted view to draw: camera matrix (3, 3) in samples, and size in samples."""
+
+    K: Array
+    width: int
+    height: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,3 +132,26 @@ def _covered(Q: Array, rows: np.ndarray, start: np.ndarray, width: int) -> tuple
             limit(bound, slope[k, which] * y + offset[k, which], out=bound)
     first, last = np.ceil(np.minimum(first, width)), np.floor(np.maximum(last, -1.0))
     return first.astype(np.int16), np.minimum(last, width - 1).astype(np.int16)
+
+
+def shown(placed: Placed, view: View) -> np.ndarray:
+    """Which rectangle each sample shows (H, W) uint8 or uint16: its row in `placed` plus 1, or 0 for none."""
+    kind = np.uint8 if len(placed) < 256 else np.uint16
+    result = np.zeros((view.height, view.width), kind)
+    nearness = np.zeros((view.height, view.width), np.float32)
+    x = np.arange(view.width, dtype=np.int16)
+    in_column = (placed.Q[:, 2, 0, None] * np.arange(view.width)).astype(np.float32)
+    in_row = (placed.Q[:, 2, 1, None] * np.arange(view.height) + placed.Q[:, 2, 2, None]).astype(np.float32)
+    for i in range(len(placed)):  # nearest first, so that each overwrites only smaller numbers
+        (y0, y1), (x0, x1) = placed.rows[i].tolist(), placed.columns[i].tolist()
+        part = slice(placed.start[i], placed.start[i + 1])
+        near = in_column[i, x0:x1] + in_row[i, y0:y1, None]
+        there = nearness[y0:y1, x0:x1]
+        seen = near > there
+        seen &= x[x0:x1] >= placed.first[part, None]
+        seen &= x[x0:x1] <= placed.last[part, None]
+        if seen.any():
+            cv2.copyTo(near, seen.view(np.uint8), there)
+            numbers = result[y0:y1, x0:x1]
+            np.maximum(numbers, seen.view(np.uint8) * kind(i + 1), out=numbers)
+    return result

@@ -112,7 +112,7 @@ class WorldSequence:
         """Images of frame k."""
         if self._images:
             return self._images[int(k)]
-        frame = self._recorder.record(self._source(k), int(k), float(self._stamps[int(k)]))
+        frame = self._recorder.record(self.source(k), int(k), float(self._stamps[int(k)]))
         return replace(frame, left_mask=self.masks[0], right_mask=self.masks[1])
 
     def keep_images(self) -> None:
@@ -129,7 +129,7 @@ class WorldSequence:
 
     def objects(self, k: int) -> ObjectPoses:
         """Poses of the moving objects in frame k."""
-        return ObjectPoses(self.world.object_ids, self.world.T_world_object[:, self._source(k)])
+        return ObjectPoses(self.world.object_ids, self.world.T_world_object[:, self.source(k)])
 
     def observe(self, start: int = 0, stop: int | None = None) -> Iterator[SimulatedFeatures]:
         """Features with their truth, without images, of frames `start` up to, but without, `stop`; see `frames`."""
@@ -142,7 +142,7 @@ class WorldSequence:
 
     def simulate(self, k: int) -> SimulatedFeatures:
         """Features of frame k with their truth, without images."""
-        source = self._source(k)
+        source = self.source(k)
         rng = np.random.default_rng([self.values["seed"], source, 1])
         seen = simulate(self.world, self._looks, self.values, source, float(self._stamps[int(k)]), rng)
         return self.faults.spoil(source, seen, self.rig, rng)
@@ -162,10 +162,10 @@ class WorldSequence:
     def _truth(self, k: int) -> TruthImages:
         """True depth and objects of frame k; the last frame's are kept."""
         if self._last_truth is None or self._last_truth[0] != k:
-            self._last_truth = k, truth_images(self.world, self._source(k))
+            self._last_truth = k, truth_images(self.world, self.source(k))
         return self._last_truth[1]
 
-    def _source(self, k: int) -> int:
+    def source(self, k: int) -> int:
         """The world's frame that is frame k of the recording."""
         if not isinstance(k, Integral) or not 0 <= k < len(self):
             raise SequenceError(f"{self.name}: there is no frame {k}; it has {len(self)}")

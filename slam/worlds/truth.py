@@ -37,8 +37,7 @@ def truth_images(world: World, frame: int) -> TruthImages:
     nearness = np.zeros((camera.height, camera.width))
     objects = np.zeros((camera.height, camera.width), np.int32)
     facing = ((placed.origin - T[:3, 3]) * placed.normal).sum(axis=1) < -1e-9
-    rows = np.flatnonzero(facing & _may_be_seen(placed, T, camera))
-    for row in rows[world.there(rows, frame)]:
+    for row in np.flatnonzero(facing & _may_be_seen(placed, T, camera)):
         _cast(placed, int(row), T, camera, rays, nearness, objects)
     with np.errstate(divide="ignore"):
         depth = np.where(nearness > 0, 1 / nearness, 0.0)

@@ -7,14 +7,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from slam.data import BoolArray, IdArray
+from slam.data import IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays, in_parts
-
-_SMALL = 8000  # landmarks or rectangles that are gone through in every frame: the way to those near it would cost more
 
 
 def _to_corner(rig: StereoRig) -> float:
@@ -22,33 +19,6 @@ def _to_corner(rig: StereoRig) -> float:
     camera = rig.left
     x, y = max(camera.u0, camera.width - camera.u0) / camera.fu, max(camera.v0, camera.height - camera.v0) / camera.fv
     return float(1.1 * np.sqrt(1 + x * x + y * y))
-
-
-@dataclass(frozen=True, eq=False)
-class Places:
-    """Things in a tree by their places.
-
-    Attributes:
-        tree: of those that stand still.
-        still, moving: indices of things (S,), (M,).
-        radius: of the largest thing that stands still [m].
-    """
-
-    tree: cKDTree
-    still: IdArray
-    moving: IdArray
-    radius: float
-
-    @classmethod
-    def of(cls, points: Array, moves: BoolArray, radius: float = 0.0) -> Places:
-        """Of things at `points` (P, 3), of which some move; `radius` [m] is the largest one's."""
-        still = np.flatnonzero(~moves)
-        return cls(cKDTree(points[still]), still, np.flatnonzero(moves), radius)
-
-    def within(self, place: Array, distance: float) -> IdArray:
-        """Indices of what stands within a distance [m] of a place (3,), and of all that moves, in order."""
-        near = self.tree.query_ball_point(place, distance + self.radius)
-        return np.sort(np.concatenate([self.still[np.array(near, np.int64)], self.moving]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +36,6 @@ class World:
         T_world_object: poses of the objects 1..B at each frame (B, N, 4, 4).
         reach: nearest and farthest distance at which a landmark can be detected [m].
         texels: texels per metre at which the surfaces are painted.
-        lasting: first frame in which each rectangle is there, and the first in which it is not (Q, 2); None for always.
         sky: colour (BGR) where no surface is.
         painted: textures painted so far, filled by the recorder.
         seen: landmarks seen in frames so far, filled by the simulator of observations.
@@ -83,7 +52,6 @@ class World:
     reach: tuple[float, float]
     texels: float
     sky: tuple[int, int, int] = (230, 225, 220)
-    lasting: IdArray | None = None
     painted: dict[Any, Any] = field(default_factory=dict, repr=False)
     seen: dict[int, Any] = field(default_factory=dict, repr=False)
 
@@ -114,57 +82,22 @@ class World:
         """`drawn` as arrays."""
         return RectangleArrays.of(self.drawn)
 
-    def drawn_there(self, frame: int) -> IdArray:
-        """Indices in `drawn` of what is there in a frame."""
-        return self._drawn_source[1][self.there(self._drawn_source[0], frame)]
-
-    @cached_property
-    def _drawn_source(self) -> tuple[IdArray, IdArray]:
-        """The rectangle that each of `drawn` is a part of, and their indices."""
-        source = np.repeat(np.arange(len(self.rectangles)), [len(in_parts(r)) for r in self.rectangles])
-        return source, np.arange(len(source))
-
     @cached_property
     def occluders(self) -> RectangleArrays:
         """The rectangles that may hide others."""
-        return self.arrays.select(self._occluding)
+        return self.arrays.select(np.flatnonzero([r.occludes for r in self.rectangles]))
 
     def landmarks_near(self, frame: int) -> IdArray:
-        """Ids of the landmarks that may be within reach in a frame; in a small world all of them."""
-        count = len(self.landmarks)
-        if count <= _SMALL:
-            rows = np.arange(count)
-        else:
-            sight = self.reach[1] * _to_corner(self.rig)
-            rows = self._landmark_places.within(self.T_world_left[frame, :3, 3], sight)
-        return rows if self.lasting is None else rows[self.there(self.landmarks.surface[rows], frame)]
+        """Ids of the landmarks that may be within reach in a frame, and of all that move."""
+        return self._within_sight(self.landmarks.positions, 0.0, self.landmarks.object, frame)
 
     def occluders_near(self, frame: int) -> RectangleArrays:
-        """The rectangles that may hide landmarks within reach in a frame; in a small world all that may hide any."""
-        if len(self.occluders) <= _SMALL and self.lasting is None:
-            return self.occluders
-        sight = self.reach[1] * _to_corner(self.rig)
-        rows = self._occluder_places.within(self.T_world_left[frame, :3, 3], sight)
-        return self.occluders.select(rows[self.there(self._occluding[rows], frame)])
+        """The rectangles that may hide landmarks within reach in a frame."""
+        every = self.occluders
+        return every.select(self._within_sight(every.middle, every.radius, every.body, frame))
 
-    def there(self, rectangles: IdArray, frame: int) -> BoolArray:
-        """Which of these rectangles are there in a frame."""
-        if self.lasting is None:
-            return np.ones(len(rectangles), bool)
-        first, end = self.lasting[rectangles].T
-        return (first <= frame) & (frame < end)
-
-    @cached_property
-    def _occluding(self) -> IdArray:
-        """Indices of the rectangles that may hide others."""
-        return np.flatnonzero([r.occludes for r in self.rectangles])
-
-    @cached_property
-    def _landmark_places(self) -> Places:
-        """Landmarks by place."""
-        return Places.of(self.landmarks.positions, self.landmarks.object > 0)
-
-    @cached_property
-    def _occluder_places(self) -> Places:
-        """Occluders by place."""
-        return Places.of(self.occluders.middle, self.occluders.body > 0, float(self.occluders.radius.max()))
+    def _within_sight(self, points: Array, radius: Array | float, body: IdArray, frame: int) -> IdArray:
+        """Indices of points (P, 3) that may be within reach in a frame, and of all that move."""
+        offset = points - self.T_world_left[frame, :3, 3]
+        square = np.einsum("ij,ij->i", offset, offset)
+        return np.flatnonzero((square < (self.reach[1] * _to_corner(self.rig) + radius) ** 2) | (body > 0))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import slam
-from backends import batch as batch_module
 from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.graph import SolverError
@@ -60,27 +59,6 @@ def test_the_smoother_is_nearly_as_good_as_the_optimum():
     best, whole, ours = errors
     # One short run scatters about the optimum in both directions.
     assert whole < 1.2 * best and ours < 1.5 * best, errors
-
-
-def test_the_solution_is_worked_out_when_asked_for_and_kept(monkeypatch):
-    solved = []
-    original = batch_module._Solution
-
-    def solution(smoother):
-        solved.append(smoother.state.number + 1)
-        return original(smoother)
-
-    monkeypatch.setattr(batch_module, "_Solution", solution)
-    data = drive()
-    backend = BatchBackend(RIG, MODELS)
-    run(backend, data)
-    for _ in range(3):
-        backend.estimate(landmarks=False)
-    assert not solved, "the pose alone is the smoother's until a solution is asked for"
-    backend.trajectory(), backend.estimate(), backend.trajectory()
-    assert solved == [20]
-    backend.predict(2.0)
-    assert len(backend.trajectory()) == 21
 
 
 def test_online_the_pose_is_the_solved_one():

@@ -18,7 +18,7 @@ from slam.commands.cli import main
 from tests.fuzz.harness import LONGEST_LINE, Broken, Subject
 from tests.fuzz.hostile import NUMBERS, PATHS, choose
 from tests.fuzz.readers import FORMATS, mutate, write
-from tests.fuzz.settings import _TEXTS
+from tests.fuzz.settings import TEXTS
 
 _RANGES = (
     *NUMBERS, "0:1", ":", "-" + "9" * 30 + ":", ":" + "9" * 30, "9" * 30 + ":" + "9" * 31, "1:0", "-1:", "0:-1",
@@ -77,7 +77,7 @@ def _arguments(rng: np.random.Generator, folder: Path) -> list[str]:
         values |= dict.fromkeys(("--kind", "--format"), PATHS)
         values |= {"--backend": (*PATHS, "ekf", "smoother"), "--frontend": (*PATHS, "surf")}
         values |= {"--draw": (str(folder / "device"), "a\0b", "/proc/x", "x" * 300)}
-        values |= {"--set": tuple(f"{key}={text}" for text in _TEXTS)}
+        values |= {"--set": tuple(f"{key}={text}" for text in TEXTS)}
     chosen = {choose(rng, list(values)) for _ in range(int(rng.integers(1, 3)))}
     options = [part for key in sorted(chosen - {"--out"}) for part in (key, choose(rng, values[key]))]
     place = choose(rng, values["--out"]) if "--out" in chosen else out

@@ -46,29 +46,29 @@ class Scripted:
     def __len__(self) -> int:
         return FRAMES
 
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[_Numbered]:
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Numbered]:
         for k in range(FRAMES):
             if self._error is not None and k == self._at:
                 raise self._error
-            yield _Numbered.of(k, self.features[k])
+            yield Numbered.of(k, self.features[k])
 
 
 @dataclass(frozen=True, eq=False)
-class _Numbered(StereoFrame):
+class Numbered(StereoFrame):
     """A frame that holds its features already."""
 
     features: object = None
 
     @classmethod
-    def of(cls, index: int, features: object) -> _Numbered:
+    def of(cls, index: int, features: object) -> Numbered:
         """Without an image."""
         return cls(index, 0.0, np.zeros((0, 0), np.uint8), None, features=features)
 
 
-class _Frontend:
+class Features:
     """Gives the features of a frame."""
 
-    def extract(self, frame: _Numbered) -> object:
+    def extract(self, frame: Numbered) -> object:
         return frame.features
 
 
@@ -95,7 +95,7 @@ def write_run(rng: np.random.Generator, folder: Path) -> None:
     raised: BaseException | None = None
     try:
         with disk_of(size):
-            run(sequence, options, frontend=_Frontend())  # type: ignore[arg-type]
+            run(sequence, options, frontend=Features())  # type: ignore[arg-type]
     except (SlamError, Interrupted) as caught:
         raised = caught
     finally:

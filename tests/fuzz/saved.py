@@ -49,7 +49,7 @@ def _files() -> dict[str, bytes]:
     return {**kept, "a.map": encode(system.snapshot()), "rig.json": rig_errors.encode()}
 
 
-def _map() -> SavedMap:
+def small_map() -> SavedMap:
     return decode(_files()["a.map"], "a.map")
 
 
@@ -130,7 +130,7 @@ def large_map(rng: np.random.Generator, folder: Path) -> None:
         points, looks = rng.standard_normal((n, 3)), np.zeros((n, 64), np.float32)
         known = SavedMap(np.arange(n), points, covariances, looks, signs, ones, ones)
     else:
-        known, scale = _map(), 10.0 ** rng.integers(-20, 20)
+        known, scale = small_map(), 10.0 ** rng.integers(-20, 20)
         name = choose(rng, ("positions", "covariances", "descriptors"))
         known = replace(known, **{name: (getattr(known, name) * scale).astype(getattr(known, name).dtype)})
     _go_on(prior_map=known)

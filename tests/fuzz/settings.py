@@ -28,12 +28,12 @@ from tests.fuzz.hostile import NUMBERS, VALUES, choose
 
 FRAMES = 4
 
-_CLASSES = (
+CLASSES = (
     SurfConfig, EkfConfig, SmootherConfig, MapConfig, AssociationConfig, SelfCalibrationConfig, ObjectsConfig,
     EstimatorModels, MotionModel, ObjectModels, SystemConfig,
 )  # fmt: skip
 
-_TEXTS = (
+TEXTS = (
     *NUMBERS, "[" * 100_000, "[" * 900 + "]" * 900, "{" * 50, "[1, 2", "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]",
     "[[1,0,0,1e308],[0,1,0,0],[0,0,1,0],[0,0,0,1]]",
     "[1e308]", "[" + "1," * 3000 + "1]", '"' * 3, "a\nb", "a\0b", "1e9",
@@ -50,7 +50,7 @@ def scene() -> tuple[StereoRig, tuple[StereoFeatures, ...]]:
 
 def construct(rng: np.random.Generator, folder: Path) -> None:
     """A configuration class with hostile values in some fields."""
-    kind = choose(rng, _CLASSES)
+    kind = choose(rng, CLASSES)
     names = [f.name for f in fields(kind)]
     chosen = {choose(rng, names): choose(rng, VALUES) for _ in range(int(rng.integers(1, 3)))}
     config = kind(**chosen)
@@ -96,7 +96,7 @@ def _setting(rng: np.random.Generator, tree: dict[str, Any], backend: str) -> st
     if isinstance(tree[section].get(key), dict):
         key = f"{key}.{choose(rng, list(tree[section][key]))}"
     default = tree[section].get(key)
-    value = choose(rng, _TEXTS)
+    value = choose(rng, TEXTS)
     if isinstance(default, (int, float)) and not isinstance(default, bool) and rng.random() < 0.5:
         value = repr(type(default)(default * 10.0 ** rng.integers(-12, 12)))
     return f"{section}.{key}={value}"

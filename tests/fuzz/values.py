@@ -20,12 +20,12 @@ from slam.system import StereoSlam
 from tests.fuzz.harness import Subject
 from tests.fuzz.hostile import NUMBERS, VALUES, choose
 
-_CLASSES = (StereoRig, PinholeCamera, Trajectory, Observations, StereoFeatures, SavedMap)
+CLASSES = (StereoRig, PinholeCamera, Trajectory, Observations, StereoFeatures, SavedMap)
 
 
 def made_of_anything(rng: np.random.Generator, folder: Path) -> None:
     """A public class made of hostile values, shown if it can be."""
-    kind = choose(rng, _CLASSES)
+    kind = choose(rng, CLASSES)
     arrays = (np.zeros(0), np.zeros(3), np.zeros((3, 2)), np.zeros((3, 3)), np.zeros((0, 4, 4)), np.arange(3))
     values = {f.name: choose(rng, (*VALUES, *arrays)) for f in fields(kind)}
     kind(**values)

@@ -10,7 +10,7 @@ import pytest
 from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
 from slam.config import SystemConfig
-from slam.data import ImagePair, Patches, StereoFeatures, StereoFrame
+from slam.data import ImagePair, Patches, StereoFrame
 from slam.errors import MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
@@ -97,29 +97,12 @@ def test_a_front_end_of_nonsense_is_named_and_the_next_frame_is_taken(method, ch
     assert result.status.measured
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, -1e9])
-def test_patches_found_in_no_image_are_not_found(value):
-    system = aligning(align=lambda found: (np.full_like(found[0], value), found[1]))
-    for k in range(3):
-        result = system.process(LEFT ^ (k % 2), RIGHT, 0.1 * k)  # a still camera has noise
-    assert result.status.measured
-    assert RIG.left.in_image(result.features.uv_left).all()
-
-
 IMAGES = [
     (3, "must be an ImagePair"),
     (ImagePair(LEFT, None), "left image must be float32"),
     (ImagePair(np.float32(LEFT)[:-1], None), r"left image must be float32 of shape \(240, 320\)"),
     (ImagePair(np.float32(LEFT), np.float64(RIGHT)), "right image must be float32"),
 ]
-
-
-@pytest.mark.parametrize("images,words", IMAGES)
-def test_images_of_features_are_of_the_rectified_rig(images, words):
-    system = aligning()
-    with pytest.raises(MeasurementError, match=words):
-        system.process_features(replace(StereoFeatures.empty(0.0), images=images))
-    assert system.process(LEFT, RIGHT, 0.0).status.measured
 
 
 def test_a_front_end_whose_features_are_no_features_ends_in_one_line():
@@ -130,8 +113,3 @@ def test_a_front_end_whose_features_are_no_features_ends_in_one_line():
 
     with pytest.raises(MeasurementError, match="uv_right must be an array of 2 dimensions"):
         StereoSlam(RIG, Flat(RIG, features=50)).process(StereoFrame(0, 0.0, LEFT, RIGHT))
-
-
-def test_features_of_ragged_tuples_are_refused():
-    with pytest.raises(MeasurementError):
-        replace(StereoFeatures.empty(0.0), uv_right=(1, (2, 3)))

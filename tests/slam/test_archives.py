@@ -18,7 +18,7 @@ from slam.mapping.map_io import SavedMap, decode, encode
 from slam.run.recording import load_recording, save_recording
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
-from tests.fuzz.saved import _map, hostile_header
+from tests.fuzz.saved import hostile_header, small_map
 
 
 def packed(members, method=zipfile.ZIP_DEFLATED):
@@ -112,7 +112,7 @@ def test_a_recording_of_many_stamps_is_checked_quickly(tmp_path, members):
 
 def map_with(**arrays):
     """A map with other arrays, its checksum right."""
-    body = encode(_map()).split(b"\n", 2)[2]
+    body = encode(small_map()).split(b"\n", 2)[2]
     with zipfile.ZipFile(io.BytesIO(body)) as file:
         found = {name: file.read(name) for name in file.namelist()}
     data = changed(found, **arrays)
@@ -120,7 +120,7 @@ def map_with(**arrays):
 
 
 def test_maps_with_impossible_values():
-    good = _map()
+    good = small_map()
     n = len(good)
     ids = good.ids.copy()
     ids[-1] = 2**63 - 1

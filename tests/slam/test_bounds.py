@@ -10,12 +10,12 @@ import pytest
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, one_line
 from slam.run.runner import parse_frames
-from tests.fuzz.settings import _CLASSES
+from tests.fuzz.settings import CLASSES
 
 HOSTILE = (None, "x", b"x", [], {}, 1j, 10**23, 10**400, 1e308, -1e308, np.nan, np.inf, -1, (1, 2, 3, 4), object())
 
 
-@pytest.mark.parametrize("kind", _CLASSES, ids=lambda k: k.__name__)
+@pytest.mark.parametrize("kind", CLASSES, ids=lambda k: k.__name__)
 def test_every_field_of_every_class_refuses_what_it_cannot_be(kind):
     for f in fields(kind):
         refused = 0

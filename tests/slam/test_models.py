@@ -16,30 +16,6 @@ def test_the_velocity_variance_is_that_of_a_random_walk():
     np.testing.assert_allclose(halves, motion.velocity_variance(0.1))
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-@pytest.mark.parametrize("name", ["acceleration", "angular_acceleration"])
-def test_densities_must_be_positive(name, value):
-    with pytest.raises(ConfigurationError, match=name):
-        MotionModel(**{name: value})
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "pixel_sigma",
-        "gate_probability",
-        "initial_position_sigma",
-        "initial_rotation_sigma",
-        "initial_velocity_sigma",
-        "initial_angular_velocity_sigma",
-    ],
-)
-def test_deviations_must_be_positive(name, value):
-    with pytest.raises(ConfigurationError, match=name):
-        EstimatorModels(**{name: value})
-
-
 def test_a_gate_of_one_lets_everything_pass_and_is_refused():
     with pytest.raises(ConfigurationError, match="gate_probability"):
         EstimatorModels(gate_probability=1.0)

@@ -5,7 +5,6 @@ import sys
 import pytest
 
 from slam import registry
-from slam.commands.compare import variants_of
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, UnknownNameError
 from slam.geometry.rig import StereoRig
@@ -40,17 +39,6 @@ def test_a_missing_folder_is_no_world_but_by_a_slip(name, suggested):
     with pytest.raises(SlamError) as raised:
         open_sequence(name)
     assert ("did you mean" in str(raised.value)) == suggested
-
-
-def test_a_format_is_suggested(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(SlamError, match="did you mean 'euroc'"):
-        open_sequence(tmp_path, format="eurok")
-
-
-def test_a_back_end_is_suggested():
-    with pytest.raises(SlamError, match=r"unknown back end 'smother' \(did you mean 'smoother'\?\); known: batch"):
-        registry.resolve("backends", "smother")
 
 
 def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
@@ -138,9 +126,3 @@ def test_a_setting_is_suggested(setting, meant):
     with pytest.raises(SlamError) as raised:
         SystemConfig().with_settings([setting])
     assert f"did you mean {meant}?" in str(raised.value)
-
-
-@pytest.mark.parametrize("text", ["x", "x:", "surf"])
-def test_a_variant_that_varies_nothing_is_refused(text):
-    with pytest.raises(SlamError, match=f"variant '{text}' names no front end and no setting"):
-        variants_of([], [text], [])

@@ -82,14 +82,6 @@ def test_buffers_that_are_filled_again_are_new_images_and_copies_are_old_ones():
     assert repeats([s.process(FRAMES[3].left, right, 0.2)]) == []  # one image of the two is new
 
 
-def test_dark_images_show_nothing_whether_repeated_or_not():
-    dark = replace(FRAMES[0], left=np.zeros_like(FRAMES[0].left), right=np.zeros_like(FRAMES[0].right))
-    s = system()
-    results = [s.process(frame) for frame in shown([0, 1, 2, 3, 4, 4, 4], [*FRAMES[:4], dark])]
-    assert repeats(results) == []
-    assert {r.status for r in results[4:]} == {FrameStatus.PREDICTED}
-
-
 def test_what_another_thread_has_read_ahead_is_not_taken_for_the_frame_before():
     frames = shown([0, 1, 2])
     s = system()

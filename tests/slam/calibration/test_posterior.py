@@ -46,6 +46,17 @@ def test_a_calibration_that_nothing_speaks_against_is_left_alone():
     assert clear.mean[0] == pytest.approx(0.1, abs=0.01)
 
 
+def test_the_posterior_is_that_of_the_whole_mixture():
+    """Against the integral: where the data cannot say which scale is true, the means by scale lie apart."""
+    sigmas, theta = np.array([0.05, 0.4]), np.linspace(-2, 2, 400_001)
+    likelihood = np.exp(-0.5 * ((theta - 0.25) / 0.15) ** 2)
+    p = likelihood * sum(np.exp(-0.5 * (theta / sigma) ** 2) / sigma for sigma in sigmas)
+    p /= p.sum()
+    mean, found = p @ theta, solve(Prior(NONE, sigmas[:, None, None] ** 2), 0.0, [evidence(0.25, 0.15)])
+    assert found.mean[0] == pytest.approx(mean, rel=1e-6)
+    assert found.inner[0, 0] == pytest.approx(p @ (theta - mean) ** 2, rel=1e-6)
+
+
 def test_residual_fields_make_the_posterior_wider_and_leave_the_mean():
     plain, wide = (solve(Prior(NONE, np.ones((1, 1, 1))), 0.5, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 1e5))
     assert plain.mean == wide.mean and plain.inner == wide.inner

@@ -53,12 +53,6 @@ def test_a_camera_that_has_turned_since_is_found(first):
     assert disparity_error(second, turned) < 0.15 < 0.9 < disparity_error(first, turned)
 
 
-def test_the_system_starts_with_it(first):
-    system = StereoSlam(CAR, None, "ekf", rig_prior=first.kept())
-    system.process_features(Street(4).features(0.0, pose(0), TURNED))
-    np.testing.assert_array_equal(system.calibration.applied.parameters, first.posterior.mean)
-
-
 def test_of_another_rig_or_switched_off_it_is_refused(first):
     other = StereoRig.rectified_pair(730, 610, 173, 0.54, 1242, 375)
     with pytest.raises(CalibrationError, match=r"another rig: focal 720 there, 730 here"):
@@ -97,15 +91,6 @@ def test_bad_files_get_one_line(first, tmp_path, change, message):
     with pytest.raises(CalibrationError, match=message) as raised:
         slam.load_calibration(file)
     assert str(file) in str(raised.value) and "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("content", ["", "[]", "{", "[" * 100_000, "{}"])
-def test_files_of_another_kind_get_one_line(tmp_path, content):
-    (tmp_path / "summary.json").write_text(content)
-    with pytest.raises(CalibrationError, match=r"summary\.json"):
-        slam.load_calibration(tmp_path)
-    with pytest.raises(CalibrationError, match=r"none\.json"):
-        slam.load_calibration(tmp_path / "none.json")
 
 
 def test_one_recording_jointly_is_that_recording(first):

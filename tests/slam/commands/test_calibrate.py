@@ -99,18 +99,3 @@ def test_what_is_there_is_not_overwritten_and_no_recording_counts_twice(made, tm
         command("calibrate", WORLD, "--out", folder / "rig.json")
     with pytest.raises(SlamError, match="given twice"):
         command("calibrate", WORLD, WORLD, "--out", tmp_path / "rig.json")
-
-
-def test_recordings_without_pairs_of_views_get_a_warning(tmp_path, monkeypatch, caplog):
-    from slam.calibration.estimator import SelfCalibration
-    from slam.calibration.evidence import RecordingEvidence
-
-    def by_rows(self):
-        rows = self._rows.total()[0]
-        return RecordingEvidence(rows, rows.scaled(0.0))
-
-    monkeypatch.setattr(SelfCalibration, "pairs", property(lambda _: 0))
-    monkeypatch.setattr(SelfCalibration, "evidence", by_rows)
-    command("calibrate", WORLD, "--frames", "0:3", "--out", tmp_path / "rig.json", "-q")
-    assert "rows alone" in caplog.text
-    assert "rows alone" in json.loads((tmp_path / "rig.json").read_text())["warnings"][0]

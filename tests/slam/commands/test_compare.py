@@ -18,22 +18,3 @@ def test_the_command_leaves_report_and_tables_and_says_what_follows(slam_command
     assert names == {
         "report.html", "runs.csv", "means.csv", "differences.csv", "timings.csv", "sweep.json", "runs",
     }  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (["synthetic:nowhere"], "nowhere"),
-        (["synthetic:aisle", "--backends", "ekf,nothing"], "nothing"),
-        (["synthetic:aisle?seed=1"], "seed"),
-        (["synthetic:aisle", "--variant", "a:surf:b"], "form"),
-        (["synthetic:aisle", "--variant", "x"], "variant 'x' names no front end and no setting"),
-    ],
-)
-def test_bad_input_is_one_line(slam_command, tmp_path, arguments, word):
-    done = slam_command("compare", *arguments, "--out", tmp_path / "out")
-    assert done.returncode == 2
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, done.stderr
-    assert word in lines[0]
-    assert not (tmp_path / "out").exists()

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from slam.commands.cli import app
 from slam.errors import SlamError
-from slam.run.repeat import load, portable
+from slam.run.repeat import load
 
 WORLD = "synthetic:aisle?frames=6&width=160&height=120"
 SAME = ("trajectory.txt", "trajectory_final.txt", "landmarks.csv", "objects.csv", "truth.txt", "schema.json")
@@ -120,12 +120,6 @@ def test_no_config_and_no_sequence(tmp_path):
         slam("run", WORLD, "--config", tmp_path, "--kind", "driving")
 
 
-def test_infinity_goes_through_json():
-    assert json.loads(json.dumps(portable({"a": (float("inf"), -float("inf"), 1.5)}))) == {
-        "a": ["Infinity", "-Infinity", 1.5]
-    }
-
-
 def test_another_run_is_not_overwritten_without_being_told(here):
     slam("run", WORLD, "--frames", "0:2", "--out", "mine", "-q", "--no-picture")
     before = (here / "mine/config.json").read_bytes()
@@ -135,11 +129,3 @@ def test_another_run_is_not_overwritten_without_being_told(here):
     assert (here / "mine/config.json").read_bytes() == before
     slam("run", WORLD, "--frames", "0:3", "-o", "mine", "--overwrite", "-q", "--no-picture")
     assert json.loads((here / "mine/config.json").read_text())["frames"] == [0, 3]
-
-
-def test_a_replay_has_a_folder_of_its_own_and_says_how_to_repeat_it(here):
-    slam("run", WORLD, "--frames", "0:3", "--record", "tape.npz", "--out", "first", "-q", "--no-picture")
-    slam("replay", "tape.npz", "-q", "--no-picture")
-    (folder,) = (here / "results").iterdir()
-    assert folder.name == "aisle-ekf-1"
-    assert json.loads((folder / "schema.json").read_text())["settings"]["backend.iterations"]["meaning"]

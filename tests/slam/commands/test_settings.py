@@ -47,33 +47,6 @@ def test_every_option_of_front_ends_and_back_ends_is_there(every, role):
         assert {s.key for s in every if s.owner == name and s.key.startswith(role)} == wanted
 
 
-def test_every_setting_says_what_it_means(every):
-    for s in every:
-        assert len(s.text) > 8, s.key
-        assert not s.text.endswith((" and", " or", ",", ";")), s.key
-        assert s.range, s.key
-        if "[px]" in s.text or "[m]" in s.text:
-            assert s.unit, s.key
-
-
-def test_ranges_are_those_that_are_checked(every):
-    ranges = {(s.owner, s.key): s.range for s in every}
-    assert ranges["surf", "frontend.descriptor"] == "16, 64"
-    assert ranges["surf", "frontend.octaves"] == "[1, 4]"
-    assert ranges["", "association.ratio"] == "[1e-09, 1]"
-    assert ranges["surf", "frontend.layers"] == "[2, 3]"
-    assert ranges["", "objects.mode"] == "detect, procedure1, off"
-    assert ranges["", "objects.database"] == "text"
-    assert ranges["", "map.monocular"] == "true or false"
-    assert ranges["smoother", "backend.lag"].startswith("[2, ")
-    assert ranges["smoother", "backend.lag"].endswith(" or null")
-
-
-@pytest.mark.parametrize("width", [80, 100])
-def test_the_listing_fits(read, width):
-    assert max(map(len, listing(None, width).splitlines())) <= width
-
-
 def test_an_unknown_section(read):
     with pytest.raises(SlamError, match="did you mean 'map'"):
         listing("mapp", 80)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.compare.collect import SERIES_COLUMNS, Collector
-from slam.compare.measure import BY_KEY, UNTRACKED, figures
+from slam.compare.measure import BY_KEY, UNTRACKED
 from slam.data import Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import exp
@@ -97,23 +97,7 @@ def test_frames_that_are_not_tracked_are_counted_and_left_out_of_the_accuracy():
     assert np.nanmean(series["nees"]) / 6 == pytest.approx(m["nees_per_dof"])
 
 
-def test_frames_without_a_pose_are_counted_too():
-    """A camera that starts in a prior map and has not been found yet has no pose at all."""
-    measured = collected({k: FrameStatus.LOST for k in range(12)}, located=range(12))
-    assert measured.metrics["tracked"] == pytest.approx(0.9)
-    assert len(measured.series) == 108
-    assert measured.metrics["ate_online_m"] < 0.05
-
-
 def test_nothing_tracked_gives_no_accuracy_and_is_no_fault():
     measured = collected({k: FrameStatus.FAILED for k in range(N)})
     assert (measured.metrics["tracked"], measured.metrics["frames_failed"]) == (0, 1)
     assert not {"ate_online_m", "nees_per_dof", "rpe_1s_m"} & set(measured.metrics)
-
-
-def test_what_loops_give_is_the_error_with_and_without_them():
-    accuracy = {"online": {"ATE RMSE [m]": 0.1}, "online without loops": {"ATE RMSE [m]": 0.4}}
-    found = figures({"accuracy": accuracy, "loops": {"closed": 4, "refused": 1}})
-    assert (found["ate_online_m"], found["ate_without_loops_m"]) == (0.1, 0.4)
-    assert (found["loops_closed"], found["loops_refused"]) == (4, 1)
-    assert "loops_closed" not in figures({"loops": {"closed": 0, "refused": 0}})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -129,6 +129,35 @@ def test_left_images_alone_in_a_prior_map_go_on_beyond_it(backend):
     distances = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimate.covariances[rows]), error)
     assert len(rows) > 20
     assert np.median(distances) < 6  # χ²₃: 2.4; they share the error of the camera's motion
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_while_right_pixels_are_missing_landmarks_come_from_two_views_and_none_is_erased(backend):
+    """Ten frames show a third of the points in both images, thirty show all of them in the left one alone."""
+    made: dict[bool | None, list[int]] = {}
+    for setting in (None, False):
+        cloud, config = Cloud(150), SystemConfig().with_settings(["models.pixel_sigma=0.5"])
+        system = StereoSlam(RIG, None, backend, config=replace(config, map=replace(config.map, monocular=setting)))
+        made[setting], erased = [], 0
+        for k in range(40):
+            T = se3.exp(np.array([0, 0, 0, 0.6 * k / 30, 0, 0]))
+            features, ids = cloud.features(T, k / 30, 0.3)
+            if k < 10:
+                rows = ids < 50
+                columns = {f.name: getattr(features, f.name)[rows] for f in fields(features)[1:8]}
+                features = replace(features, **columns)
+            else:
+                hidden = ids < 10  # they look like something else now
+                descriptors = np.where(hidden[:, None], -features.descriptors, features.descriptors)
+                features = replace(features, uv_right=features.uv_right * np.nan, descriptors=descriptors)
+            result = system.process_features(features)
+            assert k == 0 or result.status is FrameStatus.TRACKED
+            if k >= 10:
+                made[setting].append(len(result.added))
+                erased += len(result.erased)
+        assert erased < 5  # doubled ones may go; ten are hidden
+    assert sum(made[None]) > 20
+    assert not any(made[False])
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from pathlib import Path
 from slam.config import SystemConfig
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
-from tests.fuzz.runs import Scripted, _Frontend, _Numbered
+from tests.fuzz.runs import Features, Numbered, Scripted
 
 FRAMES = 25
 _LAST_FILES = 0.15  # of the frames' time: kills are spread over so much more, in which the last files are written
@@ -31,7 +31,7 @@ class Seen(Scripted):
         return FRAMES
 
     def frames(self, start=0, stop=None):
-        yield from (_Numbered.of(k, seen) for k, seen in enumerate(self.features))
+        yield from (Numbered.of(k, seen) for k, seen in enumerate(self.features))
 
 
 def _rows(path: Path) -> int:
@@ -46,7 +46,7 @@ def main() -> None:
     def work(out: Path) -> None:
         out.mkdir()
         options = RunOptions(backend, "none", SystemConfig(), out, record=out / "a.npz", save_map=out / "a.map")
-        run(sequence, options, frontend=_Frontend())
+        run(sequence, options, frontend=Features())
 
     work(folder / "whole")
     start = time.monotonic()

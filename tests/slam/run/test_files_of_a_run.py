@@ -20,14 +20,14 @@ from slam.run import runner
 from slam.run.outputs import RunFiles
 from slam.run.recording import load_recording
 from slam.run.runner import RunOptions
-from tests.fuzz.runs import Scripted, _Frontend, disk_of
+from tests.fuzz.runs import Features, Scripted, disk_of
 
 LAST = ("trajectory_final.txt", "landmarks.csv", "summary.json")
 
 
 def run(tmp_path, backend="ekf", error=None, at=0, **more):
     options = RunOptions(backend, "none", SystemConfig(), tmp_path / "out", **more)
-    return runner.run(Scripted(error, at), options, frontend=_Frontend())
+    return runner.run(Scripted(error, at), options, frontend=Features())
 
 
 # --- single files ---
@@ -92,7 +92,7 @@ def test_a_disk_that_fills_up_half_way(tmp_path):
     options = RunOptions("ekf", "none", SystemConfig(), out)
     words = r"out: File too large; .*summary\.json: cannot be written: File too large$"
     with pytest.raises(SlamError, match=words) as caught, disk_of(10**6):
-        runner.run(Scripted(None, 0), options, frontend=_Frontend(), watches=[fill])
+        runner.run(Scripted(None, 0), options, frontend=Features(), watches=[fill])
     assert "\n" not in str(caught.value)
     assert (out / "trajectory.txt").read_text().count("\n") == 4
     assert (out / "frames.csv").read_text().count("\n") == 5
@@ -112,7 +112,7 @@ def test_one_last_file_that_fails_loses_no_other(tmp_path, bad):
 
     options = RunOptions("ekf", "none", SystemConfig(), tmp_path / "out", record=record, save_map=save_map)
     with pytest.raises(SlamError, match=bad) as caught:
-        runner.run(Late(None, 0), options, frontend=_Frontend())
+        runner.run(Late(None, 0), options, frontend=Features())
     assert str(caught.value).count("cannot be written") <= 2
     others = [p for p in (*(tmp_path / "out" / n for n in LAST), record, save_map) if p.name != bad]
     assert all(p.is_file() and p.stat().st_size for p in others)

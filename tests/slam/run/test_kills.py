@@ -11,7 +11,7 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.run.runner import RunOptions, run
-from tests.fuzz.runs import Scripted, _Frontend, require_whole
+from tests.fuzz.runs import Features, Scripted, require_whole
 
 ROOT = Path(__file__).parents[3]
 COUNT = 20
@@ -37,4 +37,4 @@ def test_twenty_kills_leave_whole_rows(tmp_path, backend):
     assert all(these == whole[: len(these)] for these in rows)  # the same frames, as far as they go
     assert len({len(these) for these in rows}) > 2
     for folder in tmp_path.iterdir():  # no lock is left
-        run(Scripted(None, 0), RunOptions(backend, "none", SystemConfig(), folder), frontend=_Frontend())
+        run(Scripted(None, 0), RunOptions(backend, "none", SystemConfig(), folder), frontend=Features())

@@ -10,7 +10,7 @@ import pytest
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.models import MotionModel
-from slam.run.outcome import median_depth, motion_doubt, outcome
+from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
 from slam.run.summary import RunRecord
 from tests.slam.scene import RIG as SCENE_RIG
 from tests.slam.scene import Cloud
@@ -64,6 +64,15 @@ def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, mo
     assert outcome(record(0, features=features), rig, **more).startswith(f"no frame was tracked; likely cause: {words}")
 
 
+def test_a_baseline_that_no_hand_carries_is_the_cause_unless_it_is_a_vehicle_s():
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 7.5, 320, 240)
+    run = replace(record(0), depths=[110.0] * 11)
+    assert "likely cause: by the calibration the cameras are 7.5 m apart and what they see is 110 m away" in outcome(
+        run, rig
+    )
+    assert "no hand" not in outcome(run, rig, driving=True)
+
+
 def moving(times_too_short: float, frames: int = 40, measured: bool = True) -> RunRecord:
     """A camera in a hand: its velocity changes as the motion model says, its stamps may be wrong."""
     rng = np.random.default_rng(0)
@@ -103,6 +112,26 @@ def test_the_median_depth_of_a_frame():
     depths = SCENE_RIG.triangulate(features.uv_left, features.uv_right)[:, 2]
     assert median_depth(features, SCENE_RIG) == pytest.approx(np.median(depths), rel=0.05)
     assert np.isnan(median_depth(replace(features, uv_right=features.uv_right * np.nan), SCENE_RIG))
+
+
+@pytest.mark.parametrize(
+    ("step", "depth", "driving", "words"),
+    [
+        (3.0, 200.0, False, "30 m/s and saw things 200 m away in the median, which no camera in a hand does"),
+        (3.0, 20.0, True, ""),
+        (0.01, 0.2, True, "0.1 m/s and saw things 0.2 m away in the median, which no vehicle does"),
+        (0.01, 0.2, False, ""),
+        (30.0, 2000.0, True, "by the calibration the cameras are 0.2 m apart; is that in metres?"),
+    ],
+)
+def test_a_baseline_in_another_unit_is_known_by_speed_and_distance(step, depth, driving, words):
+    poses = [exp(np.array([0, 0, 0, 0, 0, k * step])) for k in range(30)]
+    stamps = (0.1 * np.arange(30)).tolist()
+    run = RunRecord(stamps=stamps, poses=poses, measured=[True] * 30, depths=[depth] * 30)
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.2, 320, 240)
+    said = scale_doubt(run, rig, driving)
+    assert words in said and bool(words) == bool(said)
+    assert scale_doubt(replace(run, depths=[np.nan] * 30), rig, driving) == ""
 
 
 def test_a_vehicle_that_goes_sideways_is_doubted():

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.data import StereoFrame
 from slam.errors import MeasurementError, SequenceError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -24,7 +23,7 @@ from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.run.recorded import RecordedFrame
 from slam.run.recording import load_recording
 from slam.run.run_data import RunData
-from slam.run.runner import RunOptions, parse_frames, run
+from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"
@@ -96,14 +95,6 @@ def test_a_run_leaves_its_files(tmp_path, backend):
     assert config["in_force"]["backend"]
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_the_same_run_twice_gives_the_same_bytes(tmp_path, backend):
-    for name in ("a", "b"):
-        run(open_sequence(WORLD), options(tmp_path / name, backend))
-    for file in ("trajectory.txt", "trajectory_final.txt", "landmarks.csv"):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
-
-
 def test_kernels_are_loaded_before_a_live_run_takes_its_first_frame(tmp_path, monkeypatch):
     happened = []
 
@@ -118,13 +109,6 @@ def test_kernels_are_loaded_before_a_live_run_takes_its_first_frame(tmp_path, mo
     assert happened == [0, 1, 2]
     run(Recorded(3), options(tmp_path / "live", live=True))
     assert happened[3:] == ["ekf", 0, 1, 2]
-
-
-def test_frames_are_chosen(tmp_path):
-    summary = run(open_sequence(WORLD), options(tmp_path, start=3, stop=7))
-    assert summary["frames"] == 4
-    with (tmp_path / "frames.csv").open() as file:
-        assert [int(r["frame"]) for r in csv.DictReader(file)] == [3, 4, 5, 6]
 
 
 def test_a_fault_half_way_keeps_what_was_done(tmp_path):
@@ -178,24 +162,3 @@ def test_a_stopped_run_keeps_its_frames(tmp_path, kill):
         assert f"stopped by {kill.name}" in errors
         assert "stopped" in json.loads((tmp_path / "summary.json").read_text())["ended"]
         assert (tmp_path / "landmarks.csv").exists()
-
-
-def test_a_missing_right_image_is_no_error(tmp_path):
-    class OneEyed(Broken):
-        def frames(self, start=0, stop=None):
-            for frame in open_sequence(WORLD).frames():
-                yield StereoFrame(frame.index, frame.stamp, frame.left, None) if frame.index == 6 else frame
-
-    summary = run(OneEyed(0), options(tmp_path))
-    assert summary["frames"] == 12
-
-
-@pytest.mark.parametrize(("text", "range_"), [(None, (0, None)), ("3:9", (3, 9)), (":9", (0, 9)), ("3:", (3, None))])
-def test_ranges_of_frames(text, range_):
-    assert parse_frames(text) == range_
-
-
-@pytest.mark.parametrize("text", ["", "3", "a:b", "1:2:3"])
-def test_bad_ranges_of_frames(text):
-    with pytest.raises(SlamError, match="A:B"):
-        parse_frames(text)

@@ -3,7 +3,6 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +14,9 @@ from slam.object_data import MovingObject, ObjectEstimate
 from slam.run.outputs import RunFiles
 from slam.run.repeat import Origin
 from slam.run.runner import RunOptions, run
-from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, header, markdown
+from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, header
 from slam.sequences import open_sequence
 
-PAGE = Path(__file__).parents[3] / "docs" / "files.md"
 WORLD = "synthetic:aisle?frames=4&width=160&height=120"
 
 
@@ -95,12 +93,3 @@ def test_rows_of_objects_are_what_the_system_said(done):
             np.testing.assert_allclose(rotation(numbers[3:]), T[:3, :3], atol=1e-7)
         upper = [row[f"c{i}{j}"] for i in range(6) for j in range(i, 6)]
         np.testing.assert_allclose(upper, e.covariance[np.triu_indices(6)], rtol=1e-6)
-
-
-def test_the_page_has_the_columns_as_they_are():
-    text = PAGE.read_text(encoding="utf-8")
-    for name, table in TABLES.items():
-        assert f"`{name}`" in text
-        assert "\n".join(markdown(table)) in text, (
-            f"docs/files.md: the columns of {name} are not those of slam.run.schema"
-        )

@@ -3,7 +3,6 @@ from __future__ import annotations
 import sys
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from slam.config import SystemConfig
@@ -26,52 +25,6 @@ def test_without_a_display_one_line_says_what_to_do(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(SlamError, match=r"no display for a window; give a file, such as run\.rrd"):
         Viewer("live")
-
-
-class Unreachable:
-    """A recording whose viewer has gone."""
-
-    def log(self, *_, **__):
-        pass
-
-    def flush(self):
-        raise RuntimeError("\nno connection\nsee the manual")
-
-
-def test_a_window_that_was_closed_takes_nothing_from_the_run(monkeypatch, caplog):
-    monkeypatch.setattr("slam.run.viewer._rerun", lambda: SimpleNamespace(ViewCoordinates=SimpleNamespace(RDF=None)))
-    monkeypatch.setattr("slam.run.viewer._open", lambda rr, target: Unreachable())
-    with Viewer("live"):
-        pass
-    assert caplog.messages == ["viewer live: not all was shown: no connection"]
-    with pytest.raises(SlamError, match=r"a\.rrd: no connection$"), Viewer("a.rrd"):
-        pass
-    with pytest.raises(ZeroDivisionError), Viewer("a.rrd"):  # what went wrong first is what is said
-        1 / 0  # noqa: B018
-
-
-def test_places_and_loops_are_shown(monkeypatch):
-    logged = {}
-    shapes = SimpleNamespace(
-        ViewCoordinates=SimpleNamespace(RDF=None),
-        Points3D=lambda points, **_: points,
-        LineStrips3D=lambda strips, **_: strips,
-    )
-    recording = SimpleNamespace(log=lambda path, what, static: logged.update({path: what}), flush=lambda: None)
-    monkeypatch.setattr("slam.run.viewer._rerun", lambda: shapes)
-    monkeypatch.setattr("slam.run.viewer._open", lambda rr, target: recording)
-    at = np.arange(12.0).reshape(4, 3)
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    poses[:, :3, 3] = at
-    atlas = SimpleNamespace(
-        poses_in_map=lambda: poses, prior_count=1, loops=(SimpleNamespace(first=0, second=3),), refused=((1, 2), (0, 2))
-    )
-    with Viewer("live") as viewer:
-        viewer._draw_places(SimpleNamespace(atlas=atlas))
-    np.testing.assert_array_equal(logged["world/places/keyframes"], at)
-    np.testing.assert_array_equal(logged["world/places/path"], [at[1:]])
-    np.testing.assert_array_equal(logged["world/places/loops_closed"], at[[[0, 3]]])
-    np.testing.assert_array_equal(logged["world/places/loops_refused"], at[[[1, 2], [0, 2]]])
 
 
 @pytest.mark.filterwarnings("default")  # Rerun's own

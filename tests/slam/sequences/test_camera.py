@@ -178,7 +178,7 @@ def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
             slam.open_sequence(text)
     for text, words in {
         "camera:9": "cannot be opened",
-        "camera:0,1": "differ in size: 64x120 and 160x120",
+        "camera:0,1": "differ in size: camera:0,1, left is 64x120, .*right is 160x120",
         "camera:2": "161x120 cannot hold two side by side",
         "camera:3?wait=0": "gives no images",
     }.items():

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.errors import CalibrationError, SequenceError
 from slam.sequences import Sequence, formats, open_sequence
-from slam.sequences.oxts import imu_poses
+from slam.sequences.kitti_truth import imu_poses
 
 
 def levels(sequence: Sequence) -> list[tuple[int, int]]:
@@ -287,7 +287,7 @@ def test_kitti_raw_truth_needs_its_calibration(raw: Path) -> None:
 def test_kitti_raw_with_a_reflected_rectification(raw: Path) -> None:
     calibration = raw.parent / "calib_cam_to_cam.txt"
     calibration.write_text(calibration.read_text().replace("R_rect_00: 1 0 0", "R_rect_00: -1 0 0"))
-    with pytest.raises(CalibrationError, match="not a rotation"):
+    with pytest.raises(CalibrationError, match="not a rigid motion"):
         open_sequence(raw)
 
 

@@ -124,6 +124,13 @@ def test_words_for_left_and_right() -> None:
 # ------------------------------------------------------------------------------------------------ layouts
 
 
+@pytest.mark.parametrize("names", [("image_left", "image_right"), ("camera0", "camera1"), ("infra1", "infra2")])
+def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str]) -> None:
+    for usual, name in zip(("left", "right"), names):
+        (two_folders / usual).rename(two_folders / name)
+    assert in_order(open_sequence(f"{two_folders}?fps=10"))
+
+
 def test_one_folder_with_both_cameras_in_it(two_folders: Path) -> None:
     for side in ("left", "right"):
         for path in (two_folders / side).iterdir():

@@ -178,7 +178,7 @@ def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
     lines = (kitti / "calib.txt").read_text().splitlines()
     for row in ("P1: 0 0 0 0 0 0 0 0 0 0 0 0", "P1: 50 1 31.5 -25 0 50 23.5 0 0 0 1 0", "P1: 1 2 3"):
         (kitti / "calib.txt").write_text("\n".join([lines[0], row]))
-        refused(kitti, CalibrationError, r"calib\.txt: (not a rectified projection|P1 has 3 numbers)")
+        refused(kitti, CalibrationError, r"calib\.txt: (not a rectified projection|P1 is no matrix of shape)")
 
 
 def test_lists_that_are_none_are_named_with_the_row(euroc, kitti, raw, two_folders):
@@ -209,7 +209,7 @@ def test_images_that_never_pair(euroc, kitti, two_folders, build):
     refused(euroc, SequenceError, "the nearest two are 20 ms apart, 5 ms are allowed; see tolerance=")
     for path in (kitti / "image_1").iterdir():
         build.cut(path)
-    refused(kitti, SequenceError, r"no pair of images can be read: .*PNG is cut off")
+    refused(kitti, SequenceError, r"no pair of images can be read: .*cut off or damaged")
     for side in ("left", "right"):
         for path, name in zip(sorted((two_folders / side).iterdir()), "abcdef"):
             path.rename(path.with_name(f"{name}.png"))

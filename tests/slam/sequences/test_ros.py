@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError
-from slam.sequences.ros_images import COMPRESSED, RAW, grey_image
+from slam.sequences.ros_bag import COMPRESSED, RAW, grey_image
 
 WIDTH, HEIGHT = 64, 48
 T0 = 1_700_000_000_000_000_000
@@ -339,6 +339,30 @@ def test_depth_images_and_other_cameras_are_no_stereo_pair(tmp_path: Path) -> No
         SequenceError, match=rf"several stereo pairs, choose one: left={LEFT}&right={RIGHT}; left=/twin"
     ):
         slam.open_sequence(write(tmp_path / "more.bag", rows))
+
+
+def test_one_topic_with_both_images_side_by_side(tmp_path: Path) -> None:
+    store = STORES[1]
+    rows = [
+        ("/zed/image", RAW, T0 + k * STEP, image(store, T0 + k * STEP, np.hstack([picture(k), picture(k + 10)])))
+        for k in range(6)
+    ]
+    path = write(tmp_path / "zed.bag", rows)
+    (tmp_path / "five.yaml").write_text("fx: 50\nfy: 50\ncx: 31\ncy: 23\nbaseline: 0.12\n")
+    for named in ("", "&left=/zed/image"):
+        sequence = slam.open_sequence(f"{path}?layout=sbs&calibration=five.yaml{named}")
+        assert (sequence.rig.width, sequence.rig.height) == (WIDTH, HEIGHT)
+        assert seeds(sequence) == [(k, k + 10) for k in range(6)]
+        assert np.diff(sequence.stamps) == pytest.approx(1e-9 * STEP, abs=1e-6)
+    with pytest.raises(CalibrationError, match="no /zed/camera_info for /zed/image"):
+        slam.open_sequence(f"{path}?layout=sbs")
+    with pytest.raises(ConfigurationError, match="layout must be sbs"):
+        slam.open_sequence(f"{path}?layout=tb&calibration=five.yaml")
+    with pytest.raises(ConfigurationError, match="option 'tolerance' does nothing here"):
+        slam.open_sequence(f"{path}?layout=sbs&calibration=five.yaml&tolerance=0.1")
+    two = write(tmp_path / "two.bag", stereo(store))
+    with pytest.raises(SequenceError, match="2 topics of images, where layout=sbs needs one"):
+        slam.open_sequence(f"{two}?layout=sbs&calibration=five.yaml")
 
 
 def test_without_camera_messages_a_calibration_file_and_names_decide(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_carried_off_to_an_unknown_place_the_map_begins_anew(backend):
 def test_what_counts_as_lost():
     steps = [TrackingState()]
     for vague, features in ((False, 50), (False, 50), (False, 0), (True, 50), (True, 50)):
-        steps.append(steps[-1].after(False, vague, features, lost_after=3))
+        steps.append(steps[-1].after(False, False, vague, features, lost_after=3))
     assert [s.lost for s in steps] == [False, False, False, False, True, True]
     assert [s.may_add(4) for s in steps] == [True, False, False, False, False, True]
-    assert vars(steps[-1].after(True, True, 50, 3)) == vars(TrackingState())
+    assert vars(steps[-1].after(True, False, True, 50, 3)) == vars(TrackingState())

@@ -11,6 +11,7 @@ import slam
 from slam.data import StereoFeatures
 from slam.geometry.se3 import exp, inverse, transform
 from slam.tracks.standing import Standing
+from slam.tracks.state import HIDDEN
 from tests.slam.scene import RIG
 
 SIGMA = 0.3
@@ -111,6 +112,23 @@ def test_a_truck_that_passes_does_not_take_the_camera_along(backend):
         result = system.process_features(scene.seen(k, np.eye(4), shift, passes))
         farthest = max(farthest, float(np.linalg.norm(result.estimate.T_world_left[:3, 3])))
     assert farthest < 1e-2
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_what_fills_the_view_of_a_standing_vehicle_does_not_take_it_along(backend):
+    """It hides all for three seconds, so that a new map begins on it; then the old view is recognised."""
+    world, truck, results = Scene(0.0), Scene(1.0, seed=1), []
+    system = slam.StereoSlam(RIG, backend=backend, kind="driving")
+    for k in range(60):
+        shift = np.array([0.15 * (k - 25), 0.0, 0.0])
+        features = truck.seen(k, np.eye(4), shift, True) if 10 <= k < 40 else world.seen(k, np.eye(4), np.zeros(3))
+        results.append(system.process_features(features))
+    assert system.restarted
+    assert any(result.reason == HIDDEN for result in results)
+    positions = np.array([result.estimate.T_world_left[:3, 3] for result in results])
+    assert np.linalg.norm(positions, axis=1).max() < 2e-2
+    assert results[-1].status.value == "tracked"
+    assert results[35].estimate.covariance[3, 3] > 1.0 > 1e-3 > results[-1].estimate.covariance[3, 3]
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])

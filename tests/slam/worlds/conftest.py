@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from slam.worlds import WorldSequence, open_world
-from slam.worlds.geometry import rectangle
-from slam.worlds.scenes.common import assemble
+from slam.worlds.geometry import Parts, rectangle
+from slam.worlds.scenes import Scene, assemble
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ def board_world() -> Callable[..., WorldSequence]:
         ]
         w = base.world
         values = {**base.values, "density": 1e4}
-        world = assemble("board", w.kind, values, w.rig, w.stamps, w.T_world_left, walls, (0.3, 3.5), 640.0)
-        return WorldSequence("board", world, values)
+        parts = Parts(w.stamps, w.T_world_left, walls)
+        scene = Scene("boards", lambda _: parts, (0.3, 3.5), 640.0)
+        return WorldSequence("board", assemble("board", scene, values, parts), values)
 
     return make

@@ -1,15 +1,10 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from slam import worlds
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
-from slam.worlds.options import COMMON
-
-DOCS = Path(__file__).parents[3] / "docs" / "worlds.md"
 
 
 def test_an_unknown_world_is_answered_with_the_known_ones():
@@ -50,15 +45,6 @@ def test_impossible_values_are_refused_in_one_line(query, message):
     with pytest.raises(ConfigurationError, match=message) as caught:
         worlds.open_world(f"aisle?{query}")
     assert "\n" not in str(caught.value)
-
-
-def test_the_documentation_names_every_world_and_every_option():
-    text = DOCS.read_text(encoding="utf-8")
-    for name in worlds.names():
-        assert f"`{name}`" in text
-        assert all(f"`{key}`" in text for key in worlds.options(name)), name
-    for option in COMMON:
-        assert option.text in text, option.name
 
 
 def test_frames_outside_the_recording_are_refused():

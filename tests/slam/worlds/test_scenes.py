@@ -5,8 +5,7 @@ import pytest
 
 from slam.geometry.se3 import inverse, rotation_angle
 from slam.sequences import Sequence, open_sequence
-from slam.worlds import names, open_world
-from slam.worlds.scenes import aisle, box, startup
+from slam.worlds import indoors, names, open_world
 
 WITHOUT_A_FILE = [name for name in names() if name != "drive"]
 
@@ -42,8 +41,8 @@ def test_the_aisle_is_paper_a_s():
     assert sequence.values["rate"] == 30
     assert (sequence.rig.width, sequence.rig.height, sequence.rig.baseline) == (320, 240, 0.12)
     path = sequence.ground_truth.positions
-    assert path[-1, 0] - path[0, 0] == pytest.approx(aisle.LENGTH, abs=0.05)
-    distance = aisle.SHELF_Y - path[:, 1]
+    assert path[-1, 0] - path[0, 0] == pytest.approx(indoors.AISLE_LENGTH, abs=0.05)
+    distance = indoors.SHELF_Y - path[:, 1]
     assert 0.8 <= distance.min() < 1.0 < distance.max() <= 1.5
     forward = sequence.ground_truth.poses[:, :3, 2]
     assert (forward[:, 0] > 0.3).all() and (forward[:, 1] > 0.3).all(), "along the shelves and towards them"
@@ -51,7 +50,7 @@ def test_the_aisle_is_paper_a_s():
 
 def test_startup_camera_stands_where_paper_b_says_and_the_board_faces_it():
     sequence = open_world("startup?tremor=0")
-    assert np.allclose(sequence.ground_truth.positions, startup.CAMERA, atol=1e-12)
+    assert np.allclose(sequence.ground_truth.positions, indoors.CAMERA, atol=1e-12)
     on_board = sequence.landmarks.surface == 0
     assert on_board.sum() == 24
     assert np.abs(sequence.landmarks.positions[on_board, 1]).max() < 1e-12
@@ -59,8 +58,8 @@ def test_startup_camera_stands_where_paper_b_says_and_the_board_faces_it():
 
 def test_box_stands_at_the_places_of_table_1():
     sequence = open_world("box")
-    pause = round((box.REST + box.MOVE) * 30)
-    for i, (x, y, z, yaw, pitch, roll) in enumerate(box.PLACES):
+    pause = round((indoors.REST + indoors.MOVE) * 30)
+    for i, (x, y, z, yaw, pitch, roll) in enumerate(indoors.PLACES):
         T = sequence.objects(i * pause + 30).T_world_object[0]
         assert np.allclose(T[:3, 3], (x, y, z), atol=1e-12)
         a, b, c = np.deg2rad([yaw, pitch, roll])

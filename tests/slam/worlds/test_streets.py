@@ -10,8 +10,7 @@ from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.worlds import WorldSequence, open_world
 from slam.worlds.paths import camera_poses
-from slam.worlds.scenes import town
-from slam.worlds.scenes.streets import ASIDE
+from slam.worlds.streets import ASIDE
 
 LAP = 450  # frames of a round in `loop`
 SMALL = "width=310&height=94"
@@ -32,13 +31,6 @@ def loop(tmp_path_factory) -> Path:
 
 def opened(loop: Path, query: str = "") -> WorldSequence:
     return open_world(f"drive?path={loop}&{query}")
-
-
-def test_the_path_is_the_truth(loop):
-    sequence = opened(loop)
-    assert sequence.kind == "driving"
-    assert np.array_equal(sequence.ground_truth.poses, Trajectory.read_kitti(loop).poses)
-    assert len(opened(loop, "frames=7")) == 7
 
 
 def test_a_round_later_the_same_landmarks_are_seen(loop):
@@ -68,7 +60,7 @@ def test_no_house_stands_on_a_road_and_every_house_faces_it():
     for query in ("town", "town?layout=3"):
         sequence = open_world(query)
         path = cKDTree(sequence.ground_truth.positions[:, :2])
-        houses = [r for r in sequence.world.rectangles if hasattr(r.texture, "windows")]
+        houses = [r for r in sequence.world.rectangles if r.texture.material == "facade"]
         assert len(houses) > 60
         for house in houses:
             along = np.linspace(0, 1, 20)[:, None] * house.along
@@ -80,12 +72,10 @@ def test_no_house_stands_on_a_road_and_every_house_faces_it():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cars", "same"), [("same", True), ("other", False), ("none", True)])
-def test_a_round_later_images_are_the_same_but_for_other_cars(loop, cars, same):
-    sequence = opened(loop, f"{SMALL}&noise=0&supersample=1&cars={cars}")
+def test_a_round_later_images_are_the_same(loop):
+    sequence = opened(loop, f"{SMALL}&noise=0&supersample=1")
     first, later = sequence.frame(20).left.astype(int), sequence.frame(20 + LAP).left.astype(int)
-    differ = np.mean(np.abs(first - later) > 20)
-    assert differ < 1e-3 if same else 0.005 < differ < 0.3
+    assert np.mean(np.abs(first - later) > 20) < 1e-3
 
 
 def test_the_town_is_driven_again_in_both_directions():
@@ -99,7 +89,6 @@ def test_the_town_is_driven_again_in_both_directions():
     assert len(np.unique(again[far][cosine > 0.95])) > 150
     assert len(np.unique(again[far][cosine < -0.95])) > 100
     assert np.ptp(truth.positions[:, 2]) < 0.2
-    assert len(town.CORNERS) == 11
 
 
 def test_a_wrong_calibration_is_told_and_the_true_one_records():

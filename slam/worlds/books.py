@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
-from slam.worlds.textures import layout, paint
-from slam.worlds.textures.paint import Area, Colour
+from slam.worlds import brushes as paint
+from slam.worlds import surfaces as layout
+from slam.worlds.brushes import Colour
 
 _WOOD = (110.0, 150.0, 190.0)
-
 _BLACK, _CONTRAST = 14, 1.25  # so that a detector finds about as many features as in photographs of shelves
-
 #: Cloth and paper of bindings, BGR.
 _BINDINGS = np.array(
     [
@@ -23,17 +24,11 @@ _BINDINGS = np.array(
 _INKS = ((225.0, 235.0, 240.0), (90.0, 190.0, 220.0), (25.0, 25.0, 25.0), (50.0, 50.0, 160.0))
 
 
-def paint_bay(area: Area, books: layout.Books, number: int, last: bool, seed: int, density: float) -> np.ndarray:
-    """The picture of one bay of a wall of shelves, BGR uint8.
-
-    Args:
-        area: height, width [m].
-        books: of the whole wall, from the bay's left edge.
-        number: of the bay, from the left.
-        last: whether it is the last one.
-        seed: which wall.
-        density: texels per metre.
-    """
+def paint_bay(bay: layout.Bay, density: float) -> np.ndarray:
+    """The picture of one bay of a wall of shelves, BGR uint8, `density` texels per metre."""
+    area, number, last, seed = (bay.height, bay.width), bay.number, bay.last, bay.wall.seed
+    books = layout.books_of(bay.wall)
+    books = replace(books, left=books.left - bay.left)
     rng = np.random.default_rng([seed, 61, number])
     size = round(area[0] * density), round(area[1] * density)
     cloth = 1 + 0.04 * rng.standard_normal(size, np.float32) + 0.04 * paint.clouds(size, rng, 0.012 * density, 2)

@@ -7,8 +7,8 @@ import numpy as np
 
 Colour = tuple[float, float, float]  #: blue, green, red
 Area = tuple[float, float]  #: height, width [m]
+Size = tuple[int, int]  #: rows, columns
 Box = tuple[float, float, float, float]  #: left, top, width, height [texels]
-
 _LETTERS = "ABCDEFGHIJKLMNOPRSTUVWZ"
 _FONTS = (
     cv2.FONT_HERSHEY_SIMPLEX,

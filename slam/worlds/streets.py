@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from slam.data import IdArray
 from slam.geometry.se3 import Array, pose
-from slam.worlds.drives import SAME_ROAD, STEP, Road
-from slam.worlds.geometry import Rectangle, rectangle
+from slam.geometry.trajectory import Trajectory
+from slam.worlds.drives import EYE, SAME_ROAD, STEP, Road, around_blocks, level, read_path, sampled
+from slam.worlds.geometry import Parts, Rectangle, rectangle
 from slam.worlds.paths import yaw_pitch_roll
-from slam.worlds.scenes.roadside import cabinet, trunk
-from slam.worlds.textures.surfaces import Facade, Material
+from slam.worlds.roadside import cabinet, car, trunk
+from slam.worlds.surfaces import Material, facade
 
-EYE = 1.65  #: height of the camera above the ground [m]
 ASIDE = 9.0  #: from a road's middle to the house fronts [m]
 STRETCH = 48.0  #: streets are built in stretches of this length [m], so that one can be like another
-
 _HOUSES = 4  # on each side of a stretch
 _NARROWEST = 3.0  # of a house front [m]
 _BENT = 0.5  # most that the road turns along one front [rad]
@@ -34,6 +34,26 @@ _AROUND = 16  # samples ahead and behind between which a road is straight where 
 _TILE = 12.0  # edges of the ground's parts [m]
 _LAP = 0.3  # by which these overlap where the ground is not level [m]
 _SMOOTHED = 6.0  # standard deviation of the mean that gives the ground's height [m]
+
+
+def drive(values: Mapping[str, Any]) -> Parts:
+    """A town along the path of a file; raises SequenceError where the file is no path."""
+    return _town(read_path(values["path"]), values)
+
+
+def town(values: Mapping[str, Any]) -> Parts:
+    """Streets around two blocks, driven again in the same direction and in the opposite one."""
+    return _town(around_blocks(values["layout"]), values)
+
+
+def _town(path: Trajectory, values: Mapping[str, Any]) -> Parts:
+    """Streets along a path, in the path's own axes, and the drive along them."""
+    R = level(path)  # to level axes
+    streets = Streets(Road.along(path.positions @ R.T), values["layout"])
+    drive = sampled(path, values)
+    level_parts = streets.houses() + streets.furniture() + streets.ground() + streets.parked_cars()
+    parts = [replace(r, origin=R.T @ r.origin, along=R.T @ r.along, down=R.T @ r.down) for r in level_parts]
+    return Parts(drive.stamps, drive.poses, parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +94,9 @@ class Streets:
     Args:
         road: the roads.
         layout: seed of what stands where.
-        alike: share of stretches that are copies of others.
     """
 
-    def __init__(self, road: Road, layout: int, alike: float) -> None:
+    def __init__(self, road: Road, layout: int) -> None:
         self._road = road
         self._layout = layout
         self._tree = cKDTree(road.xy)
@@ -91,7 +110,6 @@ class Streets:
             self._low = self._high = np.full(len(near), np.median(heights))
             self._foundation = 0.0
         self._stretch = np.floor((road.way - road.way[0]) / STRETCH).astype(int)
-        self._source = _sources(int(self._stretch[-1]) + 1, alike, layout)
 
     def houses(self) -> list[Rectangle]:
         """House fronts along both sides of every road, and across both ends of the path."""
@@ -123,10 +141,10 @@ class Streets:
                 width = float(plan.widths[house])  # as it is wherever the same house stands
             spread = float((self._high - self._low)[before].max())
             height = float(plan.heights[house]) + (float(np.ceil(spread)) if spread > 0.5 else 0.0)
-            facade = Facade(round(width, 2), height, plan.seed + house + 4 * part)
+            front = facade(round(width, 2), height, plan.seed + house + 4 * part)
             start, end = ends if side > 0 else ends[::-1]
             top = float(self._low[before].min()) - self._foundation + height
-            yield rectangle(facade, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
+            yield rectangle(front, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
 
     def _pieces(self, first: float, last: float, side: int) -> Iterator[tuple[float, float, int]]:
         """From where to where each house front reaches [m along the path], and its number where a house is bent."""
@@ -155,7 +173,7 @@ class Streets:
 
     def _plan(self, stretch: int, side: int) -> Plan:
         """What stands on a side of a stretch."""
-        return _plan(self._layout, int(self._source[min(stretch, len(self._source) - 1)]), side)
+        return _plan(self._layout, min(stretch, int(self._stretch[-1])), side)
 
     def _ends(self) -> list[Rectangle]:
         """House fronts across the road behind the start and beyond the end, unless other roads run there."""
@@ -166,10 +184,10 @@ class Streets:
             if np.abs(self._road.way[rows] - self._road.way[row]).max() > 3 * ASIDE:
                 continue
             plan = self._plan(int(self._stretch[row]), 1)
-            facade = Facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
+            front = facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
             start = middle - to_left * ASIDE * left
-            top = float(self._low[row]) - self._foundation + facade.height
-            out.append(rectangle(facade, (*start, top), (*(to_left * left), 0), (0, 0, -1), occludes=True))
+            top = float(self._low[row]) - self._foundation + front.height
+            out.append(rectangle(front, (*start, top), (*(to_left * left), 0), (0, 0, -1), occludes=True))
         return out
 
     def furniture(self) -> list[Rectangle]:
@@ -183,12 +201,13 @@ class Streets:
             out += [] if T is None else cabinet(T, plan.seed + 20 + number)
         return out
 
-    def parking(self) -> Iterator[tuple[Array, int]]:
-        """Poses (4, 4) of parked cars, and seeds of their looks."""
+    def parked_cars(self) -> list[Rectangle]:
+        """Cars parked at both sides."""
+        out = []
         for way, side, plan, number in self._places("cars"):
             T = self._pose(way, side, _CAR_ASIDE)
-            if T is not None:
-                yield T, plan.seed + 30 + number
+            out += [] if T is None else car(T, plan.seed + 30 + number)
+        return out
 
     def _places(self, what: str) -> Iterator[tuple[float, int, Plan, int]]:
         """Distance along the path, side, plan and number of everything of one kind."""
@@ -242,13 +261,3 @@ class Streets:
         texture = Material(edge, edge, "asphalt", 100 * self._layout + number, 0.3, (0.05, 0.3))
         along, down = np.array([1, 0, slope_x]) * edge, np.array([0, -1, -slope_y]) * edge
         return Rectangle(np.array([*xy, height]), along, down, texture)
-
-
-def _sources(count: int, alike: float, layout: int) -> IdArray:
-    """Which stretch each stretch looks like (count,): itself, or for a share `alike` another one."""
-    rng = np.random.default_rng([layout, 52])
-    copies = rng.random(count) < alike
-    originals = np.flatnonzero(~copies) if not copies.all() else np.array([0])
-    source = np.arange(count)
-    source[copies] = rng.choice(originals, int(copies.sum()))
-    return source

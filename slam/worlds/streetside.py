@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.geometry.se3 import Array
-from slam.worlds.textures import paint
-from slam.worlds.textures.paint import Area, Colour
-
-Size = tuple[int, int]
+from slam.worlds import brushes as paint
+from slam.worlds.brushes import Colour, Size
+from slam.worlds.surfaces import Material, scattered, windows
 
 _WALLS: tuple[Colour, ...] = (
     (150, 190, 215),
@@ -18,24 +16,15 @@ _WALLS: tuple[Colour, ...] = (
     (160, 175, 180),
     (120, 165, 200),
 )
-
 _PAINTS: tuple[Colour, ...] = (
     (40, 40, 150), (130, 80, 40), (60, 60, 60), (185, 190, 195), (215, 220, 222), (70, 110, 60), (30, 32, 35),
 )  # fmt: skip
 
 
-def paint_facade(area: Area, windows: Array, spots: Array, seed: int, density: float) -> np.ndarray:
-    """The picture of a house front, BGR uint8, `density` texels per metre.
-
-    Args:
-        area: height, width [m].
-        windows: (M, 4) left, top, width, height [m].
-        spots: what is scattered on the wall (N, 3): x, y, diameter [m].
-        seed: which house.
-        density: texels per metre.
-    """
-    rng = np.random.default_rng([seed, 64])
-    size = round(area[0] * density), round(area[1] * density)
+def house_front(house: Material, density: float) -> np.ndarray:
+    """The picture of a house front, BGR uint8, `density` texels per metre."""
+    rng = np.random.default_rng([house.seed, 64])
+    size = round(house.height * density), round(house.width * density)
     colour = _WALLS[int(rng.integers(len(_WALLS)))]
     light = 1 + 0.06 * paint.clouds(size, rng, 1.5 * density, 5) + 0.03 * rng.standard_normal(size, np.float32)
     canvas = paint.tinted(light, colour)
@@ -45,10 +34,10 @@ def paint_facade(area: Area, windows: Array, spots: Array, seed: int, density: f
     base = 0.7 * density
     paint.bar(canvas, (0, size[0] - base, width, base), (95.0, 100.0, 105.0))
     paint.bar(canvas, (0, 0, width, 0.35 * density), (70.0, 80.0, 110.0))
-    for left, top, w, h in windows * density:
+    for left, top, w, h in windows(house) * density:
         _window(canvas, (left, top, w, h), density, rng)
     _door(canvas, size, density, rng)
-    for x, y, diameter in spots * density:
+    for x, y, diameter in scattered(house) * density:
         darker = rng.uniform(0.55, 0.85)
         shade = (colour[0] * darker, colour[1] * darker, colour[2] * darker)
         paint.bar(canvas, (x - diameter / 2, y - diameter / 6, diameter, diameter / 3), shade)

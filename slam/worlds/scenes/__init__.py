@@ -1,1 +1,0 @@
-"""The built-in worlds, a module each: ``TEXT``, ``OPTIONS``, ``DEFAULTS`` and ``build(values) -> World``."""

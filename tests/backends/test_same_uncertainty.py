@@ -1,0 +1,77 @@
+"""Where measurements say little, back ends that assume the same still say the same, and how unsure they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import backends
+from backends.smoother.landmarks import Landmarks
+from slam.data import Observations
+from slam.geometry import se3
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.models import EstimatorModels, MotionModel
+from tests.backends.scenes import RIG, path, scene, step
+
+MODELS = EstimatorModels(
+    MotionModel(0.3, 0.3), pixel_sigma=0.05, initial_position_sigma=1e-6, initial_rotation_sigma=1e-7
+)
+OTHERS = [name for name in backends.names() if name != "ekf"]
+
+
+def made(name: str, rig: StereoRig):
+    return backends.create(name, rig, models=MODELS, **({"motion": 0.0} if name == "smoother" else {}))
+
+
+def deviations(backend) -> np.ndarray:
+    return np.sqrt(np.diag(backend.estimate().covariance))
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_frames_that_see_nothing_at_uneven_times_leave_the_same_uncertainty(name):
+    """The motion model alone: its derivatives by both earlier poses count, and the lengths of the intervals."""
+    data = scene(path(6, 0.1, np.array([0.05, 0.0, 0.3]), np.array([0.0, 0.05, 0.0])), 60, 0.05, limit=20)
+    filtered, other = (made(each, RIG) for each in ("ekf", name))
+    for backend in (filtered, other):
+        known: set[int] = set()
+        for stamp, _, seen in data:
+            step(backend, stamp, seen, known)
+        for stamp in (0.75, 0.85, 1.35):
+            backend.predict(stamp)
+            backend.update(data.observations[-1].select(np.zeros(0, int)))
+    np.testing.assert_allclose(deviations(other), deviations(filtered), rtol=0.02)
+    off = se3.log(se3.inverse(filtered.estimate().T_world_left) @ other.estimate().T_world_left)
+    assert np.abs(off / deviations(filtered)).max() < 0.02
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_noise_is_that_of_the_rigs_own_pixels(name):
+    """Rectified pixels of this rig are a quarter finer than those of the left camera, and as fine as the right one's.
+
+    The filter measures in the rig's own pixels; the others take all rectified ones to be as noisy as the left ones.
+    """
+    left, right = PinholeCamera(400, 400, 320, 240, 641, 481), PinholeCamera(500, 500, 320, 240, 641, 481)
+    rig = StereoRig(left, right, se3.so3_exp(np.array([0.01, 0.02, 0.0])), np.array([-0.3, 0.0, 0.0]))
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (40, 2)), rng.uniform(3, 6, 40)])
+    seen = Observations(np.arange(40), *rig.project(points))
+    filtered, other = (made(each, rig) for each in ("ekf", name))
+    for backend in (filtered, other):
+        backend.predict(0.0)
+        backend.add(seen)
+        backend.predict(0.1)
+        backend.update(seen)
+    ratio = deviations(other) / deviations(filtered)
+    assert ratio.min() > 0.98 and ratio.max() < 1.28, ratio
+
+
+def test_drift_adds_up_while_a_landmark_is_not_seen():
+    none, certain = np.zeros((1, 3, 3)), 1e-4 * np.eye(3)[None]
+    marks = Landmarks.of(np.array([0]), 0, np.array([[0.0, 0.0, 5.0]]), certain, none, world=False)
+    unseen, drift = np.zeros(0, np.intp), np.diag([1e-6, 2e-6, 3e-6, 1e-5, 2e-5, 3e-5])
+    once = marks.left_behind(unseen, np.eye(4), drift)
+    twice = once.left_behind(unseen, np.eye(4), drift)
+    assert np.trace(once.away[0]) > 1e-5
+    np.testing.assert_allclose(twice.away, 2 * once.away)
+    np.testing.assert_allclose(twice.from_newest, certain + twice.away)

@@ -1,0 +1,272 @@
+"""Thirty faults of one line each, put into a copy of the package one after another: do the tests find them?
+
+    python tests/seeded_faults.py            # all of them: an hour or two, so by hand or at night
+    python tests/seeded_faults.py window     # those whose name, file or tests hold this word
+    python tests/seeded_faults.py --near     # only the test files nearest to each fault, not the rest after them
+
+Prints a line for each fault, with the first test that fails. Exit status 1 where a fault is not found.
+`tests/test_seeded_faults.py` checks that every old line still stands in the code, once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+_LONGEST = 1800  # of the tests after one fault [s]; what takes longer hangs, and is found
+_LEFT_OUT = ("tests/test_seeded_faults.py", "tests/test_parameters.py", "tests/test_docs_site.py")  # read the source
+
+
+class Fault(NamedTuple):
+    """A line of a file, what stands there instead, and the tests nearest to it."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: str
+
+
+FAULTS = (
+    # the filter
+    Fault(
+        "turning the camera moves points the wrong way", "backends/ekf/measurement.py",
+        "by_pose = np.concatenate([-by_point, J @ turned.reshape(-1, 3, 3)], axis=2)",
+        "by_pose = np.concatenate([-by_point, -J @ turned.reshape(-1, 3, 3)], axis=2)",
+        "tests/backends/test_ekf_parts.py tests/backends/test_ekf.py",
+    ),
+    Fault(
+        "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
+        "X = self.cross - V @ V_left.T", "X = self.cross.copy()",
+        "tests/backends/test_ekf_parts.py tests/backends/test_rest.py tests/backends/test_ekf.py",
+    ),
+    Fault(
+        "no process noise", "backends/ekf/covariance.py",
+        "own = rows[:, :CAMERA] @ J.T + noise", "own = rows[:, :CAMERA] @ J.T",
+        "tests/backends/test_ekf.py tests/backends/test_ekf_parts.py",
+    ),
+    Fault(
+        "landmarks start without their measurement's noise", "backends/ekf/covariance.py",
+        "own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise",
+        "own.reshape(len(J), 3, len(J), 3)[each, :, each] += 0 * noise",
+        "tests/backends/test_ekf.py tests/backends/test_ekf_parts.py",
+    ),
+    Fault(
+        "one wrong match takes out its neighbours", "backends/ekf/solve.py",
+        "used = used & (excess <= max(1.0, 0.5 * worst))", "used = used & (excess <= 1.0)",
+        "tests/backends/test_ekf_robustness.py tests/backends/test_ekf_parts.py",
+    ),
+    # the smoother
+    Fault(
+        "a landmark out of view forgets earlier drift", "backends/smoother/landmarks.py",
+        "away[unseen] += by_pose @ drift @ np.swapaxes(by_pose, 1, 2)",
+        "away[unseen] = by_pose @ drift @ np.swapaxes(by_pose, 1, 2)",
+        "tests/backends/test_same_uncertainty.py tests/backends/test_smoother.py tests/backends/test_contract.py",
+    ),
+    Fault(
+        "what is known of a landmark beforehand is lost from its covariance", "backends/smoother/landmarks.py",
+        "own[seen] = inverses(all_rows[seen] + self.information[seen])", "own[seen] = inverses(all_rows[seen])",
+        "tests/backends/test_insert.py tests/backends/test_smoother.py",
+    ),
+    Fault(
+        "pixel noise not scaled to the rectified image", "backends/smoother/factors.py",
+        "self.sigma = models.pixel_sigma * stereo.scale", "self.sigma = models.pixel_sigma",
+        "tests/backends/test_same_uncertainty.py tests/backends/test_smoother.py tests/backends/test_agreement.py",
+    ),
+    # the sliding window
+    Fault(
+        "a landmark that joins the prior counts twice", "backends/window/slide.py",
+        "free[joins | ends] = 0.0", "free[ends] = 0.0",
+        "tests/backends/test_window.py tests/backends/test_insert.py",
+    ),
+    Fault(
+        "the prior's information vector is not moved with its reference", "slam/window/marginal.py",
+        "vector[at] = A.T @ vector", "vector[at] = 0.0",
+        "tests/slam/window tests/backends/test_window.py",
+    ),
+    Fault(
+        "a point's derivative by inverse distance forgets its direction", "slam/window/kernels.py",
+        "E[m, i, 2] = -(e[i, 2] + a * e[i, 0] + b * e[i, 1]) * r * r", "E[m, i, 2] = -e[i, 2] * r * r",
+        "tests/slam/window tests/backends/test_window.py",
+    ),
+    Fault(
+        "a pose relative to the reference changes the wrong way", "slam/window/kernels.py",
+        "A[at + i, j] = (1.0 if i == j else 0.0) if p == 0 else -Ad[i, j]",
+        "A[at + i, j] = (1.0 if i == j else 0.0) if p == 0 else Ad[i, j]",
+        "tests/slam/window tests/backends/test_window.py",
+    ),
+    Fault(
+        "the gate of a left pixel alone has three degrees of freedom", "slam/window/gating.py",
+        "dof = np.where(np.isnan(residuals[:, 2]), 2, 3)", "dof = np.where(np.isnan(residuals[:, 2]), 3, 3)",
+        "tests/slam/window tests/backends/test_window.py",
+    ),
+    Fault(
+        "unequal frame intervals in the motion's derivative", "slam/window/motion.py",
+        "J0[3:, 3:] = -s * R2.T @ R0", "J0[3:, 3:] = -R2.T @ R0",
+        "tests/slam/window/test_motion.py tests/slam/window tests/backends/test_window.py",
+    ),
+    # the batch solution
+    Fault(
+        "velocity's derivative by the middle pose", "backends/batch.py",
+        "r, by_pose = r - before, [-J[0], by_pose[0] - J[1], by_pose[1]]",
+        "r, by_pose = r - before, [-J[0], by_pose[0], by_pose[1]]",
+        "tests/backends/test_same_uncertainty.py tests/backends/test_batch.py tests/backends/test_agreement.py",
+    ),
+    Fault(
+        "the earlier velocity is taken over the later interval", "backends/batch.py",
+        "earlier = interval if first else float(dt[i - 1])", "earlier = interval",
+        "tests/backends/test_same_uncertainty.py tests/backends/test_batch.py",
+    ),
+    # tracks
+    Fault(
+        "a second feature that is as near counts for nothing", "slam/tracks/follow_kernels.py",
+        "elif d < second[row]:  # also one that is as near as the first",
+        "elif nearest[row] < d < second[row]:",
+        "tests/slam/tracks",
+    ),
+    Fault(
+        "a match need not be mutual", "slam/tracks/follow_kernels.py",
+        "mutual = allowed[p] and d == nearest[row] and d <= of_column[columns[p]]",
+        "mutual = allowed[p] and d == nearest[row]",
+        "tests/slam/tracks",
+    ),
+    Fault(
+        "withheld landmarks count as missed", "slam/tracks/table.py",
+        "view = view[~back[view]]", "view = view[:]",
+        "tests/slam/tracks tests/slam/mapping",
+    ),
+    Fault(
+        "a hidden landmark counts as missed", "slam/tracks/visibility.py",
+        "out[rows] = ~hidden_landmarks(view, rows, features, radius)", "out[rows] = True",
+        "tests/slam/tracks tests/slam/mapping",
+    ),
+    # moving bodies
+    Fault(
+        "a body's points are compared with where it stands now, not where it stood", "slam/objects/following.py",
+        "local = transform(inverse(body.T_before), places)", "local = transform(inverse(body.T), places)",
+        "tests/slam/objects/test_first_sight.py tests/slam/objects",
+    ),
+    Fault(
+        "noise of depth counts as a body's own extent", "slam/objects/points.py",
+        "values, axes = np.linalg.eigh(total - noise)", "values, axes = np.linalg.eigh(total)",
+        "tests/slam/objects/test_first_sight.py tests/slam/objects",
+    ),
+    Fault(
+        "a body's point counts twice as its frame leaves", "slam/objects/belief.py",
+        "rows, places = rows.select(~taken & (rows.pose > 0)), places.select(~there & (places.pose > 0))",
+        "rows, places = rows.select(rows.pose > 0), places.select(~there & (places.pose > 0))",
+        "tests/slam/objects/test_first_sight.py tests/slam/objects",
+    ),
+    # the front end
+    Fault(
+        "weight of the mixed derivative in the response", "frontends/surf/localisation.py",
+        "return dxx * dyy - 0.81 * dxy * dxy", "return dxx * dyy - 0.9 * dxy * dxy",
+        "tests/frontends/test_localisation.py tests/frontends",
+    ),
+    Fault(
+        "a quarter of the wavelets of a turned descriptor has the wrong sign", "frontends/surf/descriptor.py",
+        "dx, dy = (falling + rising) * weights[i, j], (falling - rising) * weights[i, j]",
+        "dx, dy = (falling + rising) * weights[i, j], (rising - falling) * weights[i, j]",
+        "tests/frontends",
+    ),
+    # keyframes and loops
+    Fault(
+        "a relative pose's covariance forgets the turn between its frames", "slam/mapping/atlas/pose_graph.py",
+        "J = np.concatenate([-adjoint(inverse(T)), np.eye(6)], axis=1)",
+        "J = np.concatenate([-np.eye(6), np.eye(6)], axis=1)",
+        "tests/slam/mapping",
+    ),
+    Fault(
+        "a loop is tested without its own covariance", "slam/mapping/atlas/consensus.py",
+        "return distance(T, loop.T_first_second, P + loop.covariance)", "return distance(T, loop.T_first_second, P)",
+        "tests/slam/mapping/atlas/test_disagreement.py tests/slam/mapping",
+    ),
+    Fault(
+        "errors of earlier stretches are counted again", "slam/mapping/atlas/chain.py",
+        "total -= total[begin]", "total -= 0 * total[begin]",
+        "tests/slam/mapping",
+    ),
+    # calibration
+    Fault(
+        "the baseline's forward part moves rows the wrong way", "slam/calibration/model_kernels.py",
+        "out[p, 19], out[p, 20] = d * focal, -d * y * focal", "out[p, 19], out[p, 20] = d * focal, d * y * focal",
+        "tests/slam/calibration",
+    ),
+    Fault(
+        "the spread between the prior's scales is left out", "slam/calibration/posterior.py",
+        "inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)",
+        "inner = np.tensordot(weights, covariances, axes=1)",
+        "tests/slam/calibration/test_posterior.py tests/slam/calibration",
+    ),
+)  # fmt: skip
+
+
+def main() -> int:
+    """Try the faults that the command line names; the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("words", nargs="*", help="only faults whose name, file or tests hold one of these")
+    parser.add_argument("--near", action="store_true", help="only the tests nearest to each fault")
+    parser.add_argument("--processes", type=int, default=2, help="pytest's")
+    given = parser.parse_args()
+    chosen = [
+        f for f in FAULTS if not given.words or any(w in " ".join((f.name, f.file, f.tests)) for w in given.words)
+    ]
+    found = 0
+    with tempfile.TemporaryDirectory() as scratch:
+        tree = Path(scratch) / "tree"
+        shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".git", ".*_cache", "results-*"))
+        for number, fault in enumerate(chosen, start=1):
+            begun = time.monotonic()
+            by = _found_by(tree, fault, given.near, given.processes)
+            found += by is not None
+            took = f"{time.monotonic() - begun:.0f} s"
+            print(f"{number:2} {fault.file}: {fault.name}: {by or 'NOT FOUND'} ({took})", flush=True)
+    print(f"{found} of {len(chosen)} found")
+    return 0 if found == len(chosen) else 1
+
+
+def _found_by(tree: Path, fault: Fault, near: bool, processes: int) -> str | None:
+    """The first test that fails with the fault in the copy, which is as before afterwards; None where none does."""
+    path = tree / fault.file
+    text, times = path.read_text(encoding="utf-8"), path.stat()
+    path.write_text(text.replace(fault.old, fault.new), encoding="utf-8")
+    try:
+        nearest = _failure(tree, [*fault.tests.split()], processes)
+        if nearest is not None or near:
+            return nearest
+        return _failure(tree, ["tests", *(f"--ignore={path}" for path in fault.tests.split())], processes)
+    finally:
+        path.write_text(text, encoding="utf-8")
+        os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # compiled kernels stay valid
+
+
+def _failure(tree: Path, tests: list[str], processes: int) -> str | None:
+    """The first test that fails, or None."""
+    words = [
+        sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-n", str(processes), "-p", "no:cacheprovider",
+        *(f"--ignore={path}" for path in _LEFT_OUT), *tests,
+    ]  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    try:
+        run = subprocess.run(words, cwd=tree, env=environment, capture_output=True, text=True, timeout=_LONGEST)
+    except subprocess.TimeoutExpired:
+        return "hangs"
+    if run.returncode == 0:
+        return None
+    named = re.search(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.MULTILINE)
+    if named is None:
+        raise SystemExit(f"pytest itself failed:\n{run.stdout[-2000:]}{run.stderr[-2000:]}")
+    return named[1]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

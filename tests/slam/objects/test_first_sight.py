@@ -1,0 +1,57 @@
+"""What a body gives to its points: where it takes young ones, how deep it is, and what is left of one given up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam.data import StereoFeatures
+from slam.geometry.se3 import transform
+from slam.objects.belief import slid
+from slam.objects.config import ObjectsConfig
+from slam.objects.estimator import FRAMES
+from slam.objects.following import follow
+from slam.objects.points import shape_of
+from slam.window.problem import Carried
+from slam.window.stereo import RectifiedStereo
+from tests.slam.objects.body_scene import box_scene
+from tests.slam.objects.body_scene import follow as follow_body
+from tests.slam.objects.test_recovery import POINTS, RIG, SIGMA, scene
+
+
+def test_a_body_takes_points_along_that_are_too_young_for_a_velocity():
+    body, tracks, _, _ = scene(4, np.zeros(6), np.random.default_rng(3))
+    before = body.T.copy()
+    before[0, 3] -= 3.0  # 140 px: its speed and the noise of depth allow 1.9 m
+    points = np.append(POINTS, [[0.1, 0.1, 0.0]], axis=0)
+    uv, uv_right = RIG.project(transform(body.T, points))
+    features = StereoFeatures(
+        0.0, uv, uv_right, np.ones(5), np.zeros(5), np.ones(5), np.ones(5, np.int8), np.eye(5, 64, dtype=np.float32)
+    )
+    (young,) = tracks.begin(np.array([10]), features, np.array([4]), transform(before, points[4:]))
+    local, config = RIG.triangulate(uv, uv_right), ObjectsConfig(max_speed=1.0)
+    follow(tracks, {1: replace(body, T_before=before)}, [], np.eye(4), features, local, 0.1, RIG, SIGMA, config)
+    assert tracks.row[young] == 4
+
+
+def test_the_noise_of_depth_is_no_extent():
+    rng = np.random.default_rng(0)
+    noise = np.array([0.02, 0.02, 0.6])
+    points = rng.uniform(-1, 1, (400, 3)) + noise * rng.standard_normal((400, 3))
+    shape = shape_of(points, np.tile(np.diag(noise**2), (400, 1, 1)))
+    assert np.diag(shape.covariance) == pytest.approx([1 / 3] * 3, rel=0.25)  # with the noise: 0.69 in depth
+
+
+def test_a_point_that_was_given_up_leaves_with_all_its_measurements():
+    """They are in what is known of the others from then on: kept as well, they would count twice."""
+    scene_ = box_scene(0, FRAMES + 3)
+    *_, (_, b, _) = follow_body("ekf", scene_)
+    member = next(p for p in b.prior.points.tolist() if (b.rows.point == p).any() and b.points.ids[p] >= 0)
+    ids = b.points.ids.copy()
+    ids[member] = -1
+    given_up = replace(b, points=replace(b.points, ids=ids))
+    after = slid(given_up, RectifiedStereo.of(scene_.rig), Carried.none(), 0.0)
+    assert b.points.ids[member] not in after.points.ids
+    assert len(after.points) == len(slid(b, RectifiedStereo.of(scene_.rig), Carried.none(), 0.0).points) - 1
