@@ -30,8 +30,12 @@ from slam.objects.bodies import Body
 from slam.objects.displacements import Displacements
 from slam.objects.regions import Scene
 
-PROVEN = 8.0  #: −log10 of the chance from which a body has moved for certain, where it went farther than the camera
-_SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to some 1e-19
+PROVEN = (
+    8.0  #: −log10 of the chance from which a body has moved for certain, where it went much farther than the camera
+)
+_SLIDES = 16.0  # the same elsewhere: what slides with the camera agrees by up to some 1e-15,
+_FITTED = 20.0  # and its first places, which are fitted to its tracks together, by up to 1e-19
+_FARTHER = 3.0  # times the camera's way: nothing that slides with it was seen to go twice as far
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
 _LEAST = 4  # members and frames, for a scatter
@@ -48,12 +52,14 @@ class Way:
         times: of these frames (K,) [s].
         by_rig: how far it seems to go in a frame by a disparity that is wrong by the deviation of a pixel (3,) [m].
         of_camera: how far the camera went in these frames [m].
+        fitted: whether the body is new, so that most places are fitted at once.
     """
 
     places: Array
     times: Array
     by_rig: Array
     of_camera: float
+    fitted: bool = False
 
     @classmethod
     def of(cls, body: Body, stamps: Array, cameras: Array, rig: StereoRig, sigma: float) -> Way:
@@ -74,13 +80,15 @@ class Way:
         off = depth[:, None] * rays * sigma / (rig.left.fu * rig.baseline)  # by a disparity that is wrong by sigma
         shift = off[-1] - off[0] if len(seen) else np.zeros(3)
         camera = float(np.linalg.norm(np.ptp(cameras[seen, :3, 3], axis=0))) if len(seen) else 0.0
-        return cls(places, stamps[seen], shift / max(len(seen) - 1, 1), camera)
+        return cls(places, stamps[seen], shift / max(len(seen) - 1, 1), camera, body.seen < _LEAST)
 
     @property
     def bar(self) -> float:
-        """−log10 of the chance that is asked for: what goes farther than the camera does not slide with it."""
+        """−log10 of the chance that is asked for: what goes much farther than the camera does not slide with it."""
         length = float(np.linalg.norm(np.ptp(self.places, axis=0))) if len(self.places) else 0.0
-        return PROVEN if length > self.of_camera else _SLIDES
+        if length > _FARTHER * self.of_camera:
+            return PROVEN
+        return _FITTED if self.fitted else _SLIDES
 
 
 def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
