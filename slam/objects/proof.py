@@ -30,9 +30,7 @@ from slam.objects.bodies import Body
 from slam.objects.displacements import Displacements
 from slam.objects.regions import Scene
 
-PROVEN = (
-    8.0  #: −log10 of the chance from which a body has moved for certain, where it went much farther than the camera
-)
+PROVEN = 8.0  #: −log10 of the chance from which a body has moved for certain if it went much farther than the camera
 _SLIDES = 16.0  # the same elsewhere: what slides with the camera agrees by up to some 1e-15,
 _FITTED = 20.0  # and its first places, which are fitted to its tracks together, by up to 1e-19
 _FARTHER = 3.0  # times the camera's way: nothing that slides with it was seen to go twice as far
@@ -53,6 +51,7 @@ class Way:
         by_rig: how far it seems to go in a frame by a disparity that is wrong by the deviation of a pixel (3,) [m].
         of_camera: how far the camera went in these frames [m].
         fitted: whether the body is new, so that most places are fitted at once.
+        part: whether it is a part of another body, which moves for certain: it does not slide over the still world.
     """
 
     places: Array
@@ -60,6 +59,7 @@ class Way:
     by_rig: Array
     of_camera: float
     fitted: bool = False
+    part: bool = False
 
     @classmethod
     def of(cls, body: Body, stamps: Array, cameras: Array, rig: StereoRig, sigma: float) -> Way:
@@ -80,13 +80,15 @@ class Way:
         off = depth[:, None] * rays * sigma / (rig.left.fu * rig.baseline)  # by a disparity that is wrong by sigma
         shift = off[-1] - off[0] if len(seen) else np.zeros(3)
         camera = float(np.linalg.norm(np.ptp(cameras[seen, :3, 3], axis=0))) if len(seen) else 0.0
-        return cls(places, stamps[seen], shift / max(len(seen) - 1, 1), camera, body.seen < _LEAST)
+        return cls(
+            places, stamps[seen], shift / max(len(seen) - 1, 1), camera, body.seen < _LEAST, body.apart_from is not None
+        )
 
     @property
     def bar(self) -> float:
         """−log10 of the chance that is asked for: what goes much farther than the camera does not slide with it."""
         length = float(np.linalg.norm(np.ptp(self.places, axis=0))) if len(self.places) else 0.0
-        if length > _FARTHER * self.of_camera:
+        if self.part or length > _FARTHER * self.of_camera:
             return PROVEN
         return _FITTED if self.fitted else _SLIDES
 
@@ -94,7 +96,7 @@ class Way:
 def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
     """The evidence that a body moves still, after one more frame, and whether it is proven to have moved.
 
-    The evidence is a cumulative sum of −log10 of the p-values; the better test counts, and it fades while a body rests.
+    The evidence is a cumulative sum of −log10 of the chance of its way; it fades while a body rests.
     For a proof both tests must be certain at once.
 
     Args:
@@ -109,7 +111,7 @@ def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, fa
         return evidence, far and by_frames >= way.bar
     by_members = -float(np.log10(max(_by_members(moved, scene, way.by_rig), 10.0**-_MOST)))
     proven = by_frames >= way.bar and (far or by_members >= way.bar)
-    return max(0.0, evidence + max(by_frames, by_members) - _ALLOWANCE), proven
+    return max(0.0, evidence + by_frames - _ALLOWANCE), proven
 
 
 def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> float:
