@@ -31,9 +31,8 @@ from slam.objects.displacements import Displacements
 from slam.objects.regions import Scene
 
 PROVEN = 8.0  #: −log10 of the chance from which a body has moved for certain if it went much farther than the camera
-_SLIDES = 16.0  # the same elsewhere: what slides with the camera agrees by up to some 1e-15,
-_FITTED = 20.0  # and its first places, which are fitted to its tracks together, by up to 1e-19
-_FARTHER = 3.0  # times the camera's way: nothing that slides with it was seen to go twice as far
+_SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to some 1e-19
+_FARTHER = 2.0  # times the camera's way: nothing that slides with it was seen to go so far
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
 _LEAST = 4  # members and frames, for a scatter
@@ -50,7 +49,6 @@ class Way:
         times: of these frames (K,) [s].
         by_rig: how far it seems to go in a frame by a disparity that is wrong by the deviation of a pixel (3,) [m].
         of_camera: how far the camera went in these frames [m].
-        fitted: whether the body is new, so that most places are fitted at once.
         part: whether it is a part of another body, which moves for certain: it does not slide over the still world.
     """
 
@@ -58,7 +56,6 @@ class Way:
     times: Array
     by_rig: Array
     of_camera: float
-    fitted: bool = False
     part: bool = False
 
     @classmethod
@@ -78,11 +75,11 @@ class Way:
         rays = places - cameras[seen, :3, 3]
         depth = np.einsum("ni,ni->n", rays, cameras[seen, :3, 2])
         off = depth[:, None] * rays * sigma / (rig.left.fu * rig.baseline)  # by a disparity that is wrong by sigma
-        shift = off[-1] - off[0] if len(seen) else np.zeros(3)
-        camera = float(np.linalg.norm(np.ptp(cameras[seen, :3, 3], axis=0))) if len(seen) else 0.0
-        return cls(
-            places, stamps[seen], shift / max(len(seen) - 1, 1), camera, body.seen < _LEAST, body.apart_from is not None
-        )
+        if not len(seen):
+            return cls(places, stamps[seen], np.zeros(3), 0.0)
+        camera = float(np.linalg.norm(np.ptp(cameras[seen, :3, 3], axis=0)))
+        by_rig = (off[-1] - off[0]) / max(len(seen) - 1, 1)
+        return cls(places, stamps[seen], by_rig, camera, body.apart_from is not None)
 
     @property
     def bar(self) -> float:
@@ -90,7 +87,7 @@ class Way:
         length = float(np.linalg.norm(np.ptp(self.places, axis=0))) if len(self.places) else 0.0
         if self.part or length > _FARTHER * self.of_camera:
             return PROVEN
-        return _FITTED if self.fitted else _SLIDES
+        return _SLIDES
 
 
 def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
