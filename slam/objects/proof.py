@@ -32,9 +32,7 @@ from slam.objects.regions import Scene
 
 PROVEN = 8.0  #: −log10 of the chance from which a body has moved for certain if it went farther than the camera
 _SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to some 1e-19
-_FARTHER = (
-    1.0  # times the camera's way; at 2 hardly a junction is left in EuRoC MH_01, but bodies of `boxes` are found late
-)
+_FARTHER = 1.0  # times the camera's way; at 2 EuRoC MH_01 is all but still, but bodies of `boxes` are found late
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
 _LEAST = 4  # members and frames, for a scatter
