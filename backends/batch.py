@@ -15,13 +15,13 @@ import gtsam
 import numpy as np
 
 from backends.smoother import SmootherBackend
-from backends.smoother.factors import landmark_key, pose_key, to_pose3
+from backends.smoother.factors import landmark_key, pose_key, to_pose3, velocity_change
 from backends.smoother.graph import FAILURES, Problem, Tracks, minimised
 from backends.smoother.state import State
 from slam.bounds import require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, points_by_pose, so3_left_jacobian, so3_log, transform
+from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.options import from_options
@@ -170,7 +170,8 @@ class _Solution:
             pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
             for i, number in enumerate(hangs.tolist())
         ]
-        problem, tracks = Problem(), Tracks(make, 2, None)
+        problem, tracks = Problem(), Tracks(make, None)
+        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.spread[s.of(s.begun)]))
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))
@@ -264,15 +265,10 @@ def _velocity_change(keys: list[int], d0: float, d1: float) -> Callable[[gtsam.C
     """Residual (6,): the velocity [ω, v] between the last two poses, over d1 [s], less that between the first two."""
 
     def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
-        poses = [values.atPose3(key).matrix() for key in keys]
-        r, J = _velocity(poses[-2], poses[-1], d1)
-        by_pose = [J[0], J[1]]
-        if len(poses) == 3:
-            before, J = _velocity(poses[0], poses[1], d0)
-            r, by_pose = r - before, [-J[0], by_pose[0] - J[1], by_pose[1]]
+        r, J = velocity_change(np.array([values.atPose3(key).matrix() for key in keys]), np.array([d0, d1]))
         if jacobians is not None:
-            for i, one in enumerate(by_pose):
-                jacobians[i] = one
+            for i, by_pose in enumerate(J):
+                jacobians[i] = by_pose
         return r
 
     return error
@@ -289,11 +285,3 @@ def _seen_at(keys: list[int], local: Array) -> Callable[[gtsam.CustomFactor, gts
         return point[0] - local
 
     return error
-
-
-def _velocity(T0: Array, T1: Array, dt: float) -> tuple[Array, Array]:
-    """Body rate and velocity in world axes (6,) from one pose to the next, and its Jacobians (2, 6, 6) by both."""
-    turn, J = so3_log(T0[:3, :3].T @ T1[:3, :3]), np.zeros((2, 6, 6))
-    J[0, :3, :3], J[1, :3, :3] = -np.linalg.inv(so3_left_jacobian(turn)), np.linalg.inv(so3_left_jacobian(-turn))
-    J[0, 3:, 3:], J[1, 3:, 3:] = -T0[:3, :3], T1[:3, :3]
-    return np.concatenate([turn, T1[:3, 3] - T0[:3, 3]]) / dt, J / dt

@@ -16,7 +16,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import slam
+from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,16 +50,16 @@ class Way:
         return len({called for _, called in ours}), across, sum(self.calls.values())
 
 
-def way_of(folder: str, backend: str, number: int) -> Way:
-    """The way of a frame by its number in a recording."""
-    sequence = slam.open_sequence(folder)
-    system, way = StereoSlam(sequence.rig, "surf", backend, kind=sequence.kind), Way()
-    for frame in sequence.frames(0, number + 1):
-        features = system.frontend.extract(frame)  # type: ignore[union-attr]
-        sys.setprofile(way if frame.index == number else None)
+def ways_of(sequence: Sequence, backend: str, first: int, last: int) -> list[Way]:
+    """The ways of the frames from `first` to before `last`."""
+    system, ways = StereoSlam(sequence.rig, "surf", backend, kind=sequence.kind), []
+    for frame in sequence.frames(0, last):
+        features, way = system.frontend.extract(frame), Way()  # type: ignore[union-attr]
+        sys.setprofile(way if frame.index >= first else None)
         system.process_features(features)
         sys.setprofile(None)
-    return way
+        ways.append(way)
+    return ways[first:]
 
 
 def main() -> None:
@@ -70,8 +70,9 @@ def main() -> None:
     parser.add_argument("--files", action="store_true", help="list calls by file entered")
     arguments = parser.parse_args()
     for backend in arguments.backends:
-        way = way_of(arguments.folder, backend, arguments.frame)
-        print(f"{backend}: {way.summary()[0]} files, {way.summary()[1]} calls between files, {way.summary()[2]} calls")
+        (way,) = ways_of(open_sequence(arguments.folder), backend, arguments.frame, arguments.frame + 1)
+        files, across, calls = way.summary()
+        print(f"{backend}: {files} files, {across} calls between files, {calls} calls")
         if arguments.files:
             entered: Counter[str] = Counter()
             for (_, called), n in way.calls.items():

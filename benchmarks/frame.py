@@ -2,14 +2,17 @@
 
     python benchmarks/frame.py [--quick] [--orbslam3 PYTHON] [--out DIR]
 
-Three image sizes, both back ends, detector of moving objects on, reading left out. Frame by frame, in turns: each back
-end, one ``cv2.SIFT`` with 800 features on the left image, and `orb_odometry`. Then each back end by itself with
-overlap (`StereoSlam.run`): the time from one result to the next. Then, with ``--orbslam3``, ORB-SLAM3 on the same
+Real and rendered recordings, all back ends, detector of moving objects on, reading left out. Frame by frame, in turns:
+each back end, one ``cv2.SIFT`` with 800 features on the left image, and `orb_odometry`. Then each back end by itself
+with overlap (`StereoSlam.run`): the time from one result to the next. Then, with ``--orbslam3``, ORB-SLAM3 on the same
 images as fast as it goes; PYTHON is the interpreter of an environment in which ``orbslam3-python`` is installed
 (``python -m venv E && E/bin/pip install orbslam3-python``), which is never imported here. Median times;
 compare the ratios, not the milliseconds. ORB-SLAM3's vocabulary is a small one of rendered images, good for tracking.
+A second table has the CPU time of each stage, and the way of a frame through the code (`calls`): files entered, calls
+from one file to another, and Python calls in all, the back end left out.
 
-The first size is that of KITTI odometry 06 where SLAM_DATA has it, else of the same size rendered.
+The first size is that of KITTI odometry 06 where SLAM_DATA has it, else of the same size rendered; MH_01 of EuRoC is
+left out where it has not.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.calls import ways_of
 from benchmarks.orb_odometry import OrbOdometry
 from benchmarks.orb_vocabulary import write_vocabulary
 from experiments.common import script_options
@@ -39,12 +43,15 @@ from slam.evaluation.metrics import absolute_errors, associate
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
+from slam.runtime import stages
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
-KITTI = "kitti_odometry/sequences/06"
+KITTI, EUROC = "kitti_odometry/sequences/06", "euroc/MH_01_part"
 HEADER = ("images", "what", "wall [ms]", "CPU [ms]", "wall / SIFT", "CPU / SIFT", "wall / ORB-SLAM3", "CPU / ORB-SLAM3",
           "frames lost", "ATE [mm]")  # fmt: skip
+STAGES = ("extract", "predict", "associate", "update", "estimate", "objects", "manage", "atlas")
+WAYS = ("images", "what", *(f"{name} [ms]" for name in STAGES), "files", "calls between files", "Python calls")
 SIFT, ORB, ORBSLAM3 = "cv2.SIFT, 800 features, left", "cv2.ORB and PnP", "ORB-SLAM3"
 OVERLAP = "{}, overlap"  # of a back end
 _SEEN = (FrameStatus.STARTED, FrameStatus.TRACKED)
@@ -84,12 +91,13 @@ class Times:
 
 
 def sizes(quick: bool) -> list[Size]:
-    """The three sizes."""
-    data = Path(os.environ.get("SLAM_DATA", ""), KITTI)
+    """All sizes."""
+    data, euroc = (Path(os.environ.get("SLAM_DATA", ""), name) for name in (KITTI, EUROC))
     kitti = str(data) if data.is_dir() else "synthetic:street?width=1226&height=370&frames=51"
     skipped, counted = (3, 5) if quick else (15, 36)
     return [
         Size("KITTI 06, 1226x370" if data.is_dir() else "street, 1226x370", kitti, skipped, counted, 2000),
+        *([Size("MH_01, 752x480", str(euroc), skipped, counted, 1200)] if euroc.is_dir() else []),
         Size("desk, 752x480", "synthetic:desk?width=752&height=480&frames=60", skipped, counted, 1200),
         Size("aisle, 320x240", "synthetic:aisle?frames=60", skipped, counted, 1000),
     ]
@@ -121,6 +129,21 @@ def overlapped(sequence: Sequence, backend: str, frames: list[StereoFrame]) -> T
     for _ in frames:
         times.take(lambda: tracked(next(results)[1]))
     return times
+
+
+def ways(size: Size) -> Iterable[list[str]]:
+    """Of each back end, medians over the frames that count: CPU time by stage, and the way through the code."""
+    sequence, last = open_sequence(size.sequence), size.skipped + size.counted
+    for name in ONLINE:
+        clock, stages.working_time = stages.working_time, time.process_time
+        try:
+            system = StereoSlam(sequence.rig, backend=name, kind=sequence.kind)
+            spent = [system.process(frame).milliseconds for frame in sequence.frames(0, last)][size.skipped :]
+        finally:
+            stages.working_time = clock
+        way = np.median([w.summary() for w in ways_of(sequence, name, size.skipped, last)], axis=0)
+        by_stage = (np.median([s.get(stage, 0.0) for s in spent]) for stage in STAGES)
+        yield [size.name, name, *(f"{x:.1f}" for x in by_stage), *(f"{x:.0f}" for x in way)]
 
 
 def tracked(result: FrameResult) -> Array | None:
@@ -189,10 +212,13 @@ def main() -> int:
     parser.add_argument("--orbslam3", metavar="PYTHON", help="interpreter that has orbslam3-python")
     arguments = parser.parse_args()
     table: list[list[str]] = []
+    by_way: list[list[str]] = []
     for size in sizes(arguments.quick):
         table += rows(size, measure(size, arguments.orbslam3))
-    print(markdown(HEADER, table, 2))
+        by_way += ways(size)
+    print(markdown(HEADER, table, 2), markdown(WAYS, by_way, 2), sep="\n\n")
     write_json(arguments.out / "table.json", HEADER, table)
+    write_json(arguments.out / "ways.json", WAYS, by_way)
     return 0
 
 

@@ -16,21 +16,16 @@ PAGES = sorted((Path(__file__).parent / "api").glob("*.md"))
 
 
 def listed(name: str) -> str:
-    """A module in a sentence, and its public classes and functions, a line each, in the order of its source."""
+    """A module in a sentence, and the names of its public classes and functions, in the order of its source."""
     module = import_module(name)
     own = [
         thing
         for key, thing in vars(module).items()
         if not key.startswith("_") and callable(thing) and getattr(thing, "__module__", "") == name
     ]
-    lines = [f"`{name}`: {first_line(module)}", ""]
-    lines += [f"- `{thing.__name__}`: {first_line(thing)}" for thing in own if inspect.getdoc(thing)]
-    return "\n".join(lines).rstrip("\n")
-
-
-def first_line(thing: object) -> str:
-    """The first line of a docstring."""
-    return (inspect.getdoc(thing) or "").partition("\n")[0]
+    names = ", ".join(f"`{thing.__name__}`" for thing in own if inspect.getdoc(thing))
+    first = (inspect.getdoc(module) or "").partition("\n")[0]
+    return f"`{name}`: {first}" + (f" Holds {names}." if names else "")
 
 
 def written(page: str) -> str:

@@ -2,9 +2,8 @@
 
     python experiments/aisle.py [--quick] [--world synthetic:aisle] [--out DIR]
 
-Leaves for each back end the files of a run, and the pictures ``map_3d.png`` (paper A, Fig. 5), ``top_view.png`` (paper
-A, Fig. 6: red ellipses for landmarks measured in the last frame, green ones for the others), ``errors.png`` and
-``map.png`` (D_threshold, landmarks measured and map size over time). Prints a Markdown table. The paper's marks: mean
+Leaves for each back end the files of a run, and the pictures ``top_view.png`` (paper A, Fig. 6) and ``errors.png``.
+Prints a Markdown table. The paper's marks: mean
 pose deviation below 1.5 cm, peak 3 cm, 318 landmarks.
 """
 
@@ -12,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
-from experiments.tables import markdown, write_json
+from experiments.tables import show
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
@@ -29,30 +27,11 @@ from slam.evaluation.association_truth import SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.registry import ONLINE
-from slam.run.figures import draw_map_3d
+from slam.run.options import RunOptions
 from slam.run.plots import plot
 from slam.run.run_data import RunData
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.sequences import Sequence, open_sequence
-
-
-@dataclass(frozen=True)
-class AssociationScore:
-    """Counts of associations.
-
-    Attributes:
-        right: the feature lies where the landmark's surface point is.
-        wrong: it lies elsewhere, or the landmark was first seen on something that moves.
-    """
-
-    right: int
-    wrong: int
-
-    @property
-    def precision(self) -> float:
-        """Share of the right ones; NaN where there is none."""
-        return self.right / (self.right + self.wrong) if self.right + self.wrong else float("nan")
-
 
 HEADER = (
     "back end", "tracked", "mean error [cm]", "peak [cm]", "end [cm]", "final mean [cm]", "final peak [cm]",
@@ -61,11 +40,7 @@ HEADER = (
 
 
 class Remembered:
-    """A front end that does its work once for each frame and remembers.
-
-    Args:
-        frontend: does the work.
-    """
+    """A front end that does its work once for each frame and remembers."""
 
     def __init__(self, frontend: Frontend) -> None:
         self._frontend = frontend
@@ -88,14 +63,14 @@ class AssociationCheck:
     def __init__(self, sequence: Any) -> None:
         self._points = SurfacePoints(sequence)
         self._descriptors: dict[int, np.ndarray] = {}
-        self.score = AssociationScore(0, 0)
+        self.right = self.wrong = 0
 
     def frame(self, result: FrameResult) -> None:
         """Take in one frame."""
         uv = result.features.uv_left
         error = self._points.errors(result.index, result.matched, uv[result.matched_features])
-        right, wrong = int((error < 3).sum()), int((error >= 3).sum())
-        self.score = AssociationScore(self.score.right + right, self.score.wrong + wrong)
+        self.right += int((error < 3).sum())
+        self.wrong += int((error >= 3).sum())
         self._points.add(result.index, result.added, uv[result.added_features])
         new = result.features.descriptors[result.added_features]
         self._descriptors.update(zip(result.added.tolist(), new))
@@ -131,37 +106,15 @@ def row(sequence: Sequence, backend: str, frontend: Remembered, config: SystemCo
     online = position_errors(data.online, sequence.ground_truth)
     final = position_errors(data.final, sequence.ground_truth)
     tracked = summary["status"].get("tracked", 0) + summary["status"].get("started", 0)
+    right = 100 * check.right / max(check.right + check.wrong, 1)
     return [
         backend, f"{tracked} of {summary['frames']}", *_mean_and_peak(online), float(online[-1]),
-        *_mean_and_peak(final), summary["landmarks"], check.doubled(out / backend), 100 * check.score.precision,
+        *_mean_and_peak(final), summary["landmarks"], check.doubled(out / backend), right,
         summary["consistency"]["NIS per degree of freedom"],
     ]  # fmt: skip
 
 
-def draw_map_over_time(folders: list[Path], path: Path) -> None:
-    """D_threshold, landmarks measured, and map size over time, a line for each run."""
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(3, 1, figsize=(9, 5.5), sharex=True, layout="constrained")
-    for folder in folders:
-        with (folder / "frames.csv").open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        t = np.array([float(r["stamp"]) for r in rows])
-        for axis, column in zip(axes, ("D_threshold", "used", "map_size")):
-            axis.plot(t - t[0], [float(r[column] or "nan") for r in rows], lw=1, label=folder.name)
-    for axis, label in zip(axes, ("D_threshold", "landmarks measured", "map size")):
-        axis.set_ylabel(label)
-    axes[0].set_yscale("log")
-    axes[1].legend(frameon=False, fontsize=8)
-    axes[-1].set_xlabel("time [s]")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-    plt.close(figure)
-
-
 def main() -> int:
-    import matplotlib
-
-    matplotlib.use("Agg")
     parser = script_options(__file__, __doc__, "30 frames")
     parser.add_argument("--world", default="synthetic:aisle", help="a rendered world")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
@@ -174,12 +127,9 @@ def main() -> int:
     frontend = Remembered(create("surf", sequence.rig, **config.frontend))
     rows = [row(sequence, backend, frontend, config, arguments.out) for backend in ONLINE]
     runs = [RunData.read(arguments.out / backend, backend) for backend in ONLINE]
-    draw_map_3d(runs, arguments.out / "map_3d.png")
     plot(runs, arguments.out / "top_view.png", "map")
     plot(runs, arguments.out / "errors.png", "errors")
-    draw_map_over_time([arguments.out / backend for backend in ONLINE], arguments.out / "map.png")
-    print(markdown(HEADER, rows, 2))
-    write_json(arguments.out / "table.json", HEADER, rows)
+    show(arguments.out / "table.json", HEADER, rows, 2)
     return 0
 
 

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import recordings, script_options
 from experiments.loops import ate
-from experiments.tables import markdown, write_json
+from experiments.tables import show
 from slam.calibration.posterior import RigPosterior
 from slam.config import SystemConfig
 from slam.registry import ONLINE
@@ -83,22 +83,21 @@ def world_row(world: str, options: str, backend: str, seeds: int) -> list[str]:
     return [world, backend, f"{a:.3f}", f"{b:.3f}", f"{b / a:.1f}", f"{c:.3f}", *said, f"{farthest:.1f}"]
 
 
-def drives_table(drives: Mapping[str, Path], out: Path, frames: int | None) -> str:
-    """Corrections by each drive, and how far apart they are."""
-    sequences, targets = (
-        [open_sequence(folder) for folder in drives.values()],
-        Targets(out / "rig.json", overwrite=True),
-    )
+def show_drives(drives: Mapping[str, Path], out: Path, frames: int | None) -> None:
+    """Corrections by each drive that both of them show, and how far apart they are."""
+    sequences, targets = [open_sequence(f) for f in drives.values()], Targets(out / "rig.json", overwrite=True)
     result = calibrate(sequences, targets, lambda *_: nullcontext(lambda _: None), (), (0, frames))
-    header = ("parameter", "unit", *drives, "apart [sigma]")
-    rows = []
-    for i, (factor, unit) in enumerate(result.units):
-        each = [f"{factor * f.posterior.mean[i]:.2f} ± {factor * f.posterior.sigma[i]:.2f}" for f in result.found]
-        apart = np.nan if result.agreed is None else result.agreed.largest[i]
-        rows.append([result.kept.posterior.names[i], unit, *each, "–" if np.isnan(apart) else f"{apart:.1f}"])
-    write_json(out / "drives.json", header, rows)
-    words = "" if result.agreed is None else f"\n\n{result.agreed.words}"
-    return markdown(header, rows, 2) + words
+    apart = result.agreed.largest if result.agreed is not None else np.full(len(result.units), np.nan)
+    rows = [
+        [
+            result.kept.posterior.names[i], unit,
+            *(f"{factor * f.posterior.mean[i]:.2f} ± {factor * f.posterior.sigma[i]:.2f}" for f in result.found),
+            f"{apart[i]:.1f}",
+        ]
+        for i, (factor, unit) in enumerate(result.units) if np.isfinite(apart[i])
+    ]  # fmt: skip
+    words = "" if result.agreed is None else result.agreed.words
+    show(out / "drives.json", ("parameter", "unit", *drives, "apart [sigma]"), rows, 2, words)
 
 
 def main() -> int:
@@ -114,12 +113,11 @@ def main() -> int:
     rows = [world_row(world, options, b, seeds) for world, options in worlds.items() for b in ONLINE]
     true = ", ".join(f"{name}: {true:g}" for name, (_, true, _) in WRONG.items())
     print(f"Worlds with a wrong calibration, medians of {count(seeds, 'seed')} (true corrections: {true}):\n")
-    print(markdown(header, rows, 2))
-    write_json(out / "worlds.json", header, rows)
+    show(out / "worlds.json", header, rows, 2)
     drives = recordings(DRIVES)
     if len(drives) == len(DRIVES):
         print("\nThe same rig on two drives of one day (mean ± standard deviation):\n")
-        print(drives_table(drives, out, 12 if arguments.quick else None))
+        show_drives(drives, out, 12 if arguments.quick else None)
     return 0
 
 

@@ -14,8 +14,6 @@ import numpy as np
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
-from slam.evaluation.metrics import absolute_errors, associate
-from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence
 
 T = TypeVar("T")
@@ -63,10 +61,3 @@ def timed(step: Callable[[T], FrameResult], frames: Iterable[T]) -> tuple[list[F
         results.append(step(frame))
         times.append(1e3 * (time.process_time() - start))
     return results, np.array(times)
-
-
-def online_error(results: Iterable[FrameResult], truth: Trajectory | None) -> float:
-    """RMSE of the positions as they were estimated frame by frame [m], after alignment without scale."""
-    estimates = [result.estimate for result in results]
-    path = Trajectory(np.array([e.stamp for e in estimates]), np.array([e.T_world_left for e in estimates]))
-    return absolute_errors(*associate(path, truth, 0.02, interpolated=True)).translation_statistics.rmse

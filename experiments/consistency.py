@@ -18,7 +18,6 @@ desk is drawn from the motion model itself, so that predictions, too, can be hel
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -30,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
 from experiments.consistency_trials import CASES, Trial, trials
-from experiments.tables import markdown
+from experiments.tables import markdown, picture
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry.se3 import Array
 from slam.registry import ONLINE
@@ -126,15 +125,8 @@ ACCURACY = (
     "/ bound",
 )  # fmt: skip
 CONSISTENCY = (
-    "world",
-    "back end",
-    "NEES (95 %)",
-    "frames inside",
-    "leaves at",
-    "NIS/dof",
-    "pixel NIS",
-    "landmark NEES",
-)
+    "world", "back end", "NEES (95 %)", "frames inside", "leaves at", "NIS/dof", "pixel NIS", "landmark NEES",
+)  # fmt: skip
 WRONG_MATCHES = (
     "world", "back end", "online [mm]", "with 10 % wrong", "ratio", "final [mm]", "with 10 % wrong", "ratio",
     "rejected",
@@ -150,45 +142,24 @@ def report(results: dict[str, list[Trial]]) -> str:
     )
 
 
-def write_csv(path: Path, results: dict[str, list[Trial]]) -> None:
-    """A row per case, back end and frame: means over the runs."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["world", "back_end", "frame", "rmse_m", "rmse_rad", "nees", "nis", "dof", "pixel_nis"])
-        for case, done in results.items():
-            for name in ONLINE:
-                runs = [t.runs[name] for t in done]
-                for k in range(len(runs[0].nees)):
-                    errors = np.array([r.online[k] for r in runs])
-                    means = [np.mean([getattr(r, what)[k] for r in runs]) for what in ("nees", "nis", "dof", "pixel")]
-                    writer.writerow([case, name, k, rms(errors[:, 3:]), rms(errors[:, :3]), *means])
-
-
 def draw(path: Path, results: dict[str, list[Trial]]) -> None:
     """Error against the bound, and average NEES against its band, frame by frame."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, len(results), figsize=(4.2 * len(results), 6), sharex="col", squeeze=False)
-    for (case, done), (top, bottom) in zip(results.items(), axes.T):
-        for name in ONLINE:
-            errors = np.array([t.runs[name].online[:, 3:] for t in done])
-            top.plot(1e3 * np.sqrt((errors**2).sum(axis=2).mean(axis=0)), label=name)
-            bottom.plot(np.mean([t.runs[name].nees for t in done], axis=0), label=name)
-        bound = np.mean([np.trace(t.online_bound[:, 3:, 3:], axis1=1, axis2=2) for t in done], axis=0)
-        top.plot(done[0].checked, 1e3 * np.sqrt(bound), "k.--", label="bound")
-        bottom.axhspan(*chi_square_band(6, len(done)), color="0.85", label="95 % band")
-        top.set(title=case, ylim=(0, None))
-        bottom.set(xlabel="frame", ylim=(0, None))
-    axes[0, 0].set_ylabel("RMSE of the newest position [mm]")
-    axes[1, 0].set_ylabel("average NEES of the newest pose")
-    axes[0, 0].legend()
-    axes[1, 0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    with picture(path, 4.2 * len(results), 6, 2, len(results), sharex="col") as panels:
+        axes = np.reshape(panels, (2, len(results)))
+        for (case, done), (top, bottom) in zip(results.items(), axes.T):
+            for name in ONLINE:
+                errors = np.array([t.runs[name].online[:, 3:] for t in done])
+                top.plot(1e3 * np.sqrt((errors**2).sum(axis=2).mean(axis=0)), label=name)
+                bottom.plot(np.mean([t.runs[name].nees for t in done], axis=0), label=name)
+            bound = np.mean([np.trace(t.online_bound[:, 3:, 3:], axis1=1, axis2=2) for t in done], axis=0)
+            top.plot(done[0].checked, 1e3 * np.sqrt(bound), "k.--", label="bound")
+            bottom.axhspan(*chi_square_band(6, len(done)), color="0.85", label="95 % band")
+            top.set(title=case, ylim=(0, None))
+            bottom.set(xlabel="frame", ylim=(0, None))
+        axes[0, 0].set_ylabel("RMSE of the newest position [mm]")
+        axes[1, 0].set_ylabel("average NEES of the newest pose")
+        axes[0, 0].legend()
+        axes[1, 0].legend()
 
 
 def main() -> int:
@@ -206,11 +177,7 @@ def main() -> int:
     for case in arguments.cases:
         results[case] = trials(case, seeds, frames, wrong, arguments.out / "runs", arguments.resume)
         print(f"{case} done:\n{report({case: results[case]})}", file=sys.stderr, flush=True)
-    text = f"{seeds} runs of {frames} frames; wrong matches in {min(wrong, seeds)} of them\n\n" + report(results)
-    print(text)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "tables.md").write_text(text + "\n")
-    write_csv(arguments.out / "consistency.csv", results)
+    print(f"{seeds} runs of {frames} frames; wrong matches in {min(wrong, seeds)} of them\n\n" + report(results))
     draw(arguments.out / "consistency.png", results)
     return 0
 

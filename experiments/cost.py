@@ -39,7 +39,8 @@ PARTS = (
         "frame", "Whole frames",
         "Median times of a frame, images in memory, the detector of moving objects on, and their ratios to `cv2.SIFT` "
         "on one image and to ORB-SLAM3 on the same images; with overlap, times from one result to the next. CPU "
-        "time adds up all threads. Frames lost: without a pose.",
+        "time adds up all threads. Frames lost: without a pose. The second table has the CPU time of each stage, and "
+        "the way of a frame through the code outside the back end: files entered, calls between files, Python calls.",
     ),
     Part(
         "growth", "How it grows",

@@ -20,13 +20,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.surf import medians, test_image
 from experiments.common import script_options
+from experiments.tables import picture, show
 from frontends.surf import Surf
-from slam.compare.measure import BY_KEY
-from slam.compare.plan import CLOSED_LOOP, Plan, Variant
+from slam.compare.plan import Plan, Variant
 from slam.compare.scheduler import LocalScheduler
 from slam.compare.statistics import difference
 from slam.compare.sweep import sweep
-from slam.compare.wording import sentence
+from slam.compare.wording import shown_p
+from slam.run.results import BY_KEY
 from slam.runtime.cores import available_cores
 
 WORLDS = ("synthetic:aisle?frames={}", "synthetic:desk?frames={}")
@@ -47,56 +48,50 @@ def times(counts: tuple[int, ...], rounds: int) -> np.ndarray:
     return np.array(rows)
 
 
-def known_points(frames: int, seeds: int, out: Path) -> tuple[list[str], dict[str, np.ndarray]]:
-    """What follows for each world, and the landmark errors [mm] (2, seeds) of 64-D and 16-D."""
-    lines, errors = [], {}
+def known_points(frames: int, seeds: int, out: Path) -> tuple[list[list[str]], dict[str, np.ndarray]]:
+    """Rows of the comparison by world, and the landmark errors [mm] (2, seeds) of 64-D and 16-D."""
+    rows, errors = [], {}
     plan = Plan(tuple(w.format(frames) for w in WORLDS), ("ekf",), VARIANTS, seeds, replay=False)
     shutil.rmtree(out / "runs", ignore_errors=True)  # those of another form or version
     runs = sweep(plan, out / "runs", LocalScheduler(available_cores()))
     for world in plan.sequences:
         own = [[r for r in runs if (r.trial.sequence, r.trial.variant) == (world, v)] for v in plan.variants]
-        for key in FIGURES:
-            values = [np.array([r.metrics.get(key, np.nan) for r in rs]) for rs in own]
-            lines.append(f"- {world}, {sentence(difference(BY_KEY[key], *values), *(v.name for v in VARIANTS))}")
-            if key == FIGURES[0]:
+        for metric in map(BY_KEY.__getitem__, FIGURES):
+            values = [np.array([r.metrics.get(metric.key, np.nan) for r in rs]) for rs in own]
+            d = difference(metric, *values)
+            rows.append([world, metric.title, metric.show(d.other), metric.show(d.reference), shown_p(d.p)])
+            if metric.key == FIGURES[0]:
                 errors[world] = 1e3 * np.array(values)
-    assert all(run.trial.mode == CLOSED_LOOP for run in runs)
-    return lines, errors
+    return rows, errors
 
 
 def draw(counts: tuple[int, ...], ms: np.ndarray, errors: dict[str, np.ndarray], path: Path) -> None:
     """Time over the number of features, and each seed's landmark error."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((9, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.plot(counts, ms[:, 1], "s-", label="64-D")
-    left.plot(counts, ms[:, 0], "o-", label="16-D")
-    left.set(xlabel="features", ylabel="CPU time of description [ms]", ylim=(0, None))
-    for world, values in errors.items():
-        right.plot([0, 1], values, "o-", color="C0" if "aisle" in world else "C1", alpha=0.7)
-        right.plot([], [], "o-", color="C0" if "aisle" in world else "C1", label=world.removeprefix("synthetic:"))
-    right.set_xticks([0, 1], ["64-D", "16-D"])
-    right.set(ylabel="median error of the map's points [mm]", ylim=(0, None), xlim=(-0.3, 1.3))
-    left.legend()
-    right.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    with picture(path, 9, 3.2, 1, 2) as (left, right):
+        left.plot(counts, ms[:, 1], "s-", label="64-D")
+        left.plot(counts, ms[:, 0], "o-", label="16-D")
+        left.set(xlabel="features", ylabel="CPU time of description [ms]", ylim=(0, None))
+        for world, values in errors.items():
+            right.plot([0, 1], values, "o-", color="C0" if "aisle" in world else "C1", alpha=0.7)
+            right.plot([], [], "o-", color="C0" if "aisle" in world else "C1", label=world.removeprefix("synthetic:"))
+        right.set_xticks([0, 1], ["64-D", "16-D"])
+        right.set(ylabel="median error of the map's points [mm]", ylim=(0, None), xlim=(-0.3, 1.3))
+        left.legend()
+        right.legend(fontsize=8)
 
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "one seed of fifteen frames")
     parser.add_argument("--seeds", type=int, default=6)
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     counts = (100, 800) if arguments.quick else (100, 200, 400, 600, 800)
     ms = times(counts, 5 if arguments.quick else 41)
     frames, seeds = (15, 1) if arguments.quick else (100, arguments.seeds)
-    lines, errors = known_points(frames, seeds, arguments.out)
-    table = ["| features | 16-D [ms] | 64-D [ms] | saved | paper A |", "| ---: | ---: | ---: | ---: | ---: |"]
-    table += [f"| {n} | {a:.2f} | {b:.2f} | {100 * (1 - a / b):.0f} % | 45 % |" for n, (a, b) in zip(counts, ms)]
-    text = "\n".join([*table, "", *lines])
-    print(text)
-    (arguments.out / "tables.md").write_text(text + "\n", encoding="utf-8")
+    rows, errors = known_points(frames, seeds, arguments.out)
+    saved = [[n, float(a), float(b), f"{100 * (1 - a / b):.0f} %", "45 %"] for n, (a, b) in zip(counts, ms)]
+    show(arguments.out / "times.json", ("features", "16-D [ms]", "64-D [ms]", "saved", "paper A"), saved)
+    print(f"\nMeans of {seeds} trials; p of the difference.\n")
+    show(arguments.out / "points.json", ("world", "figure", "16-D", "64-D", "p"), rows, 2)
     draw(counts, ms, errors, arguments.out / "descriptors.png")
     return 0
 

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.surf import medians
 from experiments.common import script_options
-from experiments.tables import markdown
+from experiments.tables import picture, show
 from frontends.surf import Surf
 from slam.sequences import open_sequence
 
@@ -57,29 +57,23 @@ def times(image: np.ndarray, rounds: int) -> np.ndarray:
 
 def draw(table: np.ndarray, ms: np.ndarray, radii: list[np.ndarray], path: Path) -> None:
     """Features and time over the threshold, and radii by octave."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((11, 3.2), layout="constrained")
-    a, b, c = figure.subplots(1, 3)
-    x = np.maximum(THRESHOLDS, 1)
-    names = [f"octave {i + 1}" for i in range(OCTAVES)]
-    a.stackplot(x, *table.T, labels=names)
-    a.plot([1, 10_000], [837, 41], "k*", label="paper A, its own image")
-    a.set(xscale="log", xlabel="D_threshold", ylabel="features")
-    b.plot(x, ms[:, 0], "o-", x, ms[:, 1], "s-")
-    b.set(xscale="log", xlabel="D_threshold", ylabel="CPU time of detection [ms]", ylim=(0, None))
-    b.legend(["one octave", "two octaves"])
-    c.hist(radii, bins=np.arange(3, 80, 2), stacked=True, label=names)
-    c.set(xlabel="radius [px]", ylabel="features")
-    a.legend(fontsize=8)
-    c.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    x, names = np.maximum(THRESHOLDS, 1), [f"octave {i + 1}" for i in range(OCTAVES)]
+    with picture(path, 11, 3.2, 1, 3) as (a, b, c):
+        a.stackplot(x, *table.T, labels=names)
+        a.plot([1, 10_000], [837, 41], "k*", label="paper A, its own image")
+        a.set(xscale="log", xlabel="D_threshold", ylabel="features")
+        b.plot(x, ms[:, 0], "o-", x, ms[:, 1], "s-")
+        b.set(xscale="log", xlabel="D_threshold", ylabel="CPU time of detection [ms]", ylim=(0, None))
+        b.legend(["one octave", "two octaves"])
+        c.hist(radii, bins=np.arange(3, 80, 2), stacked=True, label=names)
+        c.set(xlabel="radius [px]", ylabel="features")
+        a.legend(fontsize=8)
+        c.legend(fontsize=8)
 
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "three images, few repetitions")
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     pictures = images(3 if arguments.quick else 25)
     table, radii = counts(pictures)
     ms = times(pictures[len(pictures) // 2], 3 if arguments.quick else 41)
@@ -91,9 +85,7 @@ def main() -> int:
     shares = table[THRESHOLDS.index(100)] / max(table[THRESHOLDS.index(100)].sum(), 1)
     sizes = ", ".join(f"{np.median(r):.1f} px" for r in radii if len(r))
     first = f"At D_threshold 100, {100 * shares[:2].sum():.0f} % of all features are in the first two octaves"
-    text = f"{markdown(header, rows, 0)}\n\n{first}; median radius by octave: {sizes}."
-    print(text)
-    (arguments.out / "tables.md").write_text(text + "\n", encoding="utf-8")
+    show(arguments.out / "table.json", header, rows, 0, f"{first}; median radius by octave: {sizes}.")
     draw(table, ms, radii, arguments.out / "detector.png")
     return 0
 

@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
-from experiments.tables import markdown, write_json
+from experiments.tables import picture, show
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
@@ -125,23 +125,18 @@ def states(results: list[FrameResult]) -> str:
 
 def draw(errors: dict[tuple[Fault, str], list[float]], path: Path) -> None:
     """Position error over the frames, a panel a fault; grey from the last good frame to the first after the fault."""
-    from matplotlib.figure import Figure
-
     names = list(dict.fromkeys(fault for fault, _ in errors))
-    figure = Figure((11, 5.6), layout="constrained")
-    axes = figure.subplots(2, -(-len(names) // 2), sharey=True)
-    for axis, fault in zip(axes.ravel(), names):
-        axis.axvspan(fault.last_good, fault.over, color="0.85")
-        for backend in ONLINE:
-            axis.semilogy(np.maximum(errors[fault, backend], 1e-2), lw=1, label=backend)
-        axis.set_title(fault.name, fontsize=9)
-        axis.set_xlabel("frame")
-    for axis in axes.ravel()[len(names) :]:
-        axis.remove()
-    for axis in axes[:, 0]:
-        axis.set_ylabel("error [cm]")
-    figure.axes[0].legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    with picture(path, 11, 5.6, 2, -(-len(names) // 2), sharey=True) as panels:
+        axes = np.ravel(panels)
+        for axis, fault in zip(axes, names):
+            axis.axvspan(fault.last_good, fault.over, color="0.85")
+            for backend in ONLINE:
+                axis.semilogy(np.maximum(errors[fault, backend], 1e-2), lw=1, label=backend)
+            axis.set_title(fault.name, fontsize=9)
+            axis.set(xlabel="frame", ylabel="error [cm]")
+        for axis in axes[len(names) :]:
+            axis.remove()
+        axes[0].legend(frameon=False, fontsize=8)
 
 
 def main() -> int:
@@ -154,8 +149,7 @@ def main() -> int:
             row, errors[fault, backend] = run(fault, backend, features)
             rows.append(row)
             print(row, file=sys.stderr, flush=True)
-    print(markdown(HEADER, rows, 3))
-    write_json(arguments.out / "table.json", HEADER, rows)
+    show(arguments.out / "table.json", HEADER, rows, 3)
     draw(errors, arguments.out / "faults.png")
     return 0
 

@@ -23,7 +23,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
-from experiments.tables import markdown, write_json
+from experiments.tables import markdown, picture, write_json
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.geometry.alignment import align_positions
@@ -224,24 +224,23 @@ def worlds(given: argparse.Namespace) -> dict[str, str]:
 
 def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
     """The paths from above: true, without loops, and as estimated at the end; loops as circles."""
-    import matplotlib.pyplot as plt
-
     rows = len({backend for _, backend in runs})  # the runs are in order of their paths
     shape = (rows, len(runs) // rows)
-    figure, axes = plt.subplots(*shape, figsize=(2.6 * shape[1], 2.9 * shape[0]), squeeze=False, layout="constrained")
-    for axis, ((name, backend), run) in zip(axes.T.flat, runs.items()):
-        for poses, style, label in (
-            (run.truth, "k--", "true"), (run.odometry, "C1-", "without loops"), (run.final.poses, "C0-", "with loops"),
-        ):  # fmt: skip
-            axis.plot(*poses[:, [0, 2], 3].T, style, lw=1.2, label=label)
-        at = [run.atlas.keyframes[loop.second].frame for loop in run.atlas.loops]
-        axis.plot(*run.final.positions[at][:, [0, 2]].T, "o", mfc="none", mec="C2", ms=4, label="loops closed")
-        axis.set(
-            title=f"{name}, {backend}", aspect="equal", adjustable="datalim", xlabel="right [m]", ylabel="forward [m]"
-        )
-        axis.locator_params(nbins=4)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8)
-    figure.savefig(out / "loops.png", dpi=120)
+    with picture(out / "loops.png", 2.6 * shape[1], 2.9 * shape[0], *shape) as panels:
+        axes = np.reshape(panels, shape)
+        for axis, ((name, backend), run) in zip(axes.T.flat, runs.items()):
+            for poses, style, label in (
+                (run.truth, "k--", "true"), (run.odometry, "C1-", "without loops"),
+                (run.final.poses, "C0-", "with loops"),
+            ):  # fmt: skip
+                axis.plot(*poses[:, [0, 2], 3].T, style, lw=1.2, label=label)
+            at = [run.atlas.keyframes[loop.second].frame for loop in run.atlas.loops]
+            axis.plot(*run.final.positions[at][:, [0, 2]].T, "o", mfc="none", mec="C2", ms=4, label="loops closed")
+            axis.set(title=f"{name}, {backend}", aspect="equal", adjustable="datalim")
+            axis.set(xlabel="right [m]", ylabel="forward [m]")
+            axis.locator_params(nbins=4)
+        labels = axes[0, 0].get_legend_handles_labels()
+        axes[0, 0].figure.legend(*labels, loc="outside upper center", ncols=4, fontsize=8)
 
 
 def main() -> None:

@@ -29,12 +29,15 @@ from experiments.object_runs import (
     camera_figures,
     features_where,
     path_of,
+    places_together,
+    plain_table,
     scored_run,
     seen_in,
     steps,
     system_for,
-)
-from experiments.tables import markdown
+    worlds_together,
+)  # fmt: skip
+from experiments.tables import picture
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.objects import ObjectScore, absolute_pose_errors, body_alignment
 from slam.evaluation.summary import evaluate
@@ -110,7 +113,6 @@ def place_rows(sequence: Any, true: Any, poses: dict[int, Any], backend: str, mo
         off = np.linalg.norm(E[:, :3, 3], axis=1)
         rows.append({
             "back end": backend, "mode": mode, "place": f"B{place}", "frames": len(here),
-            "true x y z [cm]": np.round(100 * true[min(int(at * 30), len(true) - 1), :3, 3], 1).tolist(),
             "rotation error [deg]": float(np.median(np.degrees(rotation_angle(E[:, :3, :3])))) if len(here) else None,
             "translation error [mm]": 1e3 * float(np.median(off)) if len(here) else None,
         })  # fmt: skip
@@ -134,25 +136,18 @@ def moving(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
 
 def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
     """How far the box's pose is from the truth over the run, by back end, after one change of body frame each."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
-    for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange", "tab:green")):
-        found = score.poses_of(1)
-        if found is not None:
-            frames, own, true = found
-            errors = absolute_pose_errors(own, true)
-            axes[0].plot(score.stamps[frames], errors.rotation, ".", ms=3, color=colour, label=backend)
-            axes[1].plot(score.stamps[frames], 1e3 * errors.translation, ".", ms=3, color=colour)
-    axes[0].set(ylabel="rotation error [deg]", ylim=(0, None))
-    axes[1].set(ylabel="translation error [mm]", xlabel="time [s]", ylim=(0, None))
-    if axes[0].lines:
-        axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    with picture(path, 7, 4.5, 2, 1, sharex=True) as (turned, moved):
+        for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange", "tab:green")):
+            found = score.poses_of(1)
+            if found is not None:
+                frames, own, true = found
+                errors = absolute_pose_errors(own, true)
+                turned.plot(score.stamps[frames], errors.rotation, ".", ms=3, color=colour, label=backend)
+                moved.plot(score.stamps[frames], 1e3 * errors.translation, ".", ms=3, color=colour)
+        turned.set(ylabel="rotation error [deg]", ylim=(0, None))
+        moved.set(ylabel="translation error [mm]", xlabel="time [s]", ylim=(0, None))
+        if turned.lines:
+            turned.legend(fontsize=8)
 
 
 def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
@@ -353,35 +348,6 @@ def table(rows: list[dict[str, Any]]) -> str:
     return plain_table(rows) + ("\n\n" + plain_table(bodies) if bodies else "")
 
 
-def worlds_together(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each world: medians over the seeds, and all objects that are none."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        found.setdefault(row["world"].partition("seed=")[0].rstrip("?&"), []).append(row)
-    medians = ("ATE [mm]", "camera NEES", "false moving per 1000 still", "counted right", "objects [ms]")
-    return [
-        {
-            "world": world, "seeds": len(runs), **{c: float(np.median([run[c] for run in runs])) for c in medians},
-            "false objects": sum(len(run["false objects [frames]"]) for run in runs),
-            "longest [frames]": max((k for run in runs for k in run["false objects [frames]"]), default=0),
-        }
-        for world, runs in found.items()
-    ]  # fmt: skip
-
-
-def plain_table(rows: list[dict[str, Any]]) -> str:
-    columns = [key for key, value in rows[0].items() if not isinstance(value, dict)]
-    return markdown(columns, [[text(row.get(c)) for c in columns] for row in rows], len(columns))
-
-
-def text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    if isinstance(value, list):
-        value = ", ".join(map(str, value)) or None
-    return "–" if value is None else str(value)
-
-
 def main() -> int:
     parser = script_options(__file__, __doc__, "a few frames of each part")
     parser.add_argument("--observations", action="store_true", help="worlds as observations, not rendered")
@@ -395,7 +361,7 @@ def main() -> int:
             rows = json.loads(kept.read_text())
         else:
             rows = globals()[name](not arguments.observations, arguments.quick, arguments.out)
-        shown = worlds_together(rows) if name == "still" else rows
+        shown = {"still": worlds_together, "table1": places_together}.get(name, list)(rows)
         print(f"\n# {TITLES[name]}\n\n{globals()[name].__doc__}\n\n{table(shown)}", flush=True)
         kept.write_text(json.dumps(rows, indent=2, default=str) + "\n")
     return 0

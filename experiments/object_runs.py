@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import slam
+from experiments.tables import markdown
 from slam import registry
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
@@ -113,3 +114,47 @@ def body_row(world: str, backend: str, number: str, body: dict[str, Any]) -> dic
 
 def millimetres(metres: float | None) -> float | None:
     return None if metres is None else 1e3 * metres
+
+
+def places_together(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each back end and mode: at how many of the four places the box is known, and the largest errors."""
+    runs: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        runs.setdefault((row["back end"], row["mode"]), []).append(row)
+    errors = ("rotation error [deg]", "translation error [mm]")
+    return [
+        {
+            "back end": backend, "mode": mode, "places": sum(row["frames"] > 0 for row in own),
+            **{e: max((row[e] for row in own if row[e] is not None), default=None) for e in errors},
+        }
+        for (backend, mode), own in runs.items()
+    ]  # fmt: skip
+
+
+def worlds_together(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each world: medians over the seeds, and all objects that are none."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(row["world"].partition("seed=")[0].rstrip("?&"), []).append(row)
+    medians = ("ATE [mm]", "camera NEES", "false moving per 1000 still", "counted right", "objects [ms]")
+    return [
+        {
+            "world": world, "seeds": len(runs), **{c: float(np.median([run[c] for run in runs])) for c in medians},
+            "false objects": sum(len(run["false objects [frames]"]) for run in runs),
+            "longest [frames]": max((k for run in runs for k in run["false objects [frames]"]), default=0),
+        }
+        for world, runs in found.items()
+    ]  # fmt: skip
+
+
+def plain_table(rows: list[dict[str, Any]]) -> str:
+    columns = [key for key, value in rows[0].items() if not isinstance(value, dict)]
+    return markdown(columns, [[text(row.get(c)) for c in columns] for row in rows], len(columns))
+
+
+def text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    if isinstance(value, list):
+        value = ", ".join(map(str, value)) or None
+    return "–" if value is None else str(value)

@@ -29,8 +29,8 @@ ROOMS = (
 
 INTRODUCTION = """# Parameters
 
-The numbers in the algorithms that are not settings (`slam settings` lists those): how many there are of each kind, and
-those chosen ones that change a result. The others stand with their reasons in the code. Made by
+The named numbers in the algorithms that are not settings (`slam settings` lists those): how many there are of each
+kind, and the chosen ones that change a result beyond the scatter. The others have their reasons in the code. Made by
 `python experiments/parameters.py`.
 """
 
@@ -157,7 +157,7 @@ def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
         lines += ["", SENSITIVITY.format(cases=cases, **scatter)]
     lines += ["## Choices", "", _row(["name", "value", "what it is", "½", "2"]), "| --- | ---: | --- | ---: | ---: |"]
     file = ""
-    shown = ("within the scatter", "beyond it", "fails")
+    shown = ("beyond it", "fails")
     for p in (p for p in parameters if p.kind == "choice" and _outcome(measured[p], scatter) in shown):
         if p.file != file:
             file = p.file

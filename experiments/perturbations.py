@@ -38,7 +38,7 @@ from slam.system import StereoSlam
 _DAY = "kitti_raw/2011_09_26/2011_09_26_drive_"
 DRIVES = {"KITTI 06": "kitti_odometry/sequences/06", "raw 0001": f"{_DAY}0001_sync", "raw 0013": f"{_DAY}0013_sync"}
 SPOILT = ("KITTI 06", "raw 0001")  # drives that are run with spoilt images
-FIGURES = (*(f"ATE {name} [m]" for name in ONLINE), "frames", *(f"lost {name}" for name in ONLINE))
+FIGURES = (*(f"ATE {name} [m]" for name in ONLINE), "lost")
 
 _FIRST = 5  # frames that may be left out at the beginning
 _FEATURES = 0.2  # by how much the number of features may differ
@@ -219,8 +219,7 @@ def figures(fault: Fault, sequence: Drive | Sequence, last: int, trials: int) ->
         for backend in ONLINE:
             outcomes[backend].append(run(sequence, features, backend))
     ates = [quartiles([o.ate for o in outcomes[backend]]) for backend in ONLINE]
-    lost = [sum(o.lost for o in outcomes[backend]) for backend in ONLINE]
-    return [*ates, sum(o.frames for o in outcomes[ONLINE[0]]), *lost]
+    return [*ates, sum(o.lost for backend in ONLINE for o in outcomes[backend])]
 
 
 def quartiles(values: list[float]) -> str:

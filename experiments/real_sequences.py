@@ -19,14 +19,15 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import recordings, script_options
-from experiments.tables import markdown, write_json
+from experiments.tables import picture, show
 from slam.compare.collect import Lifetimes
 from slam.config import SystemConfig
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
 from slam.run.figures import widths
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from slam.sequences import open_sequence
 
 SEQUENCES = {
@@ -66,25 +67,22 @@ def row(name: str, summary: dict[str, Any]) -> list[str]:
 
 def draw(names: dict[str, Path], out: Path) -> None:
     """Paths from above, online, and the true one laid upon the first of them."""
-    from matplotlib.figure import Figure
-
     rows = math.ceil(len(names) / 2)
-    figure = Figure((9, 4 * rows), layout="constrained")
-    axes = figure.subplots(rows, 2, squeeze=False).ravel()
-    for axis in axes[len(names) :]:
-        axis.set_axis_off()
-    for axis, (name, folder) in zip(axes, names.items()):
-        paths = [Trajectory.read_tum(folder_of(name, backend, out) / "trajectory.txt") for backend in ONLINE]
-        for backend, path, width in zip(ONLINE, paths, widths(len(ONLINE), 1.5)):
-            axis.plot(*path.positions[:, [0, 2]].T, lw=width, label=backend)
-        truth = true_path(folder, paths[0])
-        if truth is not None:
-            axis.plot(*truth[:, [0, 2]].T, "k--", lw=1, label="truth")
-        axis.set(title=name, xlabel="right [m]", ylabel="forward [m]")
-        axis.axis("equal")
-        axis.locator_params(nbins=6)
-        axis.legend(frameon=False, fontsize=8)
-    figure.savefig(out / "paths.png", dpi=110, metadata={"Software": None})
+    with picture(out / "paths.png", 9, 4 * rows, rows, 2) as panels:
+        axes = np.ravel(panels)
+        for axis in axes[len(names) :]:
+            axis.set_axis_off()
+        for axis, (name, folder) in zip(axes, names.items()):
+            paths = [Trajectory.read_tum(folder_of(name, backend, out) / "trajectory.txt") for backend in ONLINE]
+            for backend, path, width in zip(ONLINE, paths, 1.5 * widths(len(ONLINE))):
+                axis.plot(*path.positions[:, [0, 2]].T, lw=width, label=backend)
+            truth = true_path(folder, paths[0])
+            if truth is not None:
+                axis.plot(*truth[:, [0, 2]].T, "k--", lw=1, label="truth")
+            axis.set(title=name, xlabel="right [m]", ylabel="forward [m]")
+            axis.axis("equal")
+            axis.locator_params(nbins=6)
+            axis.legend(frameon=False, fontsize=8)
 
 
 def true_path(folder: Path, estimate: Trajectory) -> np.ndarray | None:
@@ -107,8 +105,7 @@ def main() -> int:
         print(f"left out, not there: {', '.join(sorted(set(SEQUENCES) - set(found)))}", file=sys.stderr)
     frames = 10 if arguments.quick else None
     rows = [row(n, run_one(n, folder, b, arguments.out, frames)) for n, folder in found.items() for b in ONLINE]
-    print(markdown(HEADER, rows, 2))
-    write_json(arguments.out / "table.json", HEADER, rows)
+    show(arguments.out / "table.json", HEADER, rows, 2)
     draw(found, arguments.out)
     return 0
 

@@ -16,7 +16,6 @@ smallest and the largest.
 
 from __future__ import annotations
 
-import csv
 import itertools
 import os
 import sys
@@ -31,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
 from experiments.common import script_options, span
-from experiments.tables import markdown
+from experiments.tables import picture, show
 from slam.config import SystemConfig
 from slam.data import Observations
 from slam.evaluation.metrics import absolute_errors, segment_errors
@@ -215,17 +214,13 @@ def row(moved: float, wrong: float, name: str, runs: Sequence[Run]) -> list[str 
 
 def draw(found: dict[str, Run], path: Path) -> None:
     """Online paths by label, from above, with the true one."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((5, 7), layout="constrained")
-    axis = figure.subplots()
-    axis.plot(*next(iter(found.values())).truth.positions[:, [0, 2]].T, "k--", lw=1, label="truth")
-    for label, one in found.items():
-        axis.plot(*one.online.positions[:, [0, 2]].T, lw=1, label=label)
-    axis.set(xlabel="right [m]", ylabel="forward [m]")
-    axis.axis("equal")
-    axis.legend(frameon=False, fontsize=7)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    with picture(path, 5, 7) as (axis,):
+        axis.plot(*next(iter(found.values())).truth.positions[:, [0, 2]].T, "k--", lw=1, label="truth")
+        for label, one in found.items():
+            axis.plot(*one.online.positions[:, [0, 2]].T, lw=1, label=label)
+        axis.set(xlabel="right [m]", ylabel="forward [m]")
+        axis.axis("equal")
+        axis.legend(frameon=False, fontsize=7)
 
 
 def main() -> int:
@@ -252,10 +247,7 @@ def main() -> int:
         rows.append(row(moved, wrong, name, runs))
         drawn.setdefault(f"{name}, moved by {moved:g} px" if moved else name, runs[0])
     print(f"Frames {start} to {stop}.\n")
-    print(markdown(HEADER, rows, 3))
-    given.out.mkdir(parents=True, exist_ok=True)
-    with (given.out / "recorded_tracks.csv").open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([HEADER, *rows])
+    show(given.out / "table.json", HEADER, rows, 3)
     draw(drawn, given.out / "recorded_tracks.png")
     return 0
 

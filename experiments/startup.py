@@ -4,15 +4,14 @@
 
 The board's landmarks are known to a millimetre, with their descriptors. The state begins at a wrong place; the camera
 stands at [3, -70, 2.7] cm. Three wrong starts, both back ends, all pixels or the left ones alone; and the
-back ends by themselves, without the search in the map that finds the first pose. Prints a Markdown
-table and writes it, the numbers (``startup.json``) and the figure (``startup.png``: the estimates in the x-y and x-z
+back ends by themselves, without the search in the map that finds the first pose. Prints a Markdown table and draws
+the figure (``startup.png``: the estimates in the x-y and x-z
 planes as in Fig. 6, and the error over time with what the back end says of it). Paper B's own filter stopped at
 [0, -55.8, 3.7] cm, 14 cm short.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from backends import create
 from experiments.common import script_options
-from experiments.tables import markdown
+from experiments.tables import picture, show
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures
 from slam.geometry import se3
@@ -45,7 +44,7 @@ PAPER = np.array([0.0, -0.558, 0.037])  #: where paper B's filter stopped [m]
 STANDING = MotionModel(acceleration=0.1, angular_acceleration=0.1)  #: of a robot that trembles where it stands
 KNOWN = 1e-3  #: standard deviation of the stored positions [m]
 HEADER = (
-    "pixels", "back end", "start [cm]", "frame 0 [cm]", "frame 10 [cm]", "mean after [cm]", "worst after [cm]",
+    "pixels", "back end", "frame 0 [cm]", "frame 10 [cm]", "mean after [cm]", "worst after [cm]",
     "frames above 1 cm", "1 sigma at the end [cm]",
 )  # fmt: skip
 
@@ -142,42 +141,37 @@ def taken(features: StereoFeatures, pixels: str) -> StereoFeatures:
     return features if pixels == "stereo" else replace(features, uv_right=np.full_like(features.uv_right, np.nan))
 
 
-def row(run: StartUp) -> list[str]:
-    """A row of the table."""
-    e = 100 * run.errors
-    after = e[10:]
-    figures = (e[0], e[10], after.mean(), after.max())
-    return [
-        run.pixels, run.backend, run.start, *(f"{x:.2f}" for x in figures), str(int((e > 1).sum())),
-        f"{100 * run.sigma[-1]:.2f}",
-    ]  # fmt: skip
+def worst_of_starts(runs: list[StartUp]) -> list[list[object]]:
+    """A row of the table for each kind of pixels and back end: of its starts the worst."""
+    rows: list[list[object]] = []
+    for kind in dict.fromkeys((run.pixels, run.backend) for run in runs):
+        own = [run for run in runs if (run.pixels, run.backend) == kind]
+        e = 100 * np.array([run.errors for run in own])
+        after = e[:, 10:]
+        figures = (e[:, 0].max(), e[:, 10].max(), after.mean(axis=1).max(), after.max())
+        above, sigma = int((e > 1).sum(axis=1).max()), 100 * max(float(run.sigma[-1]) for run in own)
+        rows.append([*kind, *map(float, figures), above, sigma])
+    return rows
 
 
 def draw(runs: list[StartUp], path: Path) -> None:
     """The figure: x-y and x-z planes as in paper B, Fig. 6, and the error over time."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(14, 4.4), layout="constrained")
-    for axis, (a, b), letters in zip(axes, ((0, 1), (0, 2)), ("xy", "xz")):
+    with picture(path, 14, 4.4, 1, 3) as axes:
+        for axis, (a, b), letters in zip(axes, ((0, 1), (0, 2)), ("xy", "xz")):
+            for run in runs:
+                p = 100 * run.positions
+                axis.plot(p[:, a], p[:, b], {"ekf": "o-", "smoother": "x:"}.get(run.backend, "+--"), ms=4, lw=0.8)
+            truth = 100 * runs[0].truth.mean(axis=0)
+            axis.plot(truth[a], truth[b], "k^", ms=10, mfc="none", label="true place")
+            axis.plot(100 * PAPER[a], 100 * PAPER[b], "rs", mfc="none", label="where paper B's stopped")
+            axis.set(xlabel=f"{letters[0]} [cm]", ylabel=f"{letters[1]} [cm]")
+            axis.legend(fontsize=8)
         for run in runs:
-            p = 100 * run.positions
-            axis.plot(p[:, a], p[:, b], {"ekf": "o-", "smoother": "x:"}.get(run.backend, "+--"), ms=4, lw=0.8)
-        truth = 100 * runs[0].truth.mean(axis=0)
-        axis.plot(truth[a], truth[b], "k^", ms=10, mfc="none", label="true place")
-        axis.plot(100 * PAPER[a], 100 * PAPER[b], "rs", mfc="none", label="where paper B's stopped")
-        axis.set(xlabel=f"{letters[0]} [cm]", ylabel=f"{letters[1]} [cm]")
-        axis.legend(fontsize=8)
-    for run in runs:
-        line = axes[2].semilogy(100 * run.errors, lw=0.8, label=f"{run.backend}, {run.start}")[0]
-        axes[2].semilogy(100 * run.sigma, "--", lw=0.8, color=line.get_color())
-    axes[2].axhline(1.0, color="k", lw=0.8)
-    axes[2].set(xlabel="frame", ylabel="error (dashed: 1 sigma) [cm]")
-    axes[2].legend(fontsize=7)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+            line = axes[2].semilogy(100 * run.errors, lw=0.8, label=f"{run.backend}, {run.start}")[0]
+            axes[2].semilogy(100 * run.sigma, "--", lw=0.8, color=line.get_color())
+        axes[2].axhline(1.0, color="k", lw=0.8)
+        axes[2].set(xlabel="frame", ylabel="error (dashed: 1 sigma) [cm]")
+        axes[2].legend(fontsize=7)
 
 
 def main() -> int:
@@ -189,14 +183,8 @@ def main() -> int:
     cases = [(pixels, backend, start) for pixels in ("stereo", "left") for backend in ONLINE for start in STARTS]
     runs = [start_up(sequence, known, backend, start, frames, pixels) for pixels, backend, start in cases]
     runs += [by_itself(sequence, known, backend, start, frames) for backend in ONLINE for start in STARTS]
-    text = markdown(HEADER, [row(run) for run in runs], 3) + "\n"
-    print(f"{len(known)} stored features, {frames} frames\n\n{text}")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "startup.md").write_text(text, encoding="utf-8")
-    records = [
-        {"pixels": r.pixels, "backend": r.backend, "start": r.start, "errors_m": r.errors.tolist()} for r in runs
-    ]  # fmt: skip
-    (arguments.out / "startup.json").write_text(json.dumps(records) + "\n", encoding="utf-8")
+    print(f"{len(known)} stored features, {frames} frames; of three wrong starts the worst\n")
+    show(arguments.out / "table.json", HEADER, worst_of_starts(runs), 2)
     draw([run for run in runs if run.pixels == "stereo"], arguments.out / "startup.png")
     return 0
 

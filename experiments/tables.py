@@ -1,11 +1,14 @@
-"""Tables of the experiments: Markdown for the results page, and the same cells as JSON."""
+"""What an experiment leaves: a Markdown table for the results page, the same cells as JSON, and a picture."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]], texts: int = 1) -> str:
@@ -24,3 +27,21 @@ def write_json(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]])
     """A list of rows, each by the names of its columns; no folder is needed before."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps([dict(zip(header, row)) for row in rows], indent=2) + "\n", encoding="utf-8")
+
+
+def show(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]], texts: int = 1, words: str = "") -> None:
+    """Print a table, with words below it, and write its cells to a JSON file."""
+    print(markdown(header, rows, texts) + (f"\n\n{words}" if words else ""), flush=True)
+    write_json(path, header, rows)
+
+
+@contextmanager
+def picture(path: Path, width: float, height: float, rows: int = 1, columns: int = 1, **shared: Any) -> Iterator[Any]:
+    """Panels (rows, columns) of a picture so large [in], which is written to `path` at the end; no folder is needed."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **shared)
+    yield axes if min(rows, columns) > 1 else np.ravel(axes)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, metadata={"Software": None})

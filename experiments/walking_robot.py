@@ -16,12 +16,11 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
-from experiments.tables import markdown
+from experiments.tables import show
 from slam.compare.plan import Plan
 from slam.compare.scheduler import LocalScheduler
 from slam.compare.sweep import Run, sweep
 from slam.registry import ONLINE
-from slam.run.figures import draw_map_3d
 from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.runtime.cores import available_cores
@@ -54,12 +53,8 @@ def main() -> int:
     plan = Plan(("synthetic:field",), ONLINE, stop=stop, replay=False)
     shutil.rmtree(arguments.out / "runs", ignore_errors=True)  # those of another form or version
     runs = sweep(plan, arguments.out / "runs", LocalScheduler(available_cores()))
-    text = markdown(HEADER, [row(run) for run in runs])
-    print(text)
-    (arguments.out / "tables.md").write_text(text + "\n", encoding="utf-8")
+    show(arguments.out / "table.json", HEADER, [row(run) for run in runs])
     data = [RunData.read(run.folder, run.trial.backend) for run in runs if run.completed]
-    draw_map_3d(data, arguments.out / "map_3d.png")
-    plot(data, arguments.out / "top_view.png", "map")
     plot(data, arguments.out / "errors.png", "errors")
     return 0
 

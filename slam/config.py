@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from slam.calibration.config import SelfCalibrationConfig
@@ -37,10 +37,11 @@ OBJECTS = {
     "driving": ObjectsConfig(max_speed=25.0, min_speed=1.0, suspect=40.0, group_test=70.0, size=2.0),
 }
 
-#: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does.
+#: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does; nothing comes
+#: within a metre of the cameras of a car.
 FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
     ("handheld", "surf"): {"upright": False},
-    ("driving", "surf"): {"upright": True},
+    ("driving", "surf"): {"upright": True, "min_depth": 1.0},
 }
 
 #: Options of back ends that depend on the kind of motion. A vehicle's frames are a metre apart: each is worth a pose.
@@ -105,12 +106,13 @@ class SystemConfig:
         """The configuration of a tree of plain types, as `to_json` writes it; what is left out has its default.
 
         Raises:
-            ConfigurationError: a key is unknown or a value of the wrong type or out of range.
+            ConfigurationError: a key is unknown, or no longer a setting and of another value than now, or a value is of
+                the wrong type or out of range.
         """
         from pydantic import TypeAdapter, ValidationError
 
         try:
-            return TypeAdapter(cls).validate_python(tree)
+            return TypeAdapter(cls).validate_python(_without_fixed(tree))
         except ValidationError as error:
             raise ConfigurationError(_refused(error.errors()[0])) from None
 
@@ -127,6 +129,33 @@ class SystemConfig:
         return self.from_json(tree)
 
 
+#: Classes of sections in which settings of earlier versions are constants now.
+_FIXED = {"association": AssociationConfig, "map": MapConfig, "self_calibration": SelfCalibrationConfig}
+
+
+def _without_fixed(tree: dict[str, Any]) -> dict[str, Any]:
+    """The tree without settings of earlier versions that have a fixed value now.
+
+    Raises:
+        ConfigurationError: one had another value.
+    """
+    if not isinstance(tree, dict):  # which is refused as any other value of a wrong type
+        return tree
+    kept = dict(tree)
+    for section, kind in _FIXED.items():
+        if isinstance(own := tree.get(section), dict):
+            constants = {name for name, value in vars(kind).items() if isinstance(value, (int, float))}
+            gone = [key for key in own if key in constants - {f.name for f in fields(kind)}]
+            for key in gone:
+                if not (isinstance(own[key], (int, float)) and own[key] == getattr(kind, key)):
+                    raise ConfigurationError(
+                        f"setting {section}.{key}: no longer a setting; its value is {getattr(kind, key)}, "
+                        f"not {own[key]!r:.80}"
+                    )
+            kept[section] = {key: value for key, value in own.items() if key not in gone}
+    return kept
+
+
 #: What is required of a setting, by pydantic's name of the fault.
 _WANTED = {
     "int": "a whole number", "float": "a number", "finite": "a finite number", "bool": "true or false",
@@ -137,6 +166,8 @@ _WANTED = {
 def _refused(fault: Mapping[str, Any]) -> str:
     """The line for a value that pydantic refuses: the setting, what it must be, and what it is."""
     where = ".".join(str(part) for part in fault["loc"])
+    if fault["type"] == "unexpected_keyword_argument":
+        return f"setting {where}: there is no such setting in this version"
     wanted = _WANTED.get(fault["type"].partition("_")[0])
     if wanted is None:
         return f"setting {where}: {fault['msg']}"

@@ -28,6 +28,7 @@ BUILT_IN = {
     "backends": {
         "batch": "backends.batch:BatchBackend",
         "ekf": "backends.ekf:EkfBackend",
+        "iekf": "backends.iekf:IekfBackend",
         "smoother": "backends.smoother:SmootherBackend",
         "window": "backends.window:WindowBackend",
     },

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from slam.errors import ConfigurationError
 from slam.naming import unknown
 
 _FREE = ("frontend", "backend")  # their options are checked by the front end or back end itself
+
+#: Settings that a user can set, by section, and by name of a front end. The others are the program's own: they are in
+#: ``config.json``, so that a run can be repeated, and change from version to version. All options of back ends, and of
+#: front ends from elsewhere, can be set.
+SETTABLE: dict[str, tuple[str, ...]] = {
+    "models": ("motion.acceleration", "motion.angular_acceleration", "pixel_sigma"),
+    "association": ("align",),
+    "map": ("target_in_view", "max_landmarks", "max_depth_error", "monocular", "restart_after"),
+    "atlas": ("enabled", "give_back", "most_loops", "on_disk"),
+    "self_calibration": ("enabled", "systematic"),
+    "objects": ("mode", "max_speed", "min_speed", "database"),
+    "surf": ("features", "descriptor", "upright", "min_depth", "max_depth", "threads"),
+}
 
 _LONGEST = 10_000  # characters of a setting
 _BRACKETS = 100  # in its value
@@ -34,6 +47,31 @@ def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
         if not equals:
             raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
         _set(tree, path.strip().split("."), _value(text.strip()), setting)
+
+
+def can_be_set(key: str, owner: str = "") -> bool:
+    """Whether a user can set this key, such as ``"map.grid"``; `owner` is the front end or back end that has it."""
+    section, _, name = key.partition(".")
+    names = SETTABLE.get(owner or section)
+    return names is None or name in names
+
+
+def require_settable(settings: Iterable[str], tree: Mapping[str, Any], frontend: str) -> None:
+    """Refuse texts ``section.key=value`` of settings that are the program's own.
+
+    Args:
+        settings: as `apply_settings` takes them; faults that it finds are left to it.
+        tree: the configuration that they are for.
+        frontend: name of the front end.
+
+    Raises:
+        ConfigurationError: one is no setting for users.
+    """
+    known = set(leaves(dict(tree)))
+    for key in (text.partition("=")[0].strip() for text in settings):
+        own = key.startswith("frontend.") and frontend in SETTABLE
+        if (key in known or own) and not can_be_set(key, frontend if own else ""):
+            raise ConfigurationError(f"setting {key}: cannot be set; `slam settings` lists those that can")
 
 
 def _listed(settings: Any) -> list[Any]:

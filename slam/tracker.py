@@ -80,7 +80,7 @@ class Tracker:
         places = state.backend.positions
         aligned, landmarks = self._aligner.align(frontend, features, matches, landmarks, places)
         if aligned is not features:
-            corrected = self._session.calibration.correct(aligned)
+            corrected = self._session.calibration.correct_again(corrected, features, aligned)
         step = Step(
             index, aligned, replace(corrected, images=None), prediction, landmarks, matches, standing, tracking,
             state.atlas,

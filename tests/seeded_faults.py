@@ -39,9 +39,8 @@ class Fault(NamedTuple):
 FAULTS = (
     # the filter
     Fault(
-        "turning the camera moves points the wrong way", "backends/ekf/measurement.py",
-        "by_pose = np.concatenate([-by_point, J @ turned.reshape(-1, 3, 3)], axis=2)",
-        "by_pose = np.concatenate([-by_point, -J @ turned.reshape(-1, 3, 3)], axis=2)",
+        "turning the camera moves points the wrong way", "backends/ekf/motion.py",
+        "W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ A, A", "W[:3, 3:], W[3:, 3:] = -hat(self.x[:3]) @ A, -A",
         "tests/backends/test_ekf_parts.py tests/backends/test_ekf.py",
     ),
     Fault(

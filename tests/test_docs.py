@@ -26,6 +26,7 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
 from slam.sequences.calibration_files import write_opencv
+from slam.settings import require_settable
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parent.parent
@@ -174,7 +175,9 @@ def commands(page, *languages):
 def require_accepted(settings, backend=None):
     """Raise where a setting is refused by the configuration, the front end, or every back end that it could be for."""
     needed = ["objects.database=FILE.npz"] if "objects.mode=procedure1" in settings else []
-    config = SystemConfig.for_kind("handheld").with_settings([*needed, *settings])
+    default = SystemConfig.for_kind("handheld")
+    require_settable(settings, default.to_json(), "surf")
+    config = default.with_settings([*needed, *settings])
     rig = slam.StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
     slam.StereoSlam(rig, backend="ekf", config=SystemConfig(frontend=config.frontend))
     if config.backend:

@@ -10,7 +10,8 @@ import pytest
 from experiments.ablation_parts import CASES, RECORDED, USUAL, error_of
 from experiments.bars import bars
 from slam.geometry.trajectory import Trajectory
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from slam.sequences import open_sequence
 
 pytestmark = pytest.mark.slow

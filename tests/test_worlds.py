@@ -13,7 +13,8 @@ import pytest
 from slam.config import SystemConfig
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.trajectory import Trajectory
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 

@@ -83,15 +83,25 @@ class Covariance:
         cross = np.concatenate([own, self.cross[:, stay]], axis=1)
         return replace(self, cross=cross, left=left, poses=k // POSE + 1)
 
-    def camera_moved(self, J: Array, noise: Array) -> Covariance:
-        """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
+    def camera_moved(self, J: Array, noise: Array, K: Array | None = None) -> Covariance:
+        """The camera's error (12,) becomes J times what it was, plus noise (12, 12).
+
+        With K (A, 3, 6), K times what the pose's error x has lost, ``x − x'``, is added to those of the landmarks.
+        """
         P, X = self.dense.copy(), self.cross.copy()
         rows = J @ P[:CAMERA]
         own = rows[:, :CAMERA] @ J.T + noise
+        if K is not None:
+            lost, D = P[:POSE] - rows[:POSE], np.eye(POSE, CAMERA) - J[:POSE]
+            with_all = np.concatenate([J @ lost[:, :CAMERA].T - noise[:, :POSE], lost[:, CAMERA:].T])
+            variance = lost[:, :CAMERA] @ D.T + noise[:POSE, :POSE]
         P[:CAMERA, CAMERA:], P[CAMERA:, :CAMERA] = rows[:, CAMERA:], rows[:, CAMERA:].T
         P[:CAMERA, :CAMERA] = 0.5 * (own + own.T)
-        X[:CAMERA] = J @ X[:CAMERA]
-        return replace(self, dense=P, cross=X)
+        before, X[:CAMERA] = X[:POSE].copy(), J @ X[:CAMERA]
+        if K is None:
+            return replace(self, dense=P, cross=X)
+        X[CAMERA:] += K.reshape(-1, POSE) @ (before - X[:POSE])
+        return replace(self, dense=_sheared(P.T, K, with_all, variance), cross=X)
 
     def appended(self, J: Array, noise: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
@@ -127,28 +137,49 @@ class Covariance:
         numbers[rows >= self.correlated] = -1
         return numbers.reshape(-1)
 
-    def corrected(self, V: Array, V_left: Array, J: Array, K: Array) -> Covariance:
-        """After an update, ``P − V Vᵀ``, in the coordinates of the corrected state.
+    def corrected(self, V: Array, V_left: Array, J: Array | None = None, K: Array | None = None) -> Covariance:
+        """After an update, ``P − V Vᵀ``; with J and K in the coordinates of the corrected state.
 
         Args:
             V: ``P Hᵀ L⁻ᵀ`` (n, m), in Fortran's order.
             V_left: the same of what has left (6K + 3B, m).
             J: the camera's error becomes J (12, 12) times what it was,
-            K: and then to those of the landmarks K (A, 3, 6) times that of [r, φ] is added.
+            K: and then to those of the landmarks K (A, 3, 6) times that of the pose is added.
         """
         P = dsyrk(-1.0, V, beta=1.0, c=self.dense.T, lower=1)  # a copy, of which the lower triangle counts
+        X = self.cross - V @ V_left.T
+        if J is None or K is None:
+            kernels.mirror(P.T)
+            return replace(self, dense=P.T, cross=X)
         camera = P[:, :CAMERA].copy()
         camera[:CAMERA] = np.tril(camera[:CAMERA]) + np.tril(camera[:CAMERA], -1).T
         camera = camera @ J.T
         camera[:CAMERA] = J @ camera[:CAMERA]
         P[:, :CAMERA] = camera
-        shift = np.zeros((len(P), POSE), order="F")
-        shift[CAMERA:] = K.reshape(-1, POSE)
-        if K.any():
-            half = np.asfortranarray(camera[:, :POSE] + 0.5 * shift @ camera[:POSE, :POSE])
-            P = dsyr2k(1.0, shift, half, beta=1.0, c=P, lower=1, overwrite_c=1)
-        kernels.mirror(P.T)
-        X = self.cross - V @ V_left.T
         X[:CAMERA] = J @ X[:CAMERA]
-        X += shift @ X[:POSE]
-        return replace(self, dense=P.T, cross=X)
+        X[CAMERA:] += K.reshape(-1, POSE) @ X[:POSE]
+        return replace(self, dense=_sheared(P, K, camera[:, :POSE], camera[:POSE, :POSE]), cross=X)
+
+    def sheared(self, K: Array) -> Covariance:
+        """K (A, 3, 6) times the error of the camera's pose is added to those of the landmarks of the dense part."""
+        X = self.cross.copy()
+        X[CAMERA:] += K.reshape(-1, POSE) @ X[:POSE]
+        dense = _sheared(self.dense.copy().T, K, self.dense[:, :POSE], self.pose)
+        return replace(self, dense=dense, cross=X)
+
+
+def _sheared(P: Array, K: Array, with_all: Array, variance: Array) -> Array:
+    """P (n, n) where K (A, 3, 6) times some y (6,) is added to the landmarks' errors.
+
+    Args:
+        P: in Fortran's order, its lower triangle counts; overwritten.
+        K: by landmark.
+        with_all: covariance (n, 6) of all, before that, with y.
+        variance: of y (6, 6).
+    """
+    shift = np.zeros((len(P), POSE), order="F")
+    shift[CAMERA:] = K.reshape(-1, POSE)
+    half = np.asfortranarray(with_all + 0.5 * shift @ variance)
+    P = dsyr2k(1.0, shift, half, beta=1.0, c=P, lower=1, overwrite_c=1)
+    kernels.mirror(P.T)
+    return np.asarray(P.T)

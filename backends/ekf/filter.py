@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from backends.ekf.config import EkfConfig
-from backends.ekf.covariance import CAMERA, POSE
-from backends.ekf.landmarks import COORDINATES, Landmarks, distant_anchors
-from backends.ekf.measurement import Measurement
-from backends.ekf.motion import Motion, advanced, at_rest, motion_noise, turning
+from backends.ekf.covariance import CAMERA
+from backends.ekf.landmarks import COORDINATES, Coordinates, Landmarks, distant_anchors
+from backends.ekf.measurement import Jacobian, Measurement
+from backends.ekf.motion import Camera, EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import Problem, UnsolvableError
 from backends.ekf.state import State
@@ -33,6 +34,38 @@ from slam.window.gating import with_noise
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
+@dataclass(frozen=True, eq=False)
+class Form:
+    """What a filter is of: the camera and its error, and the landmarks' coordinates.
+
+    Attributes:
+        name: of the back end, for messages.
+        config: its options.
+        camera: the first one.
+        covariance: of its error (12, 12).
+        coordinates: of the landmarks.
+        iterations: most linearisations of an update.
+        stereo: whether the right pixel is measured.
+    """
+
+    name: str
+    config: Any
+    camera: Camera
+    covariance: Array
+    coordinates: Coordinates
+    iterations: int
+    stereo: bool = True
+
+
+def papers_form(models: EstimatorModels, options: dict[str, Any]) -> Form:
+    """The papers' Euler angles, by the options of `EkfConfig`."""
+    config = from_options(EkfConfig, "ekf", options)
+    use = config.resolved()
+    stereo = use.measurement == "stereo"
+    camera, P = EulerCamera.first(models, use.consistent and stereo)
+    return Form("ekf", config, camera, P, COORDINATES[use.landmarks], use.iterations, stereo)
+
+
 class EkfBackend:
     """Extended Kalman filter over the camera's motion and the landmarks, the papers' state estimator.
 
@@ -45,7 +78,8 @@ class EkfBackend:
     Args:
         rig: the cameras.
         models: noise, priors, motion and gate.
-        options: see `EkfConfig`.
+        form: makes what the filter is of, by models and options: the papers' Euler angles, or another error.
+        options: of the form; see `EkfConfig`.
 
     Attributes:
         state: what is believed now. Each call makes a new one beside it, which takes its place at the end of the call.
@@ -57,15 +91,18 @@ class EkfBackend:
     #: Of a prior map: those that were measured keep their joint covariance (72 N² bytes).
     most_landmarks = 2000
 
-    def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
-        self.rig = rig
-        self.models = models
-        self.config = from_options(EkfConfig, "ekf", options)
-        self._options = self.config.resolved()
-        self._coordinates = COORDINATES[self._options.landmarks]
-        self._consistent = self._options.consistent and self._options.measurement == "stereo"
+    def __init__(
+        self,
+        rig: StereoRig,
+        models: EstimatorModels = EstimatorModels(),  # noqa: B008
+        form: Callable[[EstimatorModels, dict[str, Any]], Form] = papers_form,
+        **options: Any,
+    ) -> None:
+        self.rig, self.models = rig, models
+        self._form = form(models, options)
+        self.config, self._coordinates = self._form.config, self._form.coordinates
         self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
-        self.state = State.first(models)
+        self.state = State.first(self._form.camera, self._form.covariance)
         self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
@@ -78,14 +115,14 @@ class EkfBackend:
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
         """See `slam.interfaces.RestingBackend.predict_at_rest`."""
-        return self._predicted(stamp, lambda start, dt: at_rest(start))
+        return self._predicted(stamp, lambda camera, dt: camera.at_rest())
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         s = self._started("update")
-        require_not_measured("ekf", s.measured)
-        require_guess("ekf", guess)
+        require_not_measured(self._form.name, s.measured)
+        require_guess(self._form.name, guess)
         s = replace(s.with_all_of(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
@@ -99,7 +136,8 @@ class EkfBackend:
         h = self.rig.triangulate(observations.uv_left, observations.uv_right)  # paper A, Eq. (8)
         bad = ~np.isfinite(h).all(axis=1)
         if bad.any():
-            raise MeasurementError(f"ekf: landmark {observations.ids[bad][0]} has no right pixel or no positive depth")
+            what = f"landmark {observations.ids[bad][0]} has no right pixel or no positive depth"
+            raise MeasurementError(f"{self._form.name}: {what}")
         h = h * np.minimum(1.0, self._farthest / h[:, 2:])
         covariances = self.rig.triangulation_covariance(h, self.models.pixel_sigma)
         self.state = s.placed(self._coordinates, observations.ids, h, covariances)
@@ -115,7 +153,7 @@ class EkfBackend:
         rows = np.argsort(s.landmarks.ids) if landmarks else np.zeros(0, np.intp)
         marks = s.landmarks.take(rows)
         D = self._coordinates.jacobian(marks.anchors, marks.c)
-        blocks = D @ (s.covariance.marginals()[0][rows] if landmarks else np.zeros((0, 3, 3))) @ D.transpose(0, 2, 1)
+        blocks = D @ (s.landmark_covariances(rows) if landmarks else np.zeros((0, 3, 3))) @ D.transpose(0, 2, 1)
         covariances = 0.5 * (blocks + blocks.transpose(0, 2, 1))
         return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, covariances)
 
@@ -135,14 +173,14 @@ class EkfBackend:
         Raises:
             MeasurementError: before the first `predict`, or n is less than one.
         """
-        return self._started("recent").recent_poses(require_recent("ekf", n))
+        return self._started("recent").recent_poses(require_recent(self._form.name, n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
     @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
-        require_known("ekf", ids, positions, covariances)
+        require_known(self._form.name, ids, positions, covariances)
         s, anchors = self.state, distant_anchors(positions, covariances)
         s.landmarks.require_new(ids)
         new = Landmarks.at(self._coordinates, ids.astype(np.int64), anchors, positions.astype(float), s.frame)
@@ -153,8 +191,8 @@ class EkfBackend:
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
-        require_known("ekf", ids, local, covariances)
-        require_in_front("ekf", ids, local)
+        require_known(self._form.name, ids, local, covariances)
+        require_in_front(self._form.name, ids, local)
         s.landmarks.require_new(ids)
         self.state = s.placed(self._coordinates, ids, local, covariances)
 
@@ -176,7 +214,7 @@ class EkfBackend:
             rows = np.flatnonzero(rectified_rig.rig.left.in_image(z[:, :2]))
             z = correct(z[rows])
             if not np.isfinite(z).all():
-                raise MeasurementError("ekf: a mended measurement is not finite")
+                raise MeasurementError(f"{self._form.name}: a mended measurement is not finite")
             points = se3.transform(T, rectified_rig.rig.triangulate(z[:, :2], z[:, [2, 1]]))
             good = np.isfinite(points).all(axis=1)
             rows, points = rows[good], points[good]
@@ -187,18 +225,18 @@ class EkfBackend:
 
     # --- the filter's parts ---
 
-    def _advanced(self, start: Motion, dt: float) -> Motion:
+    def _advanced(self, camera: Camera, dt: float) -> Motion:
         """The camera after a step by the motion model."""
-        return advanced(self.models, start, self.state.covariance.dense[:CAMERA, :CAMERA], dt, self._consistent)
+        return camera.advanced(self.models, self.state.covariance.dense[:CAMERA, :CAMERA], dt)
 
-    def _predicted(self, stamp: float, moved: Callable[[Motion, float], Motion]) -> Prediction:
+    def _predicted(self, stamp: float, moved: Callable[[Camera, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""
         s = self.state
-        require_stamp("ekf", stamp, s.stamp if s.frame >= 0 else None)
+        require_stamp(self._form.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, measured=False)
         else:
-            after = s.advanced(float(stamp), moved(Motion(s.camera, s.R_world_angles), stamp - s.stamp))
+            after = s.advanced(float(stamp), moved(s.camera, stamp - s.stamp))
         prediction = self._prediction(after)
         self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []
         self.state = after
@@ -209,8 +247,8 @@ class EkfBackend:
         marks, T = s.landmarks, s.pose
         rows = np.flatnonzero(self.rig.left.in_view((marks.points - T[:3, 3]) @ T[:3, :3]))
         blocks, cross = (part[rows] for part in s.covariance.marginals())
-        model, c = Measurement(self.rig, s.R_world_angles, self._coordinates, marks.anchors[rows]), marks.c[rows]
-        z, H = model.linearise(s.camera[:POSE], c, rows)
+        z, own = Measurement(self.rig, self._coordinates, marks.anchors[rows]).linearise(T, marks.c[rows])
+        H = Jacobian.of(own, s.relative(rows), rows)
         right = z[:, [2, 1]]
         if not self.rig.is_rectified:
             right = self.rig.project((marks.points[rows] - T[:3, 3]) @ T[:3, :3])[1]
@@ -231,10 +269,10 @@ class EkfBackend:
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
-            after = s.corrected(self._coordinates, found, rows, self._consistent)
+            after = State.corrected(self._coordinates, found, rows)
         except UnsolvableError as error:
-            return s, UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
-        used, w = found.solution.used, found.solution.system.w
+            return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self._form.name}: {error}")
+        used, w = found.used, found.system.w
         dof = int(np.isfinite(problem.z[used]).sum())
         return after, UpdateReport(
             UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], float(w @ w), dof
@@ -243,32 +281,20 @@ class EkfBackend:
     def _problem(self, s: State, observations: Observations, rows: IndexArray, guess: Array | None) -> Problem:
         """The update by landmarks of some rows (M,) of the table."""
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
-        if self._options.measurement == "left":
+        if not self._form.stereo:
             z[:, 2] = np.nan
-        model = Measurement(self.rig, s.R_world_angles, self._coordinates, s.landmarks.anchors[rows])
-
-        def gauge() -> Array:
-            """Jacobian (6 + 3M, 6) of g by a displacement of the world."""
-            own = np.eye(6)
-            own[:3, 3:] = -se3.hat(s.camera[:3])
-            own[3:, 3:] = np.linalg.inv(turning(s.R_world_angles, s.camera))
-            return np.concatenate([own, s.landmarks.gauge[rows].reshape(-1, 6)])
-
+        view, model = partial(s.view, rows), Measurement(self.rig, self._coordinates, s.landmarks.anchors[rows])
         return Problem(
-            s.covariance.dense, s.camera[:POSE], s.landmarks.c[rows], CAMERA + 3 * rows, z, self.models.pixel_sigma,
-            model, self._options.iterations, self.models.gate_probability,
-            None if guess is None else s.change_to(guess), gauge if self._consistent else None,
+            view, s.landmarks.c[rows], CAMERA + 3 * rows, z, self.models.pixel_sigma, model, self._form.iterations,
+            self.models.gate_probability, guess,
         )  # fmt: skip
 
     def _landmarks_pose(self, s: State, problem: Problem, rows: IndexArray) -> Array | None:
-        """The change of [r, φ] (6,) to the pose on which most of the landmarks agree, if there is one."""
-        change = np.zeros(POSE) if problem.guess is None else problem.guess
-        camera = s.camera + np.concatenate([change, np.zeros(POSE)])
-        T = replace(s, camera=camera).pose
-        found = landmarks_pose(self.rig, s.landmarks.points[rows], problem.z, self.models, T, s.frame + 1)
-        return None if found is None else s.change_to(found)
+        """The pose (4, 4) on which most of the landmarks agree, if there is one."""
+        T = s.pose if problem.guess is None else problem.guess
+        return landmarks_pose(self.rig, s.landmarks.points[rows], problem.z, self.models, T, s.frame + 1)
 
     def _started(self, what: str) -> State:
         if self.state.frame < 0:
-            raise MeasurementError(f"ekf: {what} before the first predict")
+            raise MeasurementError(f"{self._form.name}: {what} before the first predict")
         return self.state

@@ -19,7 +19,7 @@ import numpy as np
 
 from slam.data import IdArray, IndexArray
 from slam.errors import MeasurementError
-from slam.geometry.se3 import Array, hat
+from slam.geometry.se3 import Array, hat, transform
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
@@ -104,7 +104,7 @@ class Landmarks:
         c: coordinates (N, 3).
         points: positions (N, 3) [m] in the world, which follow from the two.
         gauge: derivatives (N, 3, 6) of the coordinates by a displacement of the whole world (shifted by t, turned by δ
-            about the origin), at the state to which the covariance was last transported.
+            about the origin).
         seen: number of the frame (N,) that measured each last; that of its first sight at least.
     """
 
@@ -139,13 +139,13 @@ class Landmarks:
         try:
             return np.array([self._rows[int(i)] for i in ids], np.intp)
         except KeyError as error:
-            raise MeasurementError(f"ekf: landmark {error.args[0]} is not in the map") from None
+            raise MeasurementError(f"landmark {error.args[0]} is not in the map") from None
 
     def require_new(self, ids: IdArray) -> None:
         """Raise MeasurementError where a landmark is in the map already."""
         for i in ids.tolist():
             if i in self._rows:
-                raise MeasurementError(f"ekf: landmark {i} is in the map already")
+                raise MeasurementError(f"landmark {i} is in the map already")
 
     @property
     def _columns(self) -> tuple[Any, ...]:
@@ -161,10 +161,22 @@ class Landmarks:
 
     def moved(self, coordinates: Coordinates, rows: IndexArray, change: Array) -> Landmarks:
         """With a change (M, 3) of the coordinates of some rows."""
-        c, points = self.c.copy(), self.points.copy()
+        c = self.c.copy()
         c[rows] = coordinates.moved(self.c[rows], change, _NEARER)
-        points[rows] = coordinates.points(self.anchors[rows], c[rows])
-        return replace(self, c=c, points=points)
+        return replace(self, c=c)._placed(coordinates, rows)
+
+    def displaced(self, coordinates: Coordinates, rows: IndexArray, T: Array) -> Landmarks:
+        """With some rows where a displacement T (4, 4) of the world brings them; their anchors stay."""
+        c = self.c.copy()
+        c[rows] = coordinates.of(self.anchors[rows], transform(T, self.points[rows]))
+        return replace(self, c=c)._placed(coordinates, rows)
+
+    def _placed(self, coordinates: Coordinates, rows: IndexArray) -> Landmarks:
+        """With points and gauge of some rows as their coordinates say."""
+        points, gauge, anchors, c = self.points.copy(), self.gauge.copy(), self.anchors[rows], self.c[rows]
+        points[rows] = coordinates.points(anchors, c)
+        gauge[rows] = gauge_jacobian(coordinates, anchors, c, points[rows])
+        return replace(self, points=points, gauge=gauge)
 
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:

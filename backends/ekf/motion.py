@@ -1,15 +1,18 @@
-"""How the camera moves and what is known of it at first, for [r, φ, v, ω] (paper B, section 2)."""
+"""How the camera moves, for [r, φ, v, ω] and its printed transition (paper B, section 2)."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
-from backends.ekf.angles import LIMIT, reanchor
+from backends.ekf.angles import LIMIT, anchor, attitude, pose_jacobian, reanchor
 from backends.ekf.covariance import CAMERA, POSE
-from slam.geometry.euler import body_rate_matrix, rotation
+from slam.geometry import se3
+from slam.geometry.euler import angles, body_rate_matrix, rotation
 from slam.geometry.se3 import Array, hat
 from slam.models import ANYWHERE, EstimatorModels
 
@@ -18,111 +21,191 @@ _PIECES = 64  # numerics: at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # numerics: of a step whose error may be carried as a turn about the world's axes [rad]
 
 
+class Camera(Protocol):
+    """The camera's part of a filter's state, and what its error (12,) means: of the pose (6), of velocity and rate (6).
+
+    - `pose`: ``T_world_left`` (4, 4).
+    - `invariant`: whether landmarks' errors are what is left when the world is displaced by the error of the pose.
+    - `transports`: whether the covariance is transported to the corrected state after an update.
+    - `by_error`: derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error.
+    - `world`: the displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose.
+    - `plain`: the error (12, 12) by errors of position, attitude (a turn about the world's axes), velocity, and rate.
+    - `moved`: after an error (12,) is corrected. `at`: at another pose (4, 4), with the same velocities.
+    - `seen_from`: the error (12,) that would bring the other camera here.
+    - `transport`: the error as seen from another camera, by the error (12, 12).
+    - `advanced`: after `dt` [s], with the error's covariance P (12, 12).
+    - `at_rest`: after a step of a camera that stands: the pose stays, and the velocity is zero for certain.
+    - `settled`: in coordinates in which nothing is near a singularity.
+    """
+
+    @property
+    def pose(self) -> Array: ...  # noqa: D102
+    @property
+    def invariant(self) -> bool: ...  # noqa: D102
+    @property
+    def transports(self) -> bool: ...  # noqa: D102
+    def by_error(self) -> Array: ...  # noqa: D102
+    def world(self) -> Array: ...  # noqa: D102
+    def plain(self) -> Array: ...  # noqa: D102
+    def moved(self, error: Array) -> Any: ...  # noqa: D102
+    def at(self, T: Array) -> Any: ...  # noqa: D102
+    def seen_from(self, other: Any) -> Array: ...  # noqa: D102
+    def transport(self, to: Any) -> Array: ...  # noqa: D102
+    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion: ...  # noqa: D102
+    def at_rest(self) -> Motion: ...  # noqa: D102
+    def settled(self) -> Motion: ...  # noqa: D102
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A camera that has moved.
 
     Attributes:
-        camera: its state [r, φ, v, ω] (12,).
-        R_world_angles: the angles' world (3, 3), see `backends.ekf.angles`.
+        camera: where it is.
         J: its error is J (12, 12) times what it was before,
         noise: plus a Gaussian of this covariance (12, 12).
     """
 
-    camera: Array
-    R_world_angles: Array
+    camera: Any
     J: Array = field(default_factory=lambda: np.eye(CAMERA))
     noise: Array = field(default_factory=lambda: np.zeros((CAMERA, CAMERA)))
 
-    def then(self, camera: Array, R_world_angles: Array, J: Array, noise: Array | float = 0.0) -> Motion:
+    def then(self, camera: Any, J: Array, noise: Array | float = 0.0) -> Motion:
         """Followed by another one."""
-        return Motion(camera, R_world_angles, J @ self.J, J @ self.noise @ J.T + noise)
+        return Motion(camera, J @ self.J, J @ self.noise @ J.T + noise)
 
 
-def advanced(models: EstimatorModels, start: Motion, P: Array, dt: float, consistent: bool) -> Motion:
-    """The printed transition (paper B, section 2), in pieces where it would run into the angles' singularity.
+@dataclass(frozen=True, eq=False)
+class EulerCamera:
+    """The papers' [r, φ, v, ω]: position, Euler angles, and their rates; the error is that of these numbers.
 
-    Args:
-        models: how the camera moves.
-        start: where it is.
-        P: its covariance (12, 12).
-        dt: how long [s].
-        consistent: see `_transition`.
+    Attributes:
+        x: the state (12,) [m], [rad], [m/s], [rad/s].
+        R_world_angles: the angles' world (3, 3), see `backends.ekf.angles`.
+        transports: keep the error of the attitude as a turn about the world's axes, and the covariance with it.
     """
-    if attitude_deviation(models, P, dt) > _ANY_ATTITUDE:  # it may be turned anyhow: it stays, independent of the map
-        noise = covariance_after_gap(models, start.camera[3:6], P[:3, :3], dt)
-        camera = np.concatenate([start.camera[:POSE], np.zeros(POSE)])
-        return start.then(camera, start.R_world_angles, np.zeros((CAMERA, CAMERA)), noise)
-    turn = float(start.camera[10]) * dt
-    if abs(float(start.camera[4]) + turn) > LIMIT:
-        start = start.then(*reanchor(start.R_world_angles, start.camera))
-        turn = float(start.camera[10]) * dt
-    pieces = max(1, math.ceil(min(abs(turn) / LIMIT, _PIECES)))
-    for _ in range(pieces):
-        start = reanchored_if_needed(_transition(models, start, dt / pieces, consistent))
-    return start
+
+    x: Array
+    R_world_angles: Array
+    transports: bool
+    invariant = False
+
+    @classmethod
+    def first(cls, models: EstimatorModels, consistent: bool) -> tuple[EulerCamera, Array]:
+        """Before the first prediction, with its covariance."""
+        R_world_angles, phi = anchor(models.initial_pose[:3, :3])
+        camera = cls(np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)]), R_world_angles, consistent)
+        return camera, _of_angles(prior(models), phi)
+
+    @cached_property
+    def pose(self) -> Array:  # noqa: D102
+        return se3.pose(attitude(self.R_world_angles, self.x[3:6]), self.x[:3])
+
+    def by_error(self) -> Array:  # noqa: D102
+        return pose_jacobian(self.pose[:3, :3], self.x[3:6])
+
+    def world(self) -> Array:  # noqa: D102
+        W, A = np.eye(POSE), turning(self.R_world_angles, self.x)
+        W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ A, A
+        return W
+
+    def plain(self) -> Array:  # noqa: D102
+        return np.eye(CAMERA)  # with turns about the angles' axes, which matters nowhere
+
+    def moved(self, error: Array) -> EulerCamera:  # noqa: D102
+        return replace(self, x=self.x + error)
+
+    def at(self, T: Array) -> EulerCamera:  # noqa: D102
+        phi, before = angles(self.R_world_angles.T @ T[:3, :3]), self.x[3:6]
+        other = np.array([phi[0] + np.pi, np.pi - phi[1], phi[2] + np.pi])  # the same rotation
+        changes = np.stack([phi, other]) - before
+        changes -= 2 * np.pi * np.round(changes / (2 * np.pi))
+        nearest = before + changes[np.argmin(np.linalg.norm(changes, axis=1))]
+        return replace(self, x=np.concatenate([T[:3, 3], nearest, self.x[POSE:]]))
+
+    def seen_from(self, other: EulerCamera) -> Array:  # noqa: D102
+        return self.x - other.x
+
+    def transport(self, to: EulerCamera) -> Array:
+        """The displacement of the world is kept: see `backends.ekf.state.State.corrected`."""
+        J = np.eye(CAMERA)
+        if self.transports:
+            A, A_before = turning(self.R_world_angles, to.x), turning(self.R_world_angles, self.x)
+            change = to.x - self.x
+            J[:3, 3:6] = -hat(change[:3]) @ A_before
+            J[3:6, 3:6] = np.linalg.solve(A, A_before)
+            J[6:9, 3:6] = -hat(change[6:9]) @ A_before
+        return J
+
+    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
+        """The printed transition (paper B, section 2), in pieces where it would run into the angles' singularity."""
+        gap = after_gap(models, P, dt)
+        if gap is not None:  # it may be turned anyhow: it stays, independent of the map
+            camera = replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
+            return Motion(camera, np.zeros((CAMERA, CAMERA)), _of_angles(gap, self.x[3:6]))
+        motion, turn = Motion(self), float(self.x[10]) * dt
+        if abs(float(self.x[4]) + turn) > LIMIT:
+            motion = self._reanchored(motion)
+            turn = float(motion.camera.x[10]) * dt
+        pieces = max(1, math.ceil(min(abs(turn) / LIMIT, _PIECES)))
+        for _ in range(pieces):
+            motion = motion.then(*motion.camera._transition(models, dt / pieces))
+            motion = motion.camera._settled(motion)
+        return motion
+
+    def _transition(self, models: EstimatorModels, dt: float) -> tuple[EulerCamera, Array, Array]:
+        """``x ← f(x)`` and ``P ← A P Aᵀ + W Q Wᵀ`` with the printed A and W.
+
+        If the covariance is transported, the attitude's error is carried as a turn about the world's axes, not as one
+        of the angles φ. The printed transition has constant rates of the angles, which is not the same in another
+        world. The difference is of second order; in long steps, where it would not be, it is left as printed.
+        """
+        x, A = self.x.copy(), np.eye(CAMERA)
+        x[:POSE] += dt * self.x[POSE:]
+        A[:POSE, POSE:] = dt * np.eye(POSE)
+        if self.transports and np.abs(x[3:6] - self.x[3:6]).max() < _SMALL_TURN:
+            J, R = np.eye(CAMERA), self.R_world_angles
+            J[3:6, 3:6] = np.linalg.solve(turning(R, x), turning(R, self.x))
+            A = A @ J
+        return replace(self, x=x), A, motion_noise(models, dt)
+
+    def at_rest(self) -> Motion:  # noqa: D102
+        camera = replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
+        return Motion(camera, np.diag(np.repeat([1.0, 0.0], POSE)))
+
+    def settled(self) -> Motion:
+        """With a new angles' world where φy is near its singularity."""
+        return self._settled(Motion(self))
+
+    def _settled(self, motion: Motion) -> Motion:
+        phi_y = float(self.x[4])
+        near = abs(math.sin(phi_y)) > math.sin(LIMIT) or math.cos(phi_y) < 0
+        return self._reanchored(motion) if near else motion
+
+    def _reanchored(self, motion: Motion) -> Motion:
+        x, R_world_angles, J = reanchor(self.R_world_angles, self.x)
+        return motion.then(replace(self, x=x, R_world_angles=R_world_angles), J)
 
 
-def at_rest(start: Motion) -> Motion:
-    """A step of a camera that stands: the pose stays, and the velocity is zero for certain."""
-    camera = np.concatenate([start.camera[:POSE], np.zeros(POSE)])
-    return start.then(camera, start.R_world_angles, np.diag(np.repeat([1.0, 0.0], POSE)))
-
-
-def _transition(models: EstimatorModels, start: Motion, dt: float, consistent: bool) -> Motion:
-    """``x ← f(x)`` and ``P ← A P Aᵀ + W Q Wᵀ`` with the printed A and W.
-
-    `consistent`: the attitude's error is carried as a turn about the world's axes, not as one of the angles φ. The
-    printed transition has constant rates of the angles, which is not the same in another world. The difference is of
-    second order; in long steps, where it would not be, the transition is left as printed.
-    """
-    before, camera, A = start.camera, start.camera.copy(), np.eye(CAMERA)
-    camera[:POSE] += dt * before[POSE:]
-    A[:POSE, POSE:] = dt * np.eye(POSE)
-    if consistent and np.abs(camera[3:6] - before[3:6]).max() < _SMALL_TURN:
-        J, R = np.eye(CAMERA), start.R_world_angles
-        J[3:6, 3:6] = np.linalg.solve(turning(R, camera), turning(R, before))
-        A = A @ J
-    return start.then(camera, start.R_world_angles, A, motion_noise(models, dt))
-
-
-def reanchored_if_needed(motion: Motion) -> Motion:
-    """With a new angles' world where φy is near its singularity."""
-    phi_y = float(motion.camera[4])
-    if abs(math.sin(phi_y)) > math.sin(LIMIT) or math.cos(phi_y) < 0:
-        return motion.then(*reanchor(motion.R_world_angles, motion.camera))
-    return motion
-
-
-def turning(R_world_angles: Array, camera: Array) -> Array:
+def turning(R_world_angles: Array, x: Array) -> Array:
     """Derivative (3, 3) of the attitude, turned about the world's axes, by the angles φ of a camera (12,)."""
-    return np.asarray(R_world_angles @ rotation(camera[3:6]) @ body_rate_matrix(camera[3:6]))
+    return np.asarray(R_world_angles @ rotation(x[3:6]) @ body_rate_matrix(x[3:6]))
 
 
-def transport(R_world_angles: Array, before: Array, after: Array) -> tuple[Array, Array]:
-    """What becomes of the error when the camera's state (12,) is moved and the displacement of the world kept.
-
-    Returns:
-        the camera's error is multiplied by (12, 12); (6, 6) takes an error of [r, φ] after that to the displacement.
-    """
-    A, A_before, change, J = turning(R_world_angles, after), turning(R_world_angles, before), after - before, np.eye(12)
-    J[:3, 3:6] = -hat(change[:3]) @ A_before
-    J[3:6, 3:6] = np.linalg.solve(A, A_before)
-    J[6:9, 3:6] = -hat(change[6:9]) @ A_before
-    world = np.eye(POSE)
-    world[:3, 3:], world[3:, 3:] = hat(after[:3]) @ A, A
-    return J, world
+def _of_angles(P: Array, phi: Array) -> Array:
+    """A covariance (12, 12) whose turns are isotropic about the body's axes, of the angles φ (3,) and their rates."""
+    E = np.eye(CAMERA)
+    E[3:6, 3:6] = E[9:12, 9:12] = np.linalg.inv(body_rate_matrix(phi))
+    return np.asarray(E @ P @ E.T)
 
 
-def initial_covariance(models: EstimatorModels, phi: Array) -> Array:
-    """The camera's prior (12, 12) at angles φ (3,): isotropic in body axes, hence through the angles' rate matrix."""
-    P = np.zeros((CAMERA, CAMERA))
-    E = np.linalg.inv(body_rate_matrix(phi))
-    P[0:3, 0:3] = models.initial_position_sigma**2 * np.eye(3)
-    P[3:6, 3:6] = models.initial_rotation_sigma**2 * E @ E.T
-    P[6:9, 6:9] = models.initial_velocity_sigma**2 * np.eye(3)
-    P[9:12, 9:12] = models.initial_angular_velocity_sigma**2 * E @ E.T
-    return P
+def prior(models: EstimatorModels) -> Array:
+    """The first camera's covariance (12, 12) of position, attitude, velocity, and body rate."""
+    sigmas = (
+        models.initial_position_sigma, models.initial_rotation_sigma,
+        models.initial_velocity_sigma, models.initial_angular_velocity_sigma,
+    )  # fmt: skip
+    return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
 
 
 def motion_noise(models: EstimatorModels, dt: float) -> Array:
@@ -133,21 +216,18 @@ def motion_noise(models: EstimatorModels, dt: float) -> Array:
     return noise.reshape(CAMERA, CAMERA)
 
 
-def attitude_deviation(models: EstimatorModels, P: Array, dt: float) -> float:
-    """Largest standard deviation [rad] of the angles after a step of `dt` [s] from a covariance P (12, 12)."""
-    phi, omega = np.arange(3, 6), np.arange(9, 12)
-    variance = P[phi, phi] + 2 * dt * P[phi, omega] + dt * dt * P[omega, omega]
-    return math.sqrt(max(variance.max() + dt * dt * models.motion.velocity_variance(dt)[1], 0.0))
+def after_gap(models: EstimatorModels, P: Array, dt: float) -> Array | None:
+    """Covariance (12, 12) of a camera that may have turned anyhow in the last `dt` [s]; None where it may not.
 
-
-def covariance_after_gap(models: EstimatorModels, phi: Array, position: Array, dt: float) -> Array:
-    """Covariance (12, 12) of a camera at angles φ (3,) that may have turned anyhow in the last `dt` [s].
-
-    `position` (3, 3) is the covariance of its position before. The position is as uncertain as the prior of the speed
-    makes it meanwhile. Larger numbers would mean nothing, and would leave a double too few digits for the map.
+    P (12, 12) is that before, of position, attitude, velocity, and rate. The position is as uncertain as the prior of
+    the speed makes it meanwhile. Larger numbers would mean nothing, and leave a double too few digits for the map.
     """
-    P, E = initial_covariance(models, phi), np.linalg.inv(body_rate_matrix(phi))
-    P[:3, :3] = position + (models.initial_velocity_sigma * dt) ** 2 * np.eye(3)
-    P[:3, :3] *= min(1.0, ANYWHERE**2 / P[:3, :3].diagonal().max())
-    P[3:6, 3:6] = np.pi**2 / 3 * E @ E.T
-    return P
+    attitude, rate = np.arange(3, 6), np.arange(9, 12)
+    variance = P[attitude, attitude] + 2 * dt * P[attitude, rate] + dt * dt * P[rate, rate]
+    if variance.max() + dt * dt * models.motion.velocity_variance(dt)[1] <= _ANY_ATTITUDE**2:
+        return None
+    after = prior(models)
+    after[:3, :3] = P[:3, :3] + (models.initial_velocity_sigma * dt) ** 2 * np.eye(3)
+    after[:3, :3] *= min(1.0, ANYWHERE**2 / after[:3, :3].diagonal().max())
+    after[3:6, 3:6] = np.pi**2 / 3 * np.eye(3)
+    return after

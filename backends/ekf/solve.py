@@ -2,7 +2,7 @@
 
 In the papers' order: the innovation ν and its covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain
 ``K = P Hᵀ S⁻¹``, the corrected state ``x + K ν`` and covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is
-``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for g = [r, φ, measured landmarks] alone.
+``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for g = [pose, measured landmarks] alone.
 
 A component that is not measured (or gated) keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
 """
@@ -14,33 +14,27 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg.blas import dgemm, dtrmm
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 from backends.ekf import kernels
 from backends.ekf.covariance import POSE
-from backends.ekf.measurement import Displacement, Jacobian, Measurement
+from backends.ekf.measurement import Jacobian, Measurement
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
-#: further than needed does harm: a landmark's Gaussian in world coordinates comes from pixels by a linearisation at its
-#: prediction and fits pixels linearised there; moving that point to where each noisy measurement wants it biases the
-#: estimate and claims information that is not there (simulated drives at 0.1: twice the rotation error, four times
-#: the NEES of 1.0). But a long step, or the first frames of a fast camera, cannot do without.
+#: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
+#: there (drives at 0.1: four times the NEES of 1.0). A long step, or a fast camera's first, cannot do without.
 _LINEAR = 1.0
-#: Their errors together may move the pose by this share of its standard deviations: with a wide prior they all have the
-#: same sign, and each within its noise they moved it by 0.7 of them.
+#: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
 _SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
-
-
-#: Of a linear update: mask of its rows (M, 3), H, H P (3M, n), ν (3M,), S (3M, 3M), of which the lower triangle counts.
-Parts = tuple[BoolArray, Jacobian, Array, Array, Array]
 
 
 class UnsolvableError(ArithmeticError):
@@ -48,25 +42,44 @@ class UnsolvableError(ArithmeticError):
 
 
 @dataclass(frozen=True, eq=False)
+class View:
+    """The prior as seen from a pose: errors of the state are taken from there.
+
+    Attributes:
+        state: the prior itself (`backends.ekf.state.State`), with its covariance as seen from there.
+        T: the pose T_world_left (4, 4).
+        P: the covariance (n, n) of the state's error.
+        mean: that of the state's error (n,): zero at the prior's own pose.
+        lever: an error x (6,) of the pose moves a measured landmark as seen from the camera by ``−lever x`` (M, 3, 6).
+        go: the pose, and the changes (M, 3) of the measured landmarks' coordinates, after an error (n,).
+    """
+
+    state: Any
+    T: Array
+    P: Array
+    mean: Array
+    lever: Array
+    go: Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
 class Problem:
     """One update.
 
     Attributes:
-        P: the covariance (n, n) of the state.
-        pose: prior mean of [r, φ] (6,).
-        c: that of the measured landmarks' coordinates (M, 3).
+        view: gives the prior as seen from a pose (4, 4), by default its own, with more noise (12, 12) of the camera.
+        c: the prior's coordinates (M, 3) of the measured landmarks.
         first: where these begin in the state (M,).
         z: measurements (M, 3) [px], NaN where a component is not measured.
         sigma: pixel noise [px].
         model: what is predicted, and its derivatives.
         iterations: most linearisations.
         gate_probability: quantile of χ² beyond which a landmark's measurement is rejected.
-        guess: a change of [r, φ] (6,) worth trying where the prior is far off, or None.
-        gauge: gives the Jacobian (6 + 3M, 6) of g by a displacement of the world, if that is unobservable.
+        guess: a pose (4, 4) worth trying where the prior is far off, or None.
+        noise: of the camera (12, 12), which joins the prior's, or None.
     """
 
-    P: Array
-    pose: Array
+    view: Callable[[Array | None, Array | None], View]
     c: Array
     first: IndexArray
     z: Array
@@ -75,49 +88,43 @@ class Problem:
     iterations: int
     gate_probability: float
     guess: Array | None = None
-    gauge: Callable[[], Array] | None = None
+    noise: Array | None = None
+
+    @cached_property
+    def prior(self) -> View:
+        """Seen from its own pose."""
+        return self.view(None, self.noise)
 
     @cached_property
     def g(self) -> IndexArray:
-        """Where [r, φ] and the measured landmarks stand in the state (6 + 3M,)."""
+        """Where the pose and the measured landmarks stand in the state (6 + 3M,)."""
         return np.concatenate([np.arange(POSE), (self.first[:, None] + np.arange(3)).reshape(-1)])
-
-    @cached_property
-    def displacement(self) -> Displacement | None:
-        """The unobservable part of a change: a displacement of the whole world. None where landmarks are known exactly.
-
-        Of all displacements it is the one that explains the landmarks' change best, given their covariance.
-        """
-        if self.gauge is None:
-            return None
-        U, marks = self.gauge(), self.g[POSE:]
-        lower, info = dpotrf(self.P[marks][:, marks].T, lower=1, clean=0)
-        if info != 0:
-            return None
-        weighted = np.asarray(dpotrs(lower, U[POSE:], lower=1)[0])
-        L = np.zeros(U.T.shape)
-        L[:, POSE:] = np.linalg.pinv(U[POSE:].T @ weighted, rcond=1e-12, hermitian=True) @ weighted.T
-        return Displacement(U, L, self.g)
-
-    def mean(self, change: Array, whole: bool = False) -> tuple[Array, Array]:
-        """Pose (6,) and coordinates (M, 3) after a change of g, without the world's displacement unless `whole`."""
-        if change.any() and not whole and self.displacement is not None:
-            change = change - self.displacement.change @ (self.displacement.share @ change)
-        # A linear step may ask for a point beyond infinity: it is at infinity.
-        return self.pose + change[:POSE], self.model.coordinates.moved(self.c, change[POSE:].reshape(-1, 3))
 
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """A correction s of g, the change of the state that it makes, what is predicted there, and the cost.
+    """Where measurements are linearised: a view, and a change (M, 3) of the landmarks' coordinates.
 
-    The cost is the squared distance from prior and measurements, ∞ where one cannot be seen.
+    Also what is predicted (M, 3), its derivatives (M, 3, 3) by the coordinates, the squared distance from the prior.
     """
 
-    s: Array
+    view: View
     change: Array
     z: Array
-    cost: float = math.inf
+    own: Array
+    from_prior: float = 0.0
+
+    @classmethod
+    def at(cls, problem: Problem, view: View, change: Array, from_prior: float = 0.0) -> Iterate:
+        """With its linearisation."""
+        c = problem.model.coordinates.moved(problem.c, change)
+        return cls(view, change, *problem.model.linearise(view.T, c), from_prior)
+
+    def cost(self, problem: Problem, rows: BoolArray) -> float:
+        """Squared distance from prior and measurements; ∞ where one cannot be seen."""
+        residual = np.where(rows, problem.z - self.z, 0.0)
+        cost = self.from_prior + float(np.vdot(residual, residual)) / problem.sigma**2
+        return cost if math.isfinite(cost) else math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,13 +150,13 @@ class System:
     taken: Array
 
     @classmethod
-    def of(cls, rows: BoolArray, H: Jacobian, HP: Array, nu: Array, S: Array, gone: BoolArray) -> System:
-        """Without some rows (mask (M, 3)); of S only the lower triangle counts.
+    def of(cls, linear: Linear, gone: BoolArray) -> System:
+        """Without some rows (mask (M, 3)).
 
         Raises:
             UnsolvableError: S is not positive definite.
         """
-        out = np.flatnonzero(gone)
+        nu, S, out = linear.nu, linear.S, np.flatnonzero(gone)
         if len(out):
             nu, S = nu.copy(), S.copy()
             nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
@@ -158,12 +165,12 @@ class System:
             raise UnsolvableError("the innovation covariance is not positive definite")
         inverse = _inverse(upper).T
         inverse[out, out] = 0.0
-        return cls(rows & ~gone, H, HP, nu, inverse, np.zeros((len(nu), 0)))
+        return cls(linear.rows & ~gone, linear.H, linear.HP, nu, inverse, np.zeros((len(nu), 0)))
 
     def without(self, gone: BoolArray) -> System:
         """Without some more rows (mask (M, 3))."""
         columns = self.inverse[:, np.flatnonzero(gone & self.rows)]
-        more, _ = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))
+        more = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))[0]
         return replace(self, rows=self.rows & ~gone, taken=np.concatenate([self.taken, more], axis=1))
 
     def whiten(self, X: Array) -> Array:
@@ -190,11 +197,11 @@ class System:
 
     @cached_property
     def by_pose(self) -> Array:
-        """The whitened innovation's covariance (3M, 6) with [r, φ]."""
+        """The whitened innovation's covariance (3M, 6) with the pose."""
         return self.whiten(self.HP[:, :POSE])
 
     def variances(self, P: Array) -> Array:
-        """Of [r, φ] (6,) after the update; rounding may leave one that is not positive."""
+        """Of the pose's error (6,) after the update; rounding may leave one that is not positive."""
         return np.asarray(P.diagonal()[:POSE] - (self.by_pose**2).sum(axis=0))
 
     def distances(self) -> Array:
@@ -203,11 +210,34 @@ class System:
         For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
         by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
         """
-        lost = self.taken.T @ self.inverse
-        found, used = kernels.conditional_distances(self.inverse, lost, self.y), self.rows.any(axis=1)
+        found = kernels.conditional_distances(self.inverse, self.taken.T @ self.inverse, self.y)
+        used = self.rows.any(axis=1)
         if not np.isfinite(found[used]).all():
             raise UnsolvableError("the innovation covariance is not positive definite")
         return np.where(used, found, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Of a linear update: mask of its rows (M, 3), H, H P (3M, n), ν (3M,), lower triangle of S (3M, 3M)."""
+
+    rows: BoolArray
+    H: Jacobian
+    HP: Array
+    nu: Array
+    S: Array
+
+    @classmethod
+    def at(cls, problem: Problem, rows: BoolArray, at: Iterate) -> Linear:
+        """Linearised at an iterate; ν and S are those of the prior's mean."""
+        H = Jacobian.of(at.own, at.view.lever, problem.first, rows)
+        nu = np.where(rows, problem.z - at.z, 0.0).reshape(-1)
+        if at.change.any():
+            nu += (H.own @ at.change[:, :, None]).reshape(-1)
+        if at.view.mean.any():
+            nu -= H.times(at.view.mean[:, None])[:, 0]
+        HP = H.times(at.view.P)
+        return cls(rows, H, HP, nu, H.covariance(HP, problem.sigma**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,15 +246,15 @@ class Solution:
 
     Attributes:
         used: which landmarks (M,) it is made of.
-        change: of the state (n,).
+        view: of the last linearisation.
+        change: the error (n,) to correct, as seen from there.
         system: the last linear update, from which the covariance follows.
-        distances: of each landmark (M,): squared distance of its measurement from what all others predict.
     """
 
     used: BoolArray
+    view: View
     change: Array
     system: System
-    distances: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +268,7 @@ class Gated:
     limits: Array
     distances: Array
     start: Iterate
-    system: Callable[[], System]
+    linear: Linear
 
 
 def gate(problem: Problem, at_guess: bool = False) -> Gated:
@@ -247,82 +277,71 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     Raises:
         UnsolvableError: the prior is not finite, or S is not positive definite.
     """
-    if not (np.isfinite(problem.pose).all() and math.isfinite(problem.P.trace())):
+    view = problem.view(problem.guess, problem.noise) if at_guess else problem.prior
+    if not (np.isfinite(view.T).all() and math.isfinite(view.P.trace())):
         raise UnsolvableError("the predicted state is not finite")
-    nothing = np.zeros(len(problem.g)), np.zeros(len(problem.P))
-    s, change = _towards_guess(problem) if at_guess else nothing
-    z, H = problem.model.linearise(*problem.mean(change[problem.g]), problem.first)
-    start, measured = Iterate(s, change, z), np.isfinite(problem.z)
-    visible = np.asarray(np.isfinite(z).all(axis=1))
-    parts = rows, _, _, nu, S = _linear_update(problem, measured & visible[:, None], start, H)
+    start, measured = Iterate.at(problem, view, np.zeros_like(problem.c)), np.isfinite(problem.z)
+    visible = np.asarray(np.isfinite(start.z).all(axis=1))
+    linear = Linear.at(problem, measured & visible[:, None], start)
     limits = chi_square_limits(measured.sum(axis=1), problem.gate_probability)
-    own = kernels.own_distances(nu, S)
+    own = kernels.own_distances(linear.nu, linear.S)
     if not np.isfinite(own).all():
         raise UnsolvableError("the predicted innovations are not finite or not positive definite")
     distances = np.where(visible, own, np.nan)
-    used = np.asarray(distances <= limits)
-    return Gated(used, limits, distances, start, lambda: System.of(*parts, rows & ~used[:, None]))
+    return Gated(np.asarray(distances <= limits), limits, distances, start, linear)
 
 
 def solve(problem: Problem, gated: Gated) -> Solution | None:
     """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
-    the worst one, until all that is left agrees.
-
-    Returns:
-        the solution, or None where no observation is left.
+    the worst one, until all that is left agrees; None where nothing is left.
 
     Raises:
-        UnsolvableError: S is not positive definite, the new state not finite, or a variance not positive.
+        UnsolvableError: S is not positive definite, the new state not finite, or the pose's covariance not positive.
     """
-    used, first = gated.used, gated.system() if gated.used.any() else None
-    while first is not None and used.any():
-        change, system = _iterate(problem, gated.start, first)
-        distances = system.distances()
-        excess = distances / gated.limits
+    if not gated.used.any():
+        return None
+    used, first = gated.used, System.of(gated.linear, gated.linear.rows & ~gated.used[:, None])
+    while used.any():
+        view, change, system = _iterate(problem, gated.start, first)
+        excess = system.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            if not (system.variances(problem.P) > 0).all():
-                raise UnsolvableError("the pose's variances would not stay positive")
-            return Solution(used, change, system, distances)
+            left = view.P[:POSE, :POSE] - system.by_pose.T @ system.by_pose
+            if dpotrf(left, lower=1)[1] != 0:
+                raise UnsolvableError("the pose's covariance would not stay positive definite")
+            return Solution(used, view, change, system)
         used = used & (excess <= max(1.0, 0.5 * worst))
         first = first.without(~used[:, None] & np.ones(3, bool))
     return None
 
 
-def _iterate(problem: Problem, start: Iterate, system: System) -> tuple[Array, System]:
-    """The change of the state (n,) by an update whose first linearisation, at `start`, is `system`; and the last one.
+def _iterate(problem: Problem, now: Iterate, system: System) -> tuple[View, Array, System]:
+    """The change of the state (n,), seen from a view, by an update whose first linearisation is `system`, and the last.
 
-    Gauss-Newton on the posterior (the iterated Kalman filter); a step that raises the cost, or takes a landmark
-    behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
-    With one iteration the step is taken as it is: the papers' filter.
+    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
+    is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
     """
-    rows, now = system.rows, replace(start, cost=_cost(problem, system.rows, start))
+    rows, reached = system.rows, None
     for iteration in range(1, problem.iterations + 1):
-        s, change = system.H.transposed_times(system.y), system.y @ system.HP
+        s, change = system.H.transposed_times(system.y), system.y @ system.HP + now.view.mean
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
-        if problem.iterations == 1:
-            break
-        following = _visit(problem, rows, s, change, whole=True)
-        if following.cost <= now.cost and _linear(problem, system, now, following):
-            break
-        following, complete = _descend(problem, rows, now, Iterate(s, change, following.z))
-        if complete and _linear(problem, system, now, following):
-            break
+        if problem.iterations == 1 or _linear(problem, system, now, change):
+            return now.view, change, system
+        following, step = _descend(problem, rows, now, s, change)
         if iteration == 1 and problem.guess is not None:
-            at_guess = _visit(problem, rows, *_towards_guess(problem))
-            following = min(following, at_guess, key=lambda iterate: iterate.cost)
-        if following is now and iteration == 1:
-            raise UnsolvableError("no step towards the solution lowers the cost")
-        change = np.asarray(following.change)
-        if iteration == problem.iterations or following is now:
+            following = min(following, _at_guess(problem), key=lambda iterate: iterate.cost(problem, rows))
+        if following is now:
             break
-        z, H = problem.model.linearise(*problem.mean(following.change[problem.g]), problem.first)
-        now = replace(following, z=z)
-        system = System.of(*_linear_update(problem, rows, now, H), np.zeros_like(rows))
-    return change, system
+        reached = now.view, step, system
+        if iteration < problem.iterations:
+            now = following
+            system = System.of(Linear.at(problem, rows, now), np.zeros_like(rows))
+    if reached is None:
+        raise UnsolvableError("no step towards the solution lowers the cost")
+    return reached
 
 
 def _inverse(U: Array) -> Array:
@@ -337,63 +356,44 @@ def _inverse(U: Array) -> Array:
     return out
 
 
-def _linear(problem: Problem, system: System, now: Iterate, following: Iterate) -> bool:
-    """Whether the measurements changed between two iterates as the Jacobian said, as far as the pose depends on it."""
-    expected = system.H.times((following.change - now.change)[:, None]).reshape(-1, 3)
-    errors = np.where(system.rows, following.z - now.z - expected, 0.0)
-    if np.abs(errors).max() >= _LINEAR * problem.sigma:
+def _linear(problem: Problem, system: System, now: Iterate, change: Array) -> bool:
+    """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
+    seen = change[problem.first[:, None] + np.arange(3)] - now.view.lever @ change[:POSE]
+    T, moved = now.view.go(change)
+    z = problem.model.predict(T, problem.model.coordinates.moved(problem.c, moved))
+    expected = (now.own @ (seen - now.change)[:, :, None])[:, :, 0]
+    errors = np.where(system.rows, z - now.z - expected, 0.0)
+    if not np.abs(errors).max() < _LINEAR * problem.sigma:
         return False
     moved = system.whiten(errors.reshape(-1)) @ system.by_pose
-    return bool((moved**2 <= _POSE_SHARE**2 * system.variances(problem.P)).all())
+    return bool((moved**2 <= _POSE_SHARE**2 * system.variances(now.view.P)).all())
 
 
-def _cost(problem: Problem, rows: BoolArray, at: Iterate) -> float:
-    residual = np.where(rows, problem.z - at.z, 0.0)
-    prior = float(at.s @ at.change[problem.g])
-    cost = prior + float(np.vdot(residual, residual)) / problem.sigma**2
-    return cost if math.isfinite(cost) else math.inf
-
-
-def _towards_guess(problem: Problem) -> tuple[Array, Array]:
-    """The correction s of g, and the change of the state, by which the pose goes to the guess and the landmarks along
-    as their covariances with it have it.
-    """
-    assert problem.guess is not None
-    s = np.zeros(len(problem.g))
+def _at_guess(problem: Problem) -> Iterate:
+    """The guess, with the landmarks where they are believed: its distance from the prior is that of the pose alone."""
+    view, distance = problem.view(problem.guess, problem.noise), math.inf
     with suppress(np.linalg.LinAlgError):  # a pose that is known exactly cannot be moved
-        s[:POSE] = np.linalg.solve(problem.P[:POSE, :POSE], problem.guess)
-    return s, s[:POSE] @ problem.P[:POSE]
+        mean = view.mean[:POSE]
+        distance = float(mean @ np.linalg.solve(view.P[:POSE, :POSE], mean))
+    return Iterate.at(problem, view, np.zeros_like(problem.c), distance)
 
 
-def _visit(problem: Problem, rows: BoolArray, s: Array, change: Array, whole: bool = False) -> Iterate:
-    """The iterate with a correction; `whole`: with the world's displacement in it, which is less work."""
-    z = problem.model.predict(*problem.mean(change[problem.g], whole))
-    at = Iterate(s, change, z)
-    return replace(at, cost=_cost(problem, rows, at))
+def _descend(problem: Problem, rows: BoolArray, now: Iterate, s: Array, change: Array) -> tuple[Iterate, Array]:
+    """The longest of the steps 1, 1/2, 1/4, ... towards ``change = mean + P s`` that does not raise the cost, else now.
 
-
-def _descend(problem: Problem, rows: BoolArray, now: Iterate, target: Iterate) -> tuple[Iterate, bool]:
-    """The longest of the steps 1, 1/2, 1/4, ... towards `target` that does not raise the cost, else `now`.
-
-    Also whether it is the whole step.
+    Where it ends, and the step (n,). The next linearisation is at the pose reached: the camera turns, and the landmarks
+    stay. On the way the distance from the prior, with d at the start and d' at the end, is that of (1 − a) d + a d'.
     """
+    there = (change - now.view.mean)[problem.g]
+    start = np.concatenate([np.zeros(POSE), now.change.reshape(-1)])
+    end, between = float(s @ there), float(s @ (start - now.view.mean[problem.g]))
+    cost, step = now.cost(problem, rows), change.copy()
     for halving in range(_HALVINGS):
-        share = 0.5**halving
-        s, change = now.s + share * (target.s - now.s), now.change + share * (target.change - now.change)
-        trial = _visit(problem, rows, s, change)
-        if trial.cost <= now.cost * (1 + 1e-9):
-            return trial, halving == 0
-    return now, False
-
-
-def _linear_update(problem: Problem, rows: BoolArray, at: Iterate, H: Jacobian) -> Parts:
-    """Rows, H, H P, ν and S of the update linearised at an iterate, where the plain Jacobian is H."""
-    moved = at.change.any()
-    H = H if rows.all() else H.only(rows)
-    if moved and problem.displacement is not None:
-        H = H.without(problem.displacement)
-    nu = np.where(rows, problem.z - at.z, 0.0).reshape(-1)
-    if moved:
-        nu += H.times(at.change[:, None])[:, 0]
-    HP = H.times(problem.P)
-    return rows, H, HP, nu, H.covariance(HP, problem.sigma**2)
+        a = 0.5**halving
+        step[problem.g] = start + a * (change[problem.g] - start)
+        distance = (1 - a) ** 2 * now.from_prior + 2 * a * (1 - a) * between + a * a * end
+        T, moved = now.view.go(step)
+        following = Iterate.at(problem, problem.view(T, problem.noise), moved, distance)
+        if following.cost(problem, rows) <= cost * (1 + 1e-9):
+            return following, step
+    return now, step

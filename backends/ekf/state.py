@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from backends.ekf.angles import anchor, attitude, pose_jacobian
 from backends.ekf.covariance import CAMERA, POSE, Covariance
-from backends.ekf.landmarks import Coordinates, Landmarks, gauge_jacobian
-from backends.ekf.motion import Motion, initial_covariance, reanchored_if_needed, transport
-from backends.ekf.recovery import Agreement
-from backends.ekf.solve import UnsolvableError
+from backends.ekf.landmarks import Coordinates, Landmarks
+from backends.ekf.motion import Camera, Motion
+from backends.ekf.solve import Solution, UnsolvableError, View
 from slam.data import IdArray, IndexArray, RecentPoses
 from slam.geometry import se3
-from slam.geometry.euler import angles, body_rate_matrix
 from slam.geometry.se3 import Array
-from slam.models import EstimatorModels
 
 RECENT = 4  #: cost: poses before the present one that are kept
 _MOST, _LEAST = 300, 250  # cost: landmarks of the state above which some leave it, and that are left in it then
@@ -25,7 +20,7 @@ _MOST, _LEAST = 300, 250  # cost: landmarks of the state above which some leave 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """``[r, φ, v, ω]`` and three coordinates per landmark, with their joint covariance.
+    """A camera and three coordinates per landmark, with the joint covariance of their errors.
 
     The landmarks in it are those measured of late. Where there are too many, those not measured for longest leave it;
     they stay where they are, and come back with their covariances when they are measured (`backends.ekf.covariance`).
@@ -35,8 +30,7 @@ class State:
         frame: number of the prediction, −1 before the first.
         dt: time since the last one [s], 0 for the first.
         measured: whether the pose may not be updated any more.
-        camera: mean of [r, φ, v, ω] (12,): position [m], angles [rad] and their rates.
-        R_world_angles: the angles' world (3, 3), see `backends.ekf.angles`.
+        camera: pose and velocities; it says what its error means.
         landmarks: all of them.
         covariance: of everything.
         recent: stamps [s] and poses (4, 4) of the last frames before this one, the newest first.
@@ -46,58 +40,45 @@ class State:
     frame: int
     dt: float
     measured: bool
-    camera: Array
-    R_world_angles: Array
+    camera: Camera
     landmarks: Landmarks
     covariance: Covariance
     recent: tuple[tuple[float, Array], ...] = ()
 
     @classmethod
-    def first(cls, models: EstimatorModels) -> State:
-        """Before the first prediction."""
-        R_world_angles, phi = anchor(models.initial_pose[:3, :3])
-        camera = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
-        covariance = Covariance.of_camera(initial_covariance(models, phi))
-        return cls(float("nan"), -1, 0.0, True, camera, R_world_angles, Landmarks.none(), covariance)
+    def first(cls, camera: Camera, P: Array) -> State:
+        """Before the first prediction, with the covariance (12, 12) of the camera's error."""
+        return cls(float("nan"), -1, 0.0, True, camera, Landmarks.none(), Covariance.of_camera(P))
 
     # --- the camera ---
 
-    @cached_property
+    @property
     def pose(self) -> Array:
         """``T_world_left`` (4, 4)."""
-        return se3.pose(attitude(self.R_world_angles, self.camera[3:6]), self.camera[:3])
-
-    def pose_jacobian(self) -> Array:
-        """Derivative (6, 6) of the pose's right perturbation by [r, φ]."""
-        return pose_jacobian(self.pose[:3, :3], self.camera[3:6])
+        return self.camera.pose
 
     def pose_covariance(self) -> Array:
         """Covariance (6, 6) of the pose's right perturbation."""
-        J = self.pose_jacobian()
+        J = self.camera.by_error()
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
-    def change_to(self, T_world_left: Array) -> Array:
-        """The change of [r, φ] (6,) that moves the pose to `T_world_left`."""
-        phi, before = angles(self.R_world_angles.T @ T_world_left[:3, :3]), self.camera[3:6]
-        other = np.array([phi[0] + np.pi, np.pi - phi[1], phi[2] + np.pi])  # the same rotation
-        changes = np.stack([phi, other]) - before
-        changes -= 2 * np.pi * np.round(changes / (2 * np.pi))
-        nearest = changes[np.argmin(np.linalg.norm(changes, axis=1))]
-        return np.concatenate([T_world_left[:3, 3] - self.camera[:3], nearest])
-
     def advanced(self, stamp: float, motion: Motion) -> State:
         """At a later time, after a motion of the camera."""
-        covariance = self.covariance.with_pose(self.pose_jacobian(), RECENT).camera_moved(motion.J, motion.noise)
+        kept = replace(self, covariance=self.covariance.with_pose(self.camera.by_error(), RECENT))
         return replace(
-            self, stamp=stamp, frame=self.frame + 1, dt=stamp - self.stamp, measured=False, camera=motion.camera,
-            R_world_angles=motion.R_world_angles, covariance=covariance,
+            kept._carried(motion), stamp=stamp, frame=self.frame + 1, dt=stamp - self.stamp, measured=False,
             recent=((self.stamp, self.pose), *self.recent)[:RECENT],
         )  # fmt: skip
 
+    def _carried(self, motion: Motion) -> State:
+        """With another camera, whose error is that of this one and noise; the landmarks stay where they are."""
+        K = self.levers(np.arange(self.covariance.count)) if self.camera.invariant else None
+        return replace(self, camera=motion.camera, covariance=self.covariance.camera_moved(motion.J, motion.noise, K))
+
     def recent_poses(self, n: int) -> RecentPoses:
         """The last poses, as they were believed in their time, with their joint covariance; at most n."""
-        covariance = self.covariance.with_pose(self.pose_jacobian(), RECENT + 1)
+        covariance = self.covariance.with_pose(self.camera.by_error(), RECENT + 1)
         path = [(self.stamp, self.pose), *self.recent][:n][::-1]
         P = covariance.left[: POSE * len(path), : POSE * len(path)].reshape(len(path), POSE, len(path), POSE)
         joint = P[::-1, :, ::-1].reshape(POSE * len(path), POSE * len(path))
@@ -106,18 +87,42 @@ class State:
 
     # --- landmarks join and leave ---
 
+    def levers(self, rows: IndexArray) -> Array:
+        """What the pose's error adds to landmarks (M, 3, 6) beside their own errors, by rows of the table.
+
+        Nothing where errors are not invariant, nor outside of the dense part, where they are in the world as it is.
+        """
+        K: Array = self.landmarks.gauge[rows] @ self.camera.world()
+        K[np.full(len(rows), not self.camera.invariant) | (rows >= self.covariance.count)] = 0.0
+        return K
+
+    def relative(self, rows: IndexArray) -> Array:
+        """An error x of the pose moves landmarks (M, 3, 6), as seen from the camera, by minus this times x."""
+        return np.asarray(self.landmarks.gauge[rows] @ self.camera.world() - self.levers(rows))
+
+    def landmark_covariances(self, rows: IndexArray) -> Array:
+        """Covariances (M, 3, 3) of landmarks' coordinates."""
+        blocks, cross = (part[rows] for part in self.covariance.marginals())
+        if self.camera.invariant:
+            K = self.levers(rows)
+            shared = (cross + 0.5 * K @ self.covariance.pose) @ K.transpose(0, 2, 1)
+            blocks = blocks + shared + shared.transpose(0, 2, 1)
+        return np.asarray(blocks)
+
     def placed(self, coordinates: Coordinates, ids: IdArray, h: Array, covariances: Array) -> State:
-        """With landmarks at h (M, 3) in the camera's coordinates with covariances (M, 3, 3) (paper A, Eq. 10)."""
+        """With landmarks at h (M, 3) in the camera's coordinates with covariances (M, 3, 3) (paper A, Eq. 10).
+
+        An error of the pose takes them along: they stay where they are as seen from the camera.
+        """
         if not len(ids):
             return self
-        T, E = self.pose, body_rate_matrix(self.camera[3:6])
-        R, J = T[:3, :3], np.repeat(np.eye(3, POSE)[None], len(h), axis=0)
-        J[:, :, 3:] = -R @ se3.hat(h) @ E  # turning by δθ = E δφ about the camera's axes moves h by δθ × h
-        anchors = np.repeat(T[None, :3], len(h), axis=0)
-        new = Landmarks.at(coordinates, ids, anchors, self.camera[:3] + h @ R.T, self.frame)
+        R, count = self.pose[:3, :3], self.covariance.count
+        anchors = np.repeat(self.pose[None, :3], len(h), axis=0)
+        new = Landmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T, self.frame)
         D = coordinates.inverse_jacobian(anchors, new.c)
-        covariance = self.covariance.appended(D @ J, D @ (R @ covariances @ R.T) @ D.transpose(0, 2, 1))
-        landmarks = self.landmarks.with_rows(self.covariance.count, new)
+        J = np.zeros_like(new.gauge) if self.camera.invariant else new.gauge @ self.camera.world()
+        covariance = self.covariance.appended(J, D @ (R @ covariances @ R.T) @ D.transpose(0, 2, 1))
+        landmarks = self.landmarks.with_rows(count, new)
         placed = replace(self, measured=True, landmarks=landmarks, covariance=covariance)
         return placed._relieved(np.zeros(0, np.intp), np.flatnonzero(landmarks.seen == self.frame))
 
@@ -161,48 +166,79 @@ class State:
 
     def _rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> State:
         """With the landmarks of these rows of the table in each part."""
+        P, a, turns = self.covariance, self.covariance.count, self.camera.invariant
+        leave = left[left < a]
+        if turns and len(leave):  # their errors are in the world from now on
+            K = np.zeros((a, 3, POSE))
+            K[leave] = self.levers(leave)
+            P = P.sheared(K)
         landmarks = self.landmarks.take(np.concatenate([dense, left, known]))
-        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(dense, left, known))
+        after = replace(self, landmarks=landmarks, covariance=P.rearranged(dense, left, known))
+        if turns and (dense >= a).any():  # and of those that come back no longer
+            K = np.where((dense >= a)[:, None, None], -after.levers(np.arange(len(dense))), 0.0)
+            after = replace(after, covariance=after.covariance.sheared(K))
+        return after
 
     # --- updates ---
 
-    def corrected(self, coordinates: Coordinates, found: Agreement, rows: IndexArray, consistent: bool) -> State:
-        """After an update by the landmarks of some rows (M,) of the table.
+    def view(self, rows: IndexArray, T: Array | None, noise: Array | None) -> View:
+        """The state as seen from a pose (4, 4), for an update by landmarks of some rows (M,); see `Problem.view`."""
+        s, camera, S, mean = self, self.camera, self.camera.plain(), np.zeros(len(self.covariance.dense))
+        if noise is not None:
+            s = s._carried(Motion(camera, noise=S @ noise @ S.T))
+        if T is not None:
+            camera = camera.at(T)
+            s = s._carried(Motion(camera, self.camera.transport(camera)))
+            mean[:CAMERA] = self.camera.seen_from(camera)
+            mean[CAMERA:] = -(s.levers(np.arange(s.covariance.count)) @ mean[:POSE]).reshape(-1)
+        numbers, K = CAMERA + 3 * rows[:, None] + np.arange(3), s.levers(rows)
+
+        def go(error: Array) -> tuple[Array, Array]:
+            return camera.moved(error[:CAMERA]).pose, error[numbers] + K @ error[:POSE]
+
+        return View(s, camera.pose, s.covariance.dense, mean, s.relative(rows), go)
+
+    @staticmethod
+    def corrected(coordinates: Coordinates, solution: Solution, rows: IndexArray) -> State:
+        """After an update by the landmarks of some rows (M,) of the table, of the state as the solution sees it.
 
         A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on
         the state, though (how far the world's origin is, which way is depth), and an update moves the state. A filter
         that goes on with the same covariance believes to have measured such displacements, in time very well (Huang,
-        Mourikis and Roumeliotis, 2010). If it is `consistent`, the covariance is therefore transported to the corrected
-        state: the error is taken to be the displacement that the camera's [r, φ] has, by its Jacobian in old
+        Mourikis and Roumeliotis, 2010). If the camera `transports` it, the covariance is therefore transported to the
+        corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in old
         coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau and
         Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none.
+
+        An invariant error is corrected as a displacement of the world, exact however large it is, and what is left of
+        the landmarks' changes in the world: to first order that is the correction, and of second order there is nothing
+        where the camera moves among landmarks that stay.
 
         Raises:
             UnsolvableError: the new state is not finite.
         """
-        solution, P = found.solution, self.covariance
-        if found.noise is not None:
-            P = P.camera_moved(np.eye(CAMERA), found.noise)
-        dense, camera = np.arange(P.count), self.camera + solution.change[:CAMERA]
-        marks = self.landmarks.moved(coordinates, dense, solution.change[CAMERA:].reshape(-1, 3))
-        if not (np.isfinite(camera).all() and np.isfinite(marks.points).all()):
+        s: State = solution.view.state
+        P, before, dense = s.covariance, s.camera, np.arange(s.covariance.count)
+        error, J, K = solution.change, None, None
+        camera = before.moved(error[:CAMERA])
+        change, displacement = error[CAMERA:].reshape(-1, 3), np.zeros(CAMERA)
+        if camera.invariant and len(dense):
+            levers = s.levers(dense)
+            change = change + levers @ error[:POSE]  # in the world as it was
+            displacement[:POSE] = np.linalg.lstsq(levers.reshape(-1, POSE), change.reshape(-1), rcond=None)[0]
+            change = change - levers @ displacement[:POSE]
+        marks = s.landmarks.moved(coordinates, dense, change)
+        if displacement.any():
+            marks = marks.displaced(coordinates, dense, before.moved(displacement).pose @ se3.inverse(before.pose))
+        if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
-        J: Array = np.eye(CAMERA)
-        K: Array = np.zeros((P.count, 3, POSE))
-        if consistent:
-            J, world = transport(self.R_world_angles, self.camera, camera)
-            gauge = gauge_jacobian(coordinates, marks.anchors[dense], marks.c[dense], marks.points[dense])
-            K = (gauge - marks.gauge[dense]) @ world
-            marks = replace(marks, gauge=np.concatenate([gauge, marks.gauge[P.count :]]))
+        if camera.transports:
+            J, K = before.transport(camera), (marks.gauge - s.landmarks.gauge)[dense] @ camera.world()
         system = solution.system
         V_left = system.whitened(system.H.times(P.cross)) if P.cross.size else np.zeros((0, len(system.HP)))
         P = P.corrected(system.whitened(system.HP), V_left, J, K)
-        motion = reanchored_if_needed(Motion(camera, self.R_world_angles))
-        if motion.R_world_angles is not self.R_world_angles:
-            P = P.camera_moved(motion.J, motion.noise)
         seen = marks.seen.copy()
-        seen[rows[solution.used]] = self.frame
-        return replace(
-            self, camera=motion.camera, R_world_angles=motion.R_world_angles, landmarks=replace(marks, seen=seen),
-            covariance=P,
-        )  # fmt: skip
+        seen[rows[solution.used]] = s.frame
+        after = replace(s, camera=camera, landmarks=replace(marks, seen=seen), covariance=P)
+        settled = camera.settled()
+        return after if settled.camera is camera else after._carried(settled)

@@ -52,7 +52,7 @@ class SmootherBackend:
         self.config = from_options(SmootherConfig, "smoother", options)
         self._steps = Steps(rig, models, self.config)
         self._make = FactorMaker(self._steps.stereo, models)
-        self._graph = Graph(self._make, self.config.track, self.config.lag)
+        self._graph = Graph(self._make, self.config.lag)
         self._state = State.empty()
         self._path = Path()
         self._mended = False  # whether measurements were revised while poses were kept
@@ -200,7 +200,7 @@ class SmootherBackend:
         """
         s = self._state
         if s.started:
-            before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph, self._make)
+            before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph)
             path = self._path.moved(s, s.poses[0] @ inverse(before.poses[0]))
             self._path, self._state, self._mended = path, replace(s, measured=True), True
 

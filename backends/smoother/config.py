@@ -13,9 +13,10 @@ class SmootherConfig:
 
     Attributes:
         motion: median displacement of the landmarks in the image, as a share of the focal length, from which on a frame
-            becomes a pose of the graph; 0 takes every frame.
+            becomes a pose of the graph; 0 takes every measured frame.
         overlap: a frame also becomes one if less than this share of its landmarks was measured from the last one.
-        track: most measurements in one smart factor; a landmark that is measured more often continues in a new one.
+        track: most poses that a smart factor spans; a landmark that is measured for longer continues in a new one. With
+            a lag, a factor ends before its first pose leaves.
         lag: number of poses that are smoothed; older ones are marginalised, so that neither time nor memory grows
             with the run. Null (in Python None) keeps all poses and revises the whole path.
         past: number of poses, at least, whose measurements are kept, to revise the path when measurements are mended.

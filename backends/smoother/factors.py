@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
+from typing import Any
 
 import gtsam
 import gtsam_unstable
 import numpy as np
 
-from slam.geometry.se3 import Array, nearest_rotation
+from slam.geometry.se3 import Array, nearest_rotation, so3_left_jacobian, so3_log
 from slam.models import EstimatorModels
+from slam.window.motion import velocity_sigmas
 from slam.window.stereo import RectifiedStereo
+
+_Smart = gtsam_unstable.SmartStereoProjectionPoseFactor
 
 
 @lru_cache(1024)
@@ -36,6 +40,28 @@ def _parameters(mode: gtsam.LinearizationMode) -> gtsam.SmartProjectionParams:
     return parameters
 
 
+def velocity_change(poses: Array, dt: Array) -> tuple[Array, Array]:
+    """Velocity [ω, v] (6,) between the last two poses, less that before if there are three; with Jacobians (K, 6, 6).
+
+    ω is a body rate, v is in world axes.
+
+    Args:
+        poses: (K, 4, 4).
+        dt: times between the last three (2,) [s].
+    """
+    r, J = np.zeros(6), np.zeros((len(poses), 6, 6))
+    for i, sign in ((-1, 1.0), (-2, -1.0))[: len(poses) - 1]:
+        T0, T1, scale = poses[i - 1], poses[i], sign / dt[i]
+        turn = so3_log(T0[:3, :3].T @ T1[:3, :3])
+        by_later = np.linalg.inv(so3_left_jacobian(-turn))
+        r += scale * np.concatenate([turn, T1[:3, 3] - T0[:3, 3]])
+        J[i - 1, :3, :3] -= scale * by_later.T
+        J[i - 1, 3:, 3:] -= scale * T0[:3, :3]
+        J[i, :3, :3] += scale * by_later
+        J[i, 3:, 3:] += scale * T1[:3, :3]
+    return r, J
+
+
 class FactorMaker:
     """Makes factors for one rig and one set of models.
 
@@ -46,7 +72,7 @@ class FactorMaker:
 
     def __init__(self, stereo: RectifiedStereo, models: EstimatorModels) -> None:
         self.sigma = models.pixel_sigma * stereo.scale
-        self._stereo = stereo
+        self._stereo, self._models = stereo, models
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
         rectified = stereo.rectified_rig.original.is_rectified
@@ -68,21 +94,37 @@ class FactorMaker:
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         return gtsam.BetweenFactorPose3(pose_key(earlier), pose_key(later), to_pose3(relative), noise)
 
+    def motion(self, newest: int, poses: Array, dt: Array) -> gtsam.NonlinearFactor:
+        """The velocity to the newest pose is that before but for noise; linearised once, as its noise is large.
+
+        Args:
+            newest: number of the newest pose.
+            poses: the last three (3, 4, 4), or two of which the first velocity is unknown (2, 4, 4).
+            dt: times between the last three (2,) [s].
+        """
+        first, values, added = len(poses) == 2, gtsam.Values(), newest + 1 - len(poses)
+        r, J = velocity_change(poses, dt)
+        rows: list[Any] = [row for i, by_pose in enumerate(J) for row in (pose_key(added + i), by_pose)]
+        noise = gtsam.noiseModel.Diagonal.Sigmas(velocity_sigmas(self._models, float(dt[1]), first))
+        for key, T in zip(rows[::2], poses):
+            values.insert(key, gtsam.Pose3(T))
+        rows += [-r, noise]
+        return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*rows), values)
+
     def point(self, z: Sequence[float]) -> gtsam.StereoPoint2:
         """A measurement (uL, vL, uR); uR may be NaN."""
         return gtsam.StereoPoint2(z[0], z[2], z[1])
 
     def smart(
-        self, points: Sequence[gtsam.StereoPoint2], poses: Sequence[int], careful: bool = False
+        self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int], careful: bool = False
     ) -> gtsam.NonlinearFactor:
         """A landmark eliminated from its measurements, of which two or more are needed and one with a right pixel.
 
         Both modes give the same information; the careful one takes longer, and does not throw where the landmark lies
         behind a camera.
         """
-        parameters = self._careful if careful else self._quick
-        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, parameters, *self._sensor)
-        factor.add(points, [pose_key(i) for i in poses], self._K)
+        factor = _Smart(self._noise, self._careful if careful else self._quick, *self._sensor)
+        factor.add(points, keys, self._K)
         return factor
 
     def explicit(self, point: gtsam.StereoPoint2, pose: int, landmark: int) -> gtsam.NonlinearFactor:

@@ -18,6 +18,7 @@ from slam.geometry.se3 import Array, adjoint, inverse, transform
 FAILURES = (RuntimeError, ValueError, LookupError)
 
 _ENDLESS = 1e9  # numerics: a lag that no run reaches
+_CAREFUL = 20  # numerics: poses after a failure whose factors are made so that they do not throw
 _FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with which the first pose is held
 
 
@@ -30,13 +31,16 @@ class Track:
     """A landmark's smart factor.
 
     Attributes:
+        begun: see `Landmarks.begun`.
         poses: numbers of the poses that measured it.
-        points: the measurements.
+        keys, points: their variables, and the measurements.
         stereo: whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only.
         slot: of the factor in the solver, −1 while there is none.
     """
 
+    begun: int
     poses: list[int] = field(default_factory=list)
+    keys: list[int] = field(default_factory=list)
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
     stereo: bool = False
     slot: int = -1
@@ -49,14 +53,14 @@ class Problem:
     Attributes:
         factors, values: for gtsam.
         removed: slots of factors that others replace.
-        grown: landmarks with new measurements.
+        grown: smart factors with new measurements.
         stamps: times of variables for the fixed lag: numbers of poses.
     """
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     removed: list[int] = field(default_factory=list)
-    grown: dict[int, Track] = field(default_factory=dict)
+    grown: dict[tuple[int, int], Track] = field(default_factory=dict)
     stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = field(default_factory=dict)
 
 
@@ -78,48 +82,50 @@ class Solved:
 class Tracks:
     """Landmarks as factors: which measurement goes into which. Each is used once.
 
-    A landmark is a smart factor that grows; when it has `most` measurements, or when its first pose is about to leave,
-    the factor stays as it is and the landmark goes on in a new one. A landmark of which more is known than what was
-    measured is a variable of its own.
+    A landmark is a smart factor that grows until the landmark goes on in a new one (`Landmarks.measured`): factors end
+    before their first pose leaves the lag. A landmark of which more is known than what was measured is a variable of
+    its own.
     """
 
-    def __init__(self, make: FactorMaker, most: int, lag: int | None) -> None:
-        self._make, self._most, self._lag = make, most, lag
+    def __init__(self, make: FactorMaker, lag: int | None) -> None:
+        self._make, self._lag = make, lag
         self._smart: dict[int, Track] = {}
         self._variables: dict[int, int] = {}  # numbers of the poses that measured them last
 
-    def add_pose(self, problem: Problem, s: State, number: int, first: int, prior: Array | None = None) -> None:
-        """A pose, and its tie to the one before it; the first one has a prior, with another covariance if given."""
+    def add_pose(self, problem: Problem, s: State, number: int, first: int) -> None:
+        """A pose, and its tie to the one before it, if it is not the first one."""
         row = s.of(number)
         tie = s.ties[row]
-        if tie is None or number == first:
-            problem.factors.add(self._make.prior(number, s.poses[row], s.spread[row] if prior is None else prior))
-        else:
-            problem.factors.add(self._make.tie(number - 1, number, tie.relative, tie.covariance))
+        if tie is not None and number != first:
+            unknown = tie.times is not None and np.isnan(tie.times[0])
+            if tie.times is None or (not unknown and number - 2 < first):
+                factor = self._make.tie(number - 1, number, tie.relative, tie.covariance)
+            else:
+                factor = self._make.motion(number, s.poses[row - (1 if unknown else 2) : row + 1], np.diff(tie.times))
+            problem.factors.add(factor)
         problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
         problem.stamps[pose_key(number)] = float(number)
 
     def add_rows(self, problem: Problem, s: State, number: int, first: int, begin: int = 0) -> None:
         """What was measured from a pose, from some row on."""
-        sight, make = s.sights[s.of(number)], self._make
-        for serial, z in zip(sight.serials[begin:].tolist(), sight.z[begin:].tolist()):
+        sight, make, known = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
+        key = pose_key(number)
+        rows = (column[begin:].tolist() for column in (sight.serials, sight.begun, sight.z))
+        for serial, begun, z in zip(*rows):
             point = make.point(z)
-            if self._is_variable(problem, s, serial, number, first):
+            if known and self._is_variable(problem, s, serial, number, first):
                 self._variables[serial] = number
                 problem.stamps[landmark_key(serial)] = float(number)
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
             track = self._smart.get(serial)
-            if track is None or len(track.poses) >= self._most or self._leaves(track.poses[0], number):
-                self._smart[serial] = track = Track()
+            if track is None or track.begun != begun:
+                self._smart[serial] = track = Track(begun)
             track.poses.append(number)
+            track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
-            problem.grown[serial] = track
-
-    def _leaves(self, pose: int, number: int) -> bool:
-        """Whether a pose leaves with the next one after `number`."""
-        return self._lag is not None and pose <= number - self._lag
+            problem.grown[serial, begun] = track
 
     def _is_variable(self, problem: Problem, s: State, serial: int, number: int, first: int) -> bool:
         """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
@@ -150,15 +156,13 @@ class Tracks:
                 if track.slot >= 0:
                     problem.removed.append(track.slot)
                 made.append((track, problem.factors.size()))
-                problem.factors.add(self._make.smart(track.points, track.poses, careful))
+                problem.factors.add(self._make.smart(track.points, track.keys, careful))
         return made
 
     def forget(self, number: int) -> None:
-        """Forget tracks that will not go on at the pose of a number; once in a while."""
+        """Forget the smart factors that will not grow at the next pose; once in a while."""
         if self._lag is not None and not number % self._lag:
-            self._smart = {
-                serial: track for serial, track in self._smart.items() if not self._leaves(track.poses[0], number)
-            }
+            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] > number - self._lag}
 
 
 class Graph:
@@ -173,17 +177,16 @@ class Graph:
 
     Args:
         make: makes the factors.
-        track: most measurements in a smart factor.
         lag: number of poses that are smoothed; None for all.
 
     Attributes:
         rebuilds: how often it was built anew after a failure.
     """
 
-    def __init__(self, make: FactorMaker, track: int, lag: int | None) -> None:
+    def __init__(self, make: FactorMaker, lag: int | None) -> None:
         self.rebuilds = 0
         self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
-        self._make, self._track, self._lag = make, track, lag
+        self._make, self._lag = make, lag
         self.restart()
 
     def restart(self) -> None:
@@ -195,12 +198,12 @@ class Graph:
         self._solver = gtsam.IncrementalFixedLagSmoother(
             _ENDLESS if self._lag is None else float(self._lag), parameters
         )
-        self._tracks = Tracks(self._make, self._track, self._lag)
+        self._tracks = Tracks(self._make, self._lag)
         self._number, self._taken = -1, 0
         self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}
         self._first = np.eye(4)
-        self._anchored = False
+        self._kind = False, 0
 
     def followed(self, s: State) -> tuple[Solved, str]:
         """The solution for a state with one pose more than the last one; and why the graph was built anew, if it was.
@@ -209,17 +212,17 @@ class Graph:
             SolverError: gtsam fails with the new graph as well.
         """
         why = ""
-        if self._number == s.number - 1 >= s.begun and self._anchored == s.anchored:
+        if self._number == s.number - 1 >= s.begun and self._kind == _kind(s):
             number, self._number = self._number, -1  # until it is done: an interrupted call leaves a graph unknown
             try:
                 return self._stepped(s, number), ""
             except FAILURES as error:
                 why, self.rebuilds = _line(error), self.rebuilds + 1
-                self._careful = s.number + (self._lag or self._track)
+                self._careful = s.number + (self._lag or _CAREFUL)
         return self.rebuilt(s), why
 
-    def rebuilt(self, s: State) -> Solved:
-        """The solution with all anew, from what the state keeps.
+    def rebuilt(self, s: State, again: int = 0) -> Solved:
+        """The solution with all anew, from what the state keeps; `again` so many times linearised again.
 
         Raises:
             SolverError: gtsam fails.
@@ -227,27 +230,28 @@ class Graph:
         self.restart()
         oldest = self.oldest(s)
         try:
-            self._anchored, self._first = s.anchored, s.poses[s.of(oldest)]
+            self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
             prior, self._base = held(s, oldest)
-            solved = self._update(s, range(oldest, s.number + 1), oldest, prior)
+            begin = Problem()
+            begin.factors.add(self._make.prior(oldest, self._first, prior))
+            return self._update(s, range(oldest, s.number + 1), oldest, begin, again)
         except FAILURES as error:
             raise SolverError(_line(error)) from error
-        return solved
 
-    def oldest(self, s: State) -> int:
-        """Number of the oldest pose in the graph."""
+    def oldest(self, s: State, newest: int | None = None) -> int:
+        """Number of the oldest pose in the graph, where the newest one is that of the state, or has another number."""
         least = max(s.begun, s.first)
-        return least if self._lag is None else max(least, s.number - self._lag)
+        return least if self._lag is None else max(least, (s.number if newest is None else newest) - self._lag)
 
     def _stepped(self, s: State, number: int) -> Solved:
-        return self._update(s, range(number + 1, s.number + 1), self.oldest(s))
+        return self._update(s, range(number + 1, s.number + 1), self.oldest(s), Problem())
 
-    def _update(self, s: State, numbers: Iterable[int], first: int, prior: Array | None = None) -> Solved:
-        problem = Problem()
+    def _update(self, s: State, numbers: Iterable[int], first: int, problem: Problem, again: int = 0) -> Solved:
+        """The solution after a problem, and some poses with what was measured from them; solved `again` so often."""
         for number in numbers:
             if number > first:
                 self._tracks.add_rows(problem, s, number - 1, first, self._taken)
-            self._tracks.add_pose(problem, s, number, first, prior)
+            self._tracks.add_pose(problem, s, number, first)
             self._tracks.add_rows(problem, s, number, first)
             self._taken = len(s.sights[s.of(number)])
         made = self._tracks.make_smart(problem, s.number < self._careful)
@@ -255,6 +259,8 @@ class Graph:
         slots = self._solver.getISAM2Result().getNewFactorsIndices()
         for track, place in made:
             track.slot = slots[place]
+        for _ in range(again):
+            self._solver.update()
         self._tracks.forget(s.number)
         values = self._solver.calculateEstimate()
         poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)])
@@ -272,7 +278,7 @@ class Graph:
 
         From `first` on, or the oldest in the graph; of the newest pose alone, if the graph is not the state's.
         """
-        if self._number != s.number:
+        if self._number != s.number or self._kind != _kind(s):
             return s.number, s.spread[-1]
         first = max(self.oldest(s), self.oldest(s) if first is None else first)
         return first, self._joint(list(range(first, s.number + 1)))
@@ -283,6 +289,11 @@ class Graph:
         A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
         P = P + A @ self._base @ A.T
         return np.asarray(0.5 * (P + P.T))
+
+
+def _kind(s: State) -> tuple[bool, int]:
+    """What a graph cannot follow: that landmarks become known in the world, and that measurements are revised."""
+    return s.anchored, s.revisions
 
 
 def held(s: State, number: int) -> tuple[Array, Array]:

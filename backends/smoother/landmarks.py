@@ -33,6 +33,7 @@ class Landmarks:
             information (S, 3, 3), zero for nothing.
         world: whether that does not depend on any pose (S,).
         z, pose: its last measurements (S, RECENT, 3), and the numbers of their poses (S, RECENT), −1 for none.
+        begun: number of the pose from which its present smart factor counts (S,); the factor may begin later.
     """
 
     ids: IdArray
@@ -45,6 +46,7 @@ class Landmarks:
     world: BoolArray
     z: Array
     pose: IndexArray
+    begun: IndexArray
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -55,7 +57,7 @@ class Landmarks:
         n = len(ids)
         return cls(
             ids, first + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
-            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1),
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp),
         )  # fmt: skip
 
     @classmethod
@@ -103,14 +105,23 @@ class Landmarks:
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
 
-    def measured(self, rows: IndexArray, z: Array, pose: int, oldest: int = 0) -> Landmarks:
+    def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0) -> Landmarks:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number.
+
+        A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
+        in a new one. If landmarks that were found together all did so at once, the motion model alone
+        would tie that pose to the one before. So the first factor spans fewer, down to half of them, differently for
+        each landmark.
 
         What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
         was known beforehand.
         """
+        last, begun = self.pose[rows].max(axis=1), self.begun.copy()
+        half, full = max(track // 2, 1), begun[rows] <= pose - track
+        anew = (last < 0) | (last < pose - half)
+        begun[rows] = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, begun[rows]))
         old = np.zeros(len(self), bool)
-        old[rows] = (self.pose[rows].max(axis=1) < oldest) & self.away[rows].any(axis=(1, 2))
+        old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
             self = _put(self, old, self.without_measurements())
         away = self.away.copy()
@@ -118,7 +129,7 @@ class Landmarks:
         zs, poses = self.z.copy(), self.pose.copy()
         oldest = poses[rows].argmin(axis=1)
         zs[rows, oldest], poses[rows, oldest] = z, pose
-        return replace(self, z=zs, pose=poses, away=away)
+        return replace(self, z=zs, pose=poses, away=away, begun=begun)
 
     def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Landmarks:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""
@@ -185,7 +196,8 @@ class Landmarks:
 
         With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
         fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
-        information. Measurements from earlier poses count for the first one.
+        information. Measurements from earlier poses count for the first one. A landmark that none of the graph's poses
+        measured is carried by the newest, with the drift since it was seen.
 
         Args:
             stereo: the rectified rig.
@@ -202,7 +214,8 @@ class Landmarks:
         older = np.where(self.world[chosen, None, None], 0.0, self.information[chosen])
         J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
         n, width = len(chosen), len(joint)
-        C = own + self.away[chosen] + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
+        C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
+        C += np.where(np.asarray((rows < 0).all(axis=1))[:, None, None], self.away[chosen], 0.0)
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from backends.smoother.steps import Steps
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, inverse, transform
 
+_AGAIN = 2  # numerics: steps of Gauss and Newton after the first
 _ITERATIONS = 20  # numerics: of Levenberg-Marquardt at most
 
 
@@ -32,14 +34,14 @@ def corrected(s: State, correct: Callable[[Array], Array]) -> State:
     sights = tuple(replace(sight, z=out[a:b]) for sight, a, b in zip(s.sights, counts, counts[1:]))
     z = marks.z.reshape(-1, 3).copy()
     z[marks.pose.ravel() >= 0] = out[counts[-1] :]
-    return replace(s, sights=sights, landmarks=replace(marks, z=z.reshape(shape)))
+    return replace(s, sights=sights, landmarks=replace(marks, z=z.reshape(shape)), revisions=s.revisions + 1)
 
 
-def rebuilt(s: State, steps: Steps, graph: Graph, make: FactorMaker) -> State:
+def rebuilt(s: State, steps: Steps, graph: Graph) -> State:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
     first = graph.oldest(s)
     try:
-        now = optimised(s, make, steps.config.track, first)
+        now = graph.rebuilt(s, _AGAIN).poses
     except SolverError:
         now = s.poses[s.of(first) :]
     if not s.anchored:
@@ -56,7 +58,8 @@ def rebuilt(s: State, steps: Steps, graph: Graph, make: FactorMaker) -> State:
     after = moved[-1] if s.inside is False or len(moved) < 2 else moved[-2]
     last[0] = after @ inverse(before) @ s.last[0]
     s = replace(s, poses=moved, last=last, landmarks=marks.refined(steps.stereo, steps.sigma, s.first, moved))
-    graph.restart()
+    with suppress(SolverError):  # then the next update tries again
+        graph.rebuilt(s)
     return s
 
 
@@ -67,23 +70,24 @@ def path_solved(s: State, make: FactorMaker, before: Array) -> Array:
     """
     first = max(s.begun, s.first)
     try:
-        kept = np.concatenate([s.poses[: s.of(first)], optimised(s, make, len(s.poses), first)])
+        kept = np.concatenate([s.poses[: s.of(first)], optimised(s, make, first)])
     except SolverError:
         kept = s.poses
     M = np.eye(4) if s.anchored else s.poses[-1] @ inverse(kept[-1])
     return M @ np.concatenate([before, kept])
 
 
-def optimised(s: State, make: FactorMaker, track: int, first: int) -> Array:
+def optimised(s: State, make: FactorMaker, first: int) -> Array:
     """Poses from number `first` on that fit their measurements best; the first has a prior.
 
     Raises:
         SolverError: gtsam failed, or found nothing better.
     """
-    problem, tracks = Problem(), Tracks(make, track, None)
+    problem, tracks = Problem(), Tracks(make, None)
+    problem.factors.add(make.prior(first, s.poses[s.of(first)], held(s, first)[0]))
     numbers = range(first, s.number + 1)
     for number in numbers:
-        tracks.add_pose(problem, s, number, first, held(s, first)[0])
+        tracks.add_pose(problem, s, number, first)
         tracks.add_rows(problem, s, number, first)
     tracks.make_smart(problem)
     values = minimised(problem, _ITERATIONS)

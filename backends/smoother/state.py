@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from backends.smoother.landmarks import Landmarks
-from slam.data import IdArray
+from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, inverse
 
 
@@ -18,10 +18,12 @@ class Sight:
 
     Attributes:
         serials: of the landmarks (M,).
+        begun: which of each one's smart factors it goes into (M,), see `Landmarks.begun`.
         z: measurements (M, 3) of the rectified rig, uR NaN where missing.
     """
 
     serials: IdArray
+    begun: IndexArray
     z: Array
 
     def __len__(self) -> int:
@@ -30,11 +32,17 @@ class Sight:
     @classmethod
     def none(cls) -> Sight:
         """Nothing."""
-        return cls(np.zeros(0, np.int64), np.zeros((0, 3)))
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.intp), np.zeros((0, 3)))
 
-    def with_more(self, serials: IdArray, z: Array) -> Sight:
-        """With further measurements."""
-        return Sight(np.concatenate([self.serials, serials]), np.concatenate([self.z, z]))
+    @classmethod
+    def of(cls, marks: Landmarks, rows: IndexArray, z: Array) -> Sight:
+        """Of measurements z (M, 3) that landmarks have just had."""
+        return cls(marks.serial[rows], marks.begun[rows], z)
+
+    def joined(self, other: Sight) -> Sight:
+        """These measurements and others."""
+        both = zip((self.serials, self.begun, self.z), (other.serials, other.begun, other.z))
+        return Sight(*(np.concatenate(pair) for pair in both))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +52,13 @@ class Tie:
     Attributes:
         relative: the pose relative to the one before it in the graph (4, 4).
         covariance: of that (6, 6).
+        times: of the three frames that the motion model ties [s]; the first is NaN where the velocity is unknown. None
+            where not all of them are poses of the graph, one after the other: then the above counts in its place.
     """
 
     relative: Array
     covariance: Array
+    times: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +93,7 @@ class State:
         stamps: times of the last frame but one and the last (2,) [s]; NaN where there is none.
         last: their poses (2, 4, 4).
         pair: their joint covariance (12, 12), where the newest pose of the graph is known.
+        tie: of the newest frame to the newest pose of the graph that is before it.
         frame: number of the newest frame.
         since: frames since the problem has begun, 0 for its first one.
         inside: whether the newest frame is the newest pose of the graph.
@@ -89,6 +101,7 @@ class State:
         serials: number of landmarks so far.
         known: by serial number.
         measured: whether the newest frame may not be updated any more.
+        revisions: how often the measurements were revised.
         contradicted: updates in succession in which most observations agreed on another pose than was expected.
     """
 
@@ -101,6 +114,7 @@ class State:
     stamps: Array
     last: Array
     pair: Array
+    tie: Tie | None = None
     frame: int = -1
     since: int = 0
     inside: bool = True
@@ -108,6 +122,7 @@ class State:
     serials: int = 0
     known: Mapping[int, Known] = field(default_factory=dict)
     measured: bool = False
+    revisions: int = 0
     contradicted: int = 0
 
     @classmethod

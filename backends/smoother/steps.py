@@ -37,9 +37,10 @@ class Steps(RectifiedMeasurement):
         """Number of poses that are kept; None for all."""
         return None if self.config.lag is None else self.config.lag + 1 + self.config.past
 
-    def oldest(self, s: State) -> int:
-        """Number of the oldest pose that is smoothed."""
-        return s.begun if self.config.lag is None else max(s.begun, s.number - self.config.lag)
+    @property
+    def track(self) -> int:
+        """Most poses that a smart factor spans: it ends before its first pose leaves."""
+        return self.config.track if self.config.lag is None else min(self.config.track, self.config.lag + 1)
 
     # --- prediction ---
 
@@ -63,10 +64,13 @@ class Steps(RectifiedMeasurement):
             noise = (Jw * motion.velocity_sigmas(self.models, dt, first) ** 2) @ Jw.T
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
-        pair = np.block([[s.own, cross.T], [cross, 0.5 * (own + own.T)]])
+        own = 0.5 * (own + own.T)
+        tie = Tie(inverse(s.poses[-1]) @ T, own)
+        if s.inside and not rests and (first or before is None or (s.tie is not None and s.tie.times is not None)):
+            tie = replace(tie, times=np.array([np.nan if first or before is None else -before, 0.0, dt]))
         return replace(
-            s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), pair=pair, frame=s.frame + 1,
-            since=s.since + 1, inside=False, measured=False,
+            s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
+            pair=np.block([[s.own, cross.T], [cross, own]]), since=s.since + 1, inside=False, measured=False, tie=tie,
         )  # fmt: skip
 
     def in_view(self, s: State) -> tuple[IndexArray, Array, Array, Array]:
@@ -133,46 +137,45 @@ class Steps(RectifiedMeasurement):
     ) -> tuple[State, float, str]:
         """The state after an update, its NIS, and why the graph was built anew, if it was."""
         used, marks = found.used, s.landmarks
-        sight = Sight(marks.serial[rows[used]], z[used])
+        seen, number = rows[used], s.number + (found.jump is not None or not s.inside)
         if found.jump is not None:
-            after = _begun(s, found.T, world_covariance(s.covariance), sight)
-            after = replace(after, known={serial: one for serial, one in s.known.items() if one.pose < 0})
-            after = replace(after, landmarks=marks.without_measurements().measured(rows[used], z[used], after.number))
+            marks = marks.without_measurements().measured(seen, z[used], number, self.track)
+            after = _begun(s, found.T, world_covariance(s.covariance), Sight.of(marks, seen, z[used]))
+            known = {serial: one for serial, one in s.known.items() if one.pose < 0}
+            after = replace(after, known=known, landmarks=marks)
             return self.settled(after, graph.rebuilt(after)), float("nan"), ""
         residuals, J = pose_only.residuals(one, found.T)
         information = _information(J[used], one.noise[used], z[used])
         x = log(inverse(one.predicted) @ found.T)
         nis = float(squared_distances(residuals[used], one.noise[used]).sum() + x @ one.information @ x)
+        if not (s.inside or self._is_chosen(s, found.T, seen)):
+            return _hung(s, found.T, information), nis, ""
+        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number))
+        sight = Sight.of(marks, seen, z[used])
         if s.inside:
             after = replace(
                 s, sights=(*s.sights[:-1], sight), poses=np.concatenate([s.poses[:-1], found.T[None]]),
-                last=np.stack([s.last[0], found.T]),
-                landmarks=marks.measured(rows[used], z[used], s.number),
+                last=np.stack([s.last[0], found.T]), landmarks=marks,
             )  # fmt: skip
             return self.settled(after, graph.rebuilt(after)), nis, ""
-        if not self._is_chosen(s, found.T, sight, rows[used]):
-            return _hung(s, found.T, information), nis, ""
-        tie = Tie(inverse(s.poses[-1]) @ s.last[1], s.own)
         after = _hung(s, found.T, information)
         after = replace(
-            after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, tie),
-            spread=np.concatenate([s.spread, after.covariance[None]]), inside=True,
+            after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, s.tie),
+            spread=np.concatenate([s.spread, after.covariance[None]]), inside=True, landmarks=marks,
         )  # fmt: skip
-        after = replace(after, landmarks=marks.measured(rows[used], z[used], after.number, self.oldest(after)))
         solved, why = graph.followed(after)
         after = self.settled(after, solved)
         drift = _drift(solved.covariance, after.poses[-2], after.poses[-1])
-        marks = after.landmarks.left_behind(rows[used], after.poses[-1], drift)
-        return replace(after, landmarks=marks), nis, why
+        return replace(after, landmarks=after.landmarks.left_behind(seen, after.poses[-1], drift)), nis, why
 
-    def _is_chosen(self, s: State, T: Array, sight: Sight, rows: IndexArray) -> bool:
+    def _is_chosen(self, s: State, T: Array, seen: IndexArray) -> bool:
         """Whether the newest frame, at T (4, 4), becomes a pose of the graph: see `SmootherConfig`."""
         if self.config.motion == 0:
             return True
-        again = np.isin(sight.serials, s.sights[-1].serials)
+        again = np.isin(s.landmarks.serial[seen], s.sights[-1].serials)
         if again.mean() < self.config.overlap:
             return True
-        points = s.landmarks.position[rows[again]]
+        points = s.landmarks.position[seen[again]]
         here, there = (transform(inverse(pose), points) for pose in (T, s.poses[-1]))
         with np.errstate(divide="ignore", invalid="ignore"):
             moved = np.linalg.norm(here[:, :2] / here[:, 2:] - there[:, :2] / there[:, 2:], axis=1)
@@ -212,8 +215,9 @@ class Steps(RectifiedMeasurement):
         marks = _seen_from_newest(s, ids, local, self.sigma**2 * back @ np.swapaxes(back, 1, 2))
         if s.inside:
             nothing = np.zeros_like(marks.information)
-            marks = replace(marks, information=nothing).measured(np.arange(len(ids)), z, s.number)
-            s = replace(s, sights=(*s.sights[:-1], s.sights[-1].with_more(marks.serial, z)))
+            new = np.arange(len(ids))
+            marks = replace(marks, information=nothing).measured(new, z, s.number, self.track)
+            s = replace(s, sights=(*s.sights[:-1], s.sights[-1].joined(Sight.of(marks, new, z))))
         return _with(s, marks)
 
     def inserted(self, s: State, ids: IdArray, positions: Array, covariances: Array) -> State:
@@ -255,7 +259,7 @@ def _begun(s: State, T: Array, covariance: Array, sight: Sight) -> State:
     return replace(
         s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
         spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
-        since=0, inside=True,
+        since=0, inside=True, tie=None,
     )  # fmt: skip
 
 
@@ -292,8 +296,14 @@ def _with(s: State, marks: Landmarks) -> State:
 
 
 def _seen_from_newest(s: State, ids: IdArray, local: Array, covariances: Array) -> Landmarks:
-    """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes."""
+    """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes.
+
+    From a frame that is no pose of the graph they are as uncertain as it is itself, given the newest pose of the graph.
+    """
     T = s.last[1]
+    if not s.inside:
+        by_pose = points_by_pose(local)
+        covariances = covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)
     own = T[:3, :3] @ covariances @ T[:3, :3].T
     own = 0.5 * (own + np.swapaxes(own, 1, 2))
     return Landmarks.of(ids, s.serials, transform(T, local), own, inverses(own), False)

@@ -25,15 +25,19 @@ class Call:
     step: str
     arguments: tuple[Any, ...]
 
-    def corrected(self, correct: Callable[[Array], Array]) -> Call:
-        """With corrected measurements."""
-        if self.step not in ("updated", "added"):
+    @property
+    def measured(self) -> Array:
+        """The call's measurements (M, 3); most calls have none."""
+        return np.asarray(self.arguments[1]) if self.step in ("updated", "added") else np.zeros((0, 3))
+
+    def with_measured(self, z: Array) -> Call:
+        """With corrected measurements (M, 3)."""
+        if not len(z):
             return self
-        ids, z, *rest = self.arguments
-        out = _corrected(z, correct)
+        ids, before, *rest = self.arguments
         if self.step == "added":  # what has no depth any more was placed as it was
-            out = np.where((out[:, 0] > out[:, 2])[:, None], out, z)
-        return Call(self.step, (ids, out, *rest))
+            z = np.where((z[:, 0] > z[:, 2])[:, None], z, before)
+        return Call(self.step, (ids, z, *rest))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +87,11 @@ class History:
         Raises:
             MeasurementError: a corrected measurement is not finite.
         """
+        measured = [call.measured for part in self.parts for call in part.calls]
+        ends = np.cumsum([len(z) for z in measured])[:-1]
+        rows = iter(np.split(_corrected(np.concatenate(measured), correct), ends) if measured else ())
         return replace(self, parts=tuple(
-            Part(state_corrected(part.state, stereo, correct), tuple(call.corrected(correct) for call in part.calls))
+            Part(state_corrected(part.state, stereo, correct), tuple(c.with_measured(next(rows)) for c in part.calls))
             for part in self.parts
         ))  # fmt: skip
 

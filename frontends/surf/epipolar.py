@@ -13,26 +13,53 @@ _HALF = 4  # fixed: half width of the compared patches [half-resolution px]; the
 _SIDE = 2 * _HALF + 1
 _FLAT = 2.0  # least standard deviation of a patch [grey levels of 8-bit images]
 _LANES = 16  # cost: columns are searched in whole vector registers
-_CONTENDER = 0.5  # cost: correlation of a column below which the places beside it are no rivals
+_PADDED = (_SIDE * _SIDE + _LANES - 1) // _LANES * _LANES  # pixels of a patch by rows, padded with zeros
+_CONTENDER = 0.7  # cost: a column no more alike than this share of what a rival needs has none beside it
 _NEIGHBOURS = 2  # columns about the best place that are no rivals of it
 
 
-class HalfImage(NamedTuple):
-    """An image at half resolution, ready for correlation.
+class _Space(NamedTuple):
+    """Work space of the search: for patches by rows, padded with zeros, and the places along a row.
 
     Attributes:
-        pixels: grey values (H/2, W/2) float32 on the scale of 8-bit images.
-        weight: one over the root of the sum of squared deviations of the patch about each pixel; 0 where it is flat
-            or leaves the image.
-        flat_pixels: these by rows in one line, and as many zeros behind them as `_correlate` reads.
-        flat_weight: likewise.
-        between: grey values by rows in one line, half a column further to the right.
+        patch: what is looked for, its mean removed.
+        pixels, between: the patches at a place and half a column beside it.
+        side: of a patch; no constant here, or its loops would be unrolled instead of running on vector registers.
+        scores: correlations with the places.
+        marks: which of these may be rivals of the best one.
+        words: eight marks each.
     """
 
+    patch: NDArray[np.float32]
+    pixels: NDArray[np.float32]
+    between: NDArray[np.float32]
+    side: int
+    scores: NDArray[np.float32]
+    marks: NDArray[np.bool_]
+    words: NDArray[np.uint64]
+
+    @classmethod
+    def of(cls, width: int) -> _Space:
+        """For rows of so many places."""
+        words = np.zeros(width // 8 + 1, np.uint64)
+        patch, pixels, between = np.zeros((3, _PADDED), np.float32)
+        return cls(patch, pixels, between, _SIDE, np.empty(width + _LANES, np.float32), words.view(np.bool_), words)
+
+
+class HalfImage(NamedTuple):
+    """An image at half resolution, ready for correlation: arrays by rows, and a vector register of zeros behind them.
+
+    Attributes:
+        shape: rows and columns.
+        pixels: grey values, float32 on the scale of 8-bit images.
+        weight: one over the root of the sum of squared deviations of the patch about each pixel; 0 where it is flat
+            or leaves the image.
+        between: grey values half a column further to the right.
+    """
+
+    shape: tuple[int, int]
     pixels: NDArray[np.float32]
     weight: NDArray[np.float32]
-    flat_pixels: NDArray[np.float32]
-    flat_weight: NDArray[np.float32]
     between: NDArray[np.float32]
 
 
@@ -40,15 +67,17 @@ def half_image(image: NDArray, full_scale: float) -> HalfImage:
     """Halve a grey image (H, W) of pixels 0..full_scale for `search_rows`."""
     import cv2
 
-    height, width = image.shape
-    small = cv2.resize(image, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
-    flat_pixels, flat_weight = np.zeros((2, small.size + _LANES), np.float32)
-    pixels, weight = flat_pixels[: small.size].reshape(small.shape), flat_weight[: small.size].reshape(small.shape)
-    np.multiply(small, np.float32(255.0 / full_scale), out=pixels)
-    _weigh(pixels, weight, np.empty(pixels.shape[1], np.float32), np.empty(pixels.shape[1], np.float32))
-    between = cv2.resize(np.roll(image, -1, axis=1), small.shape[::-1], interpolation=cv2.INTER_AREA)
-    between = between.reshape(-1) * np.float32(255.0 / full_scale)
-    return HalfImage(pixels, weight, flat_pixels, flat_weight, between)
+    rows, columns = (max(n // 2, 1) for n in image.shape)
+    small, beside = (
+        cv2.resize(view, (columns, rows), interpolation=cv2.INTER_AREA) for view in (image, np.roll(image, -1, axis=1))
+    )
+    flat = np.zeros((3, small.size + _LANES), np.float32)
+    pixels, weight, between = (plane[: small.size].reshape(rows, columns) for plane in flat)
+    scale = np.float32(255.0 / full_scale)
+    np.multiply(small, scale, out=pixels)
+    np.multiply(beside, scale, out=between)
+    _weigh(pixels, weight, np.empty(columns, np.float32), np.empty(columns, np.float32))
+    return HalfImage((rows, columns), flat[0], flat[1], flat[2])
 
 
 @kernel
@@ -87,32 +116,42 @@ def _column_sums(pixels, y, sums, squares):
 
 
 @vector_helper
-def _zero_mean_patch(image, x, y, patch):
-    """Patch about a pixel, its mean removed."""
-    total = np.float32(0.0)
+def _cut(pixels, stride, x, y, side, out):
+    """The patch about a pixel of a flat image, by rows."""
     for r in range(_SIDE):
-        for c in range(_SIDE):
-            patch[r, c] = image[y - _HALF + r, x - _HALF + c]
-            total += patch[r, c]
-    for r in range(_SIDE):
-        for c in range(_SIDE):
-            patch[r, c] -= total / np.float32(_SIDE * _SIDE)
+        start, to = np.uint64((y - _HALF + r) * stride + x - _HALF), np.uint64(r * _SIDE)
+        for c in range(side):
+            out[to + np.uint64(c)] = pixels[start + np.uint64(c)]
 
 
 @vector_helper
-def _correlate(image, stride, y, first, count, patch, own, scores):
+def _take_patch(pixels, stride, x, y, space):
+    """Look for the patch about a pixel of a flat image, its mean removed."""
+    patch, n = space.patch, space.side * space.side
+    _cut(pixels, stride, x, y, space.side, patch)
+    total = np.float32(0.0)
+    for k in range(n):
+        total += patch[k]
+    mean = total / np.float32(_SIDE * _SIDE)
+    for k in range(n):
+        patch[k] -= mean
+
+
+@vector_helper
+def _correlate(image, stride, y, first, count, own, space):
     """Normalised correlation of a patch with the places at columns first, first + 1, ... of row y, into `scores`.
 
     It goes on to the end of a vector register: `_LANES - 1` more scores and, in the images, pixels at most.
     """
-    pixels, weights = image.flat_pixels, image.flat_weight
+    pixels, weights, patch, scores = image.pixels, image.weight, space.patch, space.scores
     count = (count + _LANES - 1) & -_LANES
     for j in range(count):
         scores[j] = np.float32(0.0)
     for r in range(_SIDE):
         start = np.uint64((y - _HALF + r) * stride + first - _HALF)
-        w0, w1, w2, w3, w4 = patch[r, 0], patch[r, 1], patch[r, 2], patch[r, 3], patch[r, 4]
-        w5, w6, w7, w8 = patch[r, 5], patch[r, 6], patch[r, 7], patch[r, 8]
+        n = r * _SIDE
+        w0, w1, w2, w3, w4 = patch[n], patch[n + 1], patch[n + 2], patch[n + 3], patch[n + 4]
+        w5, w6, w7, w8 = patch[n + 5], patch[n + 6], patch[n + 7], patch[n + 8]
         for j in range(count):
             k = start + np.uint64(j)
             scores[j] += (
@@ -147,30 +186,42 @@ def _place_of(scores, value):
 
 
 @vector_helper
-def _height(image, stride, y, x, patch, own, score, side):
-    """Best correlation of a patch with the places from column x, where it is `score`, to half a column to a side.
+def _mark_contenders(scores, count, least, marks):
+    """Mark the local maxima of at least some score; `scores` goes on beyond its end."""
+    for j in range(1, count - 1):
+        s = scores[j]
+        marks[j] = (s >= least) & (s >= scores[j - 1]) & (s >= scores[j + 1])
+    marks[0] = (scores[0] >= least) & ((count < 2) | (scores[0] >= scores[1]))
+    if count > 1:
+        marks[count - 1] = (scores[count - 1] >= least) & (scores[count - 1] >= scores[count - 2])
+    for j in range(count, (count + 7) & -8):
+        marks[j] = False
+
+
+@vector_helper
+def _height(image, stride, y, x, own, score, side, space):
+    """Best correlation of the patch with the places from column x, where it is `score`, to half a column to a side.
 
     Linear interpolation between two patches, that correlate by `alike` with each other and by s and n with a third,
     correlates with that by the root of ``(s² - 2 alike s n + n²) / (1 - alike²)`` at best, if that lies between them.
     """
-    pixels, weights, between = image.flat_pixels, image.flat_weight, image.between
     zero, one, area = np.float32(0.0), np.float32(1.0), np.float32(_SIDE * _SIDE)
+    patch, pixels, between = space.patch, space.pixels, space.between
+    _cut(image.pixels, stride, x, y, space.side, pixels)
+    _cut(image.between, stride, x + (side - 1) // 2, y, space.side, between)
     sa, sb, bb, ab, product = zero, zero, zero, zero, zero
-    for r in range(_SIDE):
-        start = np.uint64((y - _HALF + r) * stride + x - _HALF)
-        beside = np.uint64((y - _HALF + r) * stride + x - _HALF + (side - 1) // 2)
-        for c in range(_SIDE):
-            a, b = pixels[start + np.uint64(c)], between[beside + np.uint64(c)]
-            sa += a
-            sb += b
-            bb += b * b
-            ab += a * b
-            product += patch[r, c] * b
+    for k in range(patch.size):
+        a, b = pixels[k], between[k]
+        sa += a
+        sb += b
+        bb += b * b
+        ab += a * b
+        product += patch[k] * b
     spread = bb - sb * sb / area
     if not spread > area * np.float32(_FLAT * _FLAT):
         return score
     weight = one / np.sqrt(spread)
-    n, alike = product * own * weight, (ab - sa * sb / area) * weight * weights[np.uint64(y * stride + x)]
+    n, alike = product * own * weight, (ab - sa * sb / area) * weight * image.weight[np.uint64(y * stride + x)]
     largest = max(score, n)
     if min(score, n) > alike * largest and alike * alike < one:
         largest = np.sqrt((score * score - np.float32(2.0) * alike * score * n + n * n) / (one - alike * alike))
@@ -178,18 +229,19 @@ def _height(image, stride, y, x, patch, own, score, side):
 
 
 @vector_helper
-def _unresolved(image, stride, x, y):
+def _unresolved(image, stride, x, y, space):
     """How much too low a height may be by noise, and by linear interpolation between places half a column apart.
 
     It is half of the share of the variance about (x, y) that interpolation between whole columns leaves unexplained,
     over 4: a share that falls with the fourth power of the distance in smooth images, and more slowly in coarse ones.
     """
-    pixels, between = image.flat_pixels, image.between
+    pixels, between, inner = space.pixels, space.between, space.side - 1
+    _cut(image.pixels, stride, x, y, space.side, pixels)
+    _cut(image.between, stride, x, y, space.side, between)
     s, ss, ee = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for r in range(_SIDE):
-        start = np.uint64((y - _HALF + r) * stride + x - _HALF)
-        for c in range(_SIDE - 1):
-            k = start + np.uint64(c)
+        for c in range(inner):
+            k = np.uint64(r * _SIDE) + np.uint64(c)
             v = between[k]
             e = v - np.float32(0.5) * (pixels[k] + pixels[k + np.uint64(1)])
             s += v
@@ -200,38 +252,53 @@ def _unresolved(image, stride, x, y):
 
 
 @helper
-def _search(image, shape, band, y, first, last, patch, own, scores):
-    """Best place of a patch in columns first..last of the rows within `band` of y: x, y and correlation.
+def _search(image, shape, band, y, first, last, own, limits, space):
+    """The place of the patch in columns first..last of the rows within `band` of y: x, y; -1 where there is none.
 
-    And the heights of it and of its rival, the correlations with the best places between columns, by which they are
-    compared: a wrong place of a repeated pattern that happens to lie on a whole column looks better than the true one
-    that does not.
+    It correlates with at least the first of `limits`, and clearly better than any rival: ``(1 - height) / (1 - rival)``
+    is at most the second, with the third taken from the rival's side as what noise may do. Heights are the correlations
+    with the best places between columns: a wrong place of a repeated pattern that happens to lie on a whole column
+    looks better than the true one that does not.
     """
+    scores, marks, words = space.scores, space.marks, space.words
+    min_correlation, uniqueness, unresolved = limits
     rows, stride = shape
     begin, count = np.int64(0), last - first + 1  # no literal number: Numba would compile a helper again for it
+    one = np.float32(1.0)
     found, row, score, height, rival = -1, -1, np.float32(-1.0), np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
-        _correlate(image, stride, v, first, count, patch, own, scores)
-        best, better = _largest(scores, begin, count), False
-        if best > score:
-            better = True
+        _correlate(image, stride, v, first, count, own, space)
+        best = _largest(scores, begin, count)
+        better = best > score
+        if better:
             place = first + _place_of(scores, best)
             if abs(place - found) > _NEIGHBOURS:
                 rival = max(rival, height)
             found, row, score = place, v, best
-        for j in range(count):
-            s = scores[j]
-            before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
-            apart, itself = abs(first + j - found) > _NEIGHBOURS, better and first + j == found
-            if not itself and (not apart or s < _CONTENDER or s < before or s < after):
+        if score < min_correlation:
+            continue
+        harmless = one - unresolved - (one - score) / uniqueness  # a rival up to this height is none
+        _mark_contenders(scores, count, _CONTENDER * harmless, marks)
+        if better:
+            marks[found - first] = True
+        for word in range((count + 7) // 8):
+            if words[word] == 0:
                 continue
-            side = 1 if after >= before or first + j == _HALF else -1
-            top = _height(image, stride, v, first + j, patch, own, s, side)
-            if itself:
-                height = top
-            else:
-                rival = max(rival, top)
-    return found, row, score, height, rival
+            for j in range(8 * word, 8 * word + 8):
+                itself = better and first + j == found
+                if not marks[j] or not (itself or abs(first + j - found) > _NEIGHBOURS):
+                    continue
+                s = scores[j]
+                before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
+                side = 1 if after >= before or first + j == _HALF else -1
+                top = _height(image, stride, v, first + j, own, s, side, space)
+                if itself:
+                    height = top
+                else:
+                    rival = max(rival, top)
+    if score < min_correlation or one - height > uniqueness * (one - rival - unresolved):
+        return -1, -1
+    return found, row
 
 
 def search_rows(
@@ -260,19 +327,20 @@ def search_rows(
         uniqueness: largest ratio ``(1 - best) / (1 - rival)``.
     """
     out = np.full((len(uv), 2), np.nan)
-    patch, scores = np.empty((_SIDE, _SIDE), np.float32), np.empty(left.pixels.shape[1] + _LANES, np.float32)
-    _search_rows(left, right, uv, 0.5 * low, 0.5 * high, band, min_correlation, uniqueness, patch, scores, out)
+    space = _Space.of(left.shape[1])
+    _search_rows(left, right, uv, 0.5 * low, 0.5 * high, band, min_correlation, uniqueness, space, out)
     return out
 
 
 @kernel
-def _search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, patch, scores, out):
-    """The same into `out`, at half resolution, with work space for a patch and the scores of a row."""
-    height, width = left.pixels.shape
+def _search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, space, out):
+    """The same into `out`, at half resolution."""
+    height, width = left.shape
+    least, most = np.float32(min_correlation), np.float32(uniqueness)
     for i in range(len(uv)):
         px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
         x, y = int(np.rint(px)), int(np.rint(py))
-        if not (_HALF <= x < width - _HALF and _HALF <= y < height - _HALF) or left.weight[y, x] == 0.0:
+        if not (_HALF <= x < width - _HALF and _HALF <= y < height - _HALF) or left.weight[y * width + x] == 0.0:
             continue
         found, row = x, y
         for back in range(2):  # to the right image, and from there to the left one again
@@ -285,12 +353,11 @@ def _search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, 
             first, last = max(_HALF, int(from_)), min(width - 1 - _HALF, int(to))
             if last <= first and not back:
                 break
-            unresolved, own = _unresolved(here, width, found, row), here.weight[row, found]
-            _zero_mean_patch(here.pixels, found, row, patch)
-            place, line, score, best, rival = _search(
-                there, here.pixels.shape, band, row, first, last, patch, own, scores
-            )
-            if score < min_correlation or 1.0 - best > uniqueness * (1.0 - rival - unresolved):
+            limits = least, most, _unresolved(here, width, found, row, space)
+            _take_patch(here.pixels, width, found, row, space)
+            own = here.weight[row * width + found]
+            place, line = _search(there, (height, width), band, row, first, last, own, limits, space)
+            if place < 0:
                 break
             if not back:
                 found, row = place, line

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.runtime.compilation import kernel
-
 
 def integral_image(image: NDArray) -> NDArray[np.int32]:
     """Integral image (H+1, W+1) int32 of a grey image (H, W): ``sum(y, x) = image[:y, :x].sum()``.
@@ -14,11 +12,13 @@ def integral_image(image: NDArray) -> NDArray[np.int32]:
     Sums wrap around modulo 2**32. Differences of them stay exact as long as one box sum fits 31 bits, which it does
     for every filter size in use, also with 16-bit pixels.
     """
-    if image.dtype == np.uint8 and image.size:
-        import cv2
+    if not image.size:
+        return np.zeros((image.shape[0] + 1, image.shape[1] + 1), np.int32)
+    if image.dtype != np.uint8:  # exact below 2**53
+        return float_integral_image(image).astype(np.int64).astype(np.int32)
+    import cv2
 
-        return cv2.integral(image, sdepth=cv2.CV_32S)
-    return _integral_image(image)
+    return cv2.integral(image, sdepth=cv2.CV_32S)
 
 
 def float_integral_image(image: NDArray) -> NDArray[np.float64]:
@@ -26,24 +26,6 @@ def float_integral_image(image: NDArray) -> NDArray[np.float64]:
     import cv2
 
     return cv2.integral(image, sdepth=cv2.CV_64F)
-
-
-@kernel
-def _integral_image(image):
-    """The same for pixel types that OpenCV does not sum up in 32 bits."""
-    height, width = image.shape
-    out = np.empty((height + 1, width + 1), np.int32)
-    out[0, :] = 0
-    for y in range(height):
-        row, above, below = image[y], out[y], out[y + 1]
-        running = np.int32(0)
-        below[0] = 0
-        for x in range(width):
-            running = np.int32(running + np.int32(row[x]))
-            below[x + 1] = running
-        for x in range(1, width + 1):
-            below[x] = np.int32(below[x] + above[x])
-    return out
 
 
 def column_phases(integral: NDArray[np.int32], step: int, first: int, last: int) -> NDArray[np.int32]:

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_positive
 
-_SIGMAS = (1e-4, 1e4)  # guard: [px]
-_RANGES = {
-    "prior_scale": (1e-3, 1e3),
-    "pixel_sigma": _SIGMAS,
-    "disparity_sigma": _SIGMAS,
-    "systematic": _SIGMAS,
-    "minimum_parallax": _SIGMAS,
-    "inflation": (1e-3, 1e3),
-}
+_RANGES = {"systematic": (1e-4, 1e4), "minimum_parallax": (1e-4, 1e4)}  # [px]
 
 
 @dataclass(frozen=True)
@@ -24,29 +17,28 @@ class SelfCalibrationConfig:
 
     Attributes:
         enabled: False leaves all measurements unchanged.
-        pixel_sigma: initial noise of a left pixel [px]; it is then estimated from pairs of views.
-        disparity_sigma: the same of a disparity [px].
         systematic: error of rows and disparities that all frames of a recording may share, for each parameter [px].
-        kept_share: two views are compared once less than this share of the first view's features is matched.
         minimum_common: least number of features matched in both views.
         minimum_parallax: least median displacement of the features by translation between two views [px].
-        inflation: initial factor on the variance of the evidence, until its scatter has been measured.
     """
 
     enabled: bool = True
-    pixel_sigma: float = 0.4
-    disparity_sigma: float = 0.2
     systematic: float = 0.05
-    kept_share: float = 0.3
     minimum_common: int = 30
     minimum_parallax: float = 4.0
-    inflation: float = 4.0
+
+    #: Noise of a left pixel [px] at first; it is then estimated from pairs of views.
+    pixel_sigma: ClassVar[float] = 0.4
+    #: The same of a disparity [px].
+    disparity_sigma: ClassVar[float] = 0.2
+    #: Two views are compared once less than this share of the first view's features is matched.
+    kept_share: ClassVar[float] = 0.3
+    #: Factor on the variance of the evidence at first, until its scatter has been measured.
+    inflation: ClassVar[float] = 4.0
 
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_positive(self, _RANGES, "self_calibration")
-        if self.kept_share > 1:
-            raise ConfigurationError(f"self_calibration: kept_share must lie in (0, 1], got {self.kept_share}")
         if self.minimum_common < 10:
             raise ConfigurationError("self_calibration: minimum_common >= 10 is required (a pose and the rig)")

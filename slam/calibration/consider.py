@@ -32,9 +32,6 @@ from slam.models import EstimatorModels
 #: tenths of a percent. It scales the whole world, so images never show it.
 BASELINE = 0.002
 
-_LEAST = 1e-9  # numerics: of a motion's standard deviations [rad], [m]; with none there is no information matrix
-_LONGEST = 1.0  # guard: time [s] after which a motion counts as unknown
-
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
@@ -259,9 +256,10 @@ class SchmidtFilter:
 
     def _motion_sigmas(self, dt: float) -> tuple[float, float]:
         """Prior standard deviations of a motion [rad], [m]: twice the velocity's change."""
-        dt = min(abs(dt), _LONGEST)
+        dt = min(abs(dt), 1.0)  # 1.0: time [s] after which a motion counts as unknown
         v, w = 2 * dt * np.sqrt(self._motion.velocity_variance(dt))
-        return max(float(w), _LEAST), max(float(v), _LEAST)
+        # 1e-9: of a motion's standard deviations [rad], [m]; with none there is no information matrix
+        return max(float(w), 1e-9), max(float(v), 1e-9)
 
     def _sight(self, local: Array) -> tuple[Array, Array, Array]:
         """Of z = (x, y, d) [px] of points (M, 3) [m]: ∂z/∂h (M, 3, 3), ∂z/∂δ (M, 3, m), and the noise (3, 3).

@@ -15,8 +15,6 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, so3_exp
 
-_GRID = 25, 15  # numerics: grid of pixels to which the cameras are fitted, columns and rows
-
 
 class CorrectedRig(NamedTuple):
     """A rig corrected by its estimated error.
@@ -65,7 +63,8 @@ def _camera(
         R: rotation from the camera's axes to those of the rectified camera (3, 3).
         theta: the corrections (8,) of `LENS`.
     """
-    u, v = np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip((camera.width, camera.height), _GRID)))
+    # (25, 15): grid of pixels to which the cameras are fitted, columns and rows
+    u, v = np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip((camera.width, camera.height), (25, 15))))
     pixels = np.column_stack([u.ravel(), v.ravel()])
     seen = ideal.normalise(rectify(pixels))
     good = np.isfinite(seen).all(axis=1)

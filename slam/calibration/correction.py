@@ -10,8 +10,6 @@ from slam.calibration.model import RigModel
 from slam.data import StereoFeatures
 from slam.geometry.se3 import Array
 
-_ROUNDS = 4  # numerics: fixed-point iterations that undo a correction; each reduces the error some 30 times
-
 
 @dataclass(frozen=True, eq=False)
 class RigCorrection:
@@ -33,21 +31,24 @@ class RigCorrection:
     def undone(self, z: Array) -> Array:
         """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
         corrected = points = self.model.points(z)
-        for _ in range(_ROUNDS):
+        for _ in range(4):  # 4: fixed-point iterations that undo a correction; each reduces the error some 30 times
             points = corrected - self.model.shift(points, self.parameters)
         return self.model.rows(points)
 
     def features(self, features: StereoFeatures) -> StereoFeatures:
-        """Features with both pixels corrected; the right row keeps the remaining vertical disparity."""
+        """Features with both pixels corrected."""
+        uv_left, uv_right = self.pixels(features.uv_left, features.uv_right)
+        return replace(features, uv_left=uv_left, uv_right=uv_right)
+
+    def pixels(self, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
+        """Corrected pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
         rectified_rig = self.model.rig.rectified
-        left, right = rectified_rig.rectify_left(features.uv_left), rectified_rig.rectify_right(features.uv_right)
+        left, right = rectified_rig.rectify_left(uv_left), rectified_rig.rectify_right(uv_right)
         z = np.column_stack([left, right[:, 0]])
         vertical = right[:, 1] - left[:, 1] + self.model.vertical(self.model.points(z)) @ self.parameters
         z = self.rows(z)
         new_right = np.column_stack([z[:, 2], z[:, 1] + vertical])
-        return replace(
-            features, uv_left=rectified_rig.unrectify_left(z[:, :2]), uv_right=rectified_rig.unrectify_right(new_right)
-        )
+        return rectified_rig.unrectify_left(z[:, :2]), rectified_rig.unrectify_right(new_right)
 
 
 @dataclass(frozen=True, eq=False)

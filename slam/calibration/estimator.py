@@ -29,14 +29,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
-_SPACING = 0.5  # cost: a new view is taken when the last one has lost this share of the features it may lose
-_FEW = 6  # with fewer pairs, an incomplete one counts provisionally
-_LATER = 1.25  # cost: an incomplete pair is solved again after so many times the frames: parallax grows no faster
-_MOST_ROWS = 250  # cost: features of a frame whose rows are used: more add little
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
-_CONFIGURED = 4  # number of pairs that the configured noise counts for
-_RARER = 20  # cost: after this many pairs every second frame is used, after twice as many every third, and so on
-_TURN = 0.05  # but at least one per rotation by this angle [rad]: turns are rare, and they alone show the focal length
 
 
 class SelfCalibration:
@@ -79,7 +72,7 @@ class SelfCalibration:
         self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
         self._solution = Solution(self._prior.mean, start, start, 1.0 if kept is None else kept.residual)
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
-        self._scattered = _CONFIGURED
+        self._scattered = 4  # 4: number of pairs that the configured noise counts for
         self._waiting: list[View] = []
         self._open: Evidence | None = None  # of a pair that is not complete
         self._frames, self._solved = 0, 0  # frames of the incomplete pair: now, and when last solved
@@ -142,6 +135,16 @@ class SelfCalibration:
             return features
         return self.applied.features(features)
 
+    def correct_again(self, corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:
+        """`correct` features that have moved since they were corrected: `now`, those of `before` that moved alone."""
+        if corrected is before:
+            return now
+        moved = (now.uv_left != before.uv_left) | (now.uv_right != before.uv_right)
+        rows = np.flatnonzero(moved.any(axis=1))
+        uv_left, uv_right = corrected.uv_left.copy(), corrected.uv_right.copy()
+        uv_left[rows], uv_right[rows] = self.applied.pixels(now.uv_left[rows], now.uv_right[rows])
+        return replace(now, uv_left=uv_left, uv_right=uv_right)
+
     def observe(self, features: StereoFeatures, T_world_left: Array) -> None:
         """Learn from one frame.
 
@@ -152,13 +155,15 @@ class SelfCalibration:
         if not self.config.enabled:
             return
         self._seen += 1
-        if self._seen % (1 + self.pairs // _RARER) and not self._has_turned(T_world_left):
+        # 20: after this many pairs every second frame is used, after twice as many every third, and so on
+        if self._seen % (1 + self.pairs // 20) and not self._has_turned(T_world_left):
             return
         self._looked = T_world_left
         view = View.of(self.model, features, T_world_left, _MOST_FEATURES)
         if len(view) < self.config.minimum_common:
             return
-        some = np.linspace(0, len(view) - 1, min(len(view), _MOST_ROWS)).astype(int)
+        # 250: features of a frame whose rows are used: more add little
+        some = np.linspace(0, len(view) - 1, min(len(view), 250)).astype(int)
         rows, fields = row_evidence(self.model, view.points[some], view.vertical[some], self._solution.mean)
         self._rows.add(rows)
         self._fields = fields if self._fields is None else self._fields + fields
@@ -171,7 +176,9 @@ class SelfCalibration:
         if self._looked is None:
             return True
         cosine = 0.5 * (np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) - 1)
-        return bool(cosine < np.cos(_TURN))
+        # 0.05: but at least one per rotation by this angle [rad]: turns are rare, and they alone show the focal
+        # length
+        return bool(cosine < np.cos(0.05))
 
     def _compare(self, view: View) -> None:
         """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""
@@ -179,7 +186,8 @@ class SelfCalibration:
         waiting = self._waiting
         newest = match(waiting[-1], view) if waiting else NO_MATCHES
         common = len(newest[0])
-        apart = not waiting or common < (1 - _SPACING * (1 - c.kept_share)) * len(waiting[-1])
+        # 0.5: a new view is taken when the last one has lost this share of the features it may lose
+        apart = not waiting or common < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
         ended = 0
         for first in waiting:
             matched = newest if first is waiting[-1] else match(first, view)
@@ -190,9 +198,10 @@ class SelfCalibration:
             evidence = self._evidence(first, view, matched) if n >= c.minimum_common else None
             if evidence is not None:
                 self._motion.add(evidence)
-        if waiting and not ended and self.pairs < _FEW:
+        if waiting and not ended and self.pairs < 6:  # 6: with fewer pairs, an incomplete one counts provisionally
             self._frames += 1
-            if self._frames >= _LATER * self._solved:
+            # 1.25: an incomplete pair is solved again after so many times the frames: parallax grows no faster
+            if self._frames >= 1.25 * self._solved:
                 self._open, self._solved = self._evidence(waiting[0], view, matched), self._frames
         else:
             self._open, self._frames, self._solved = None, 0, 0

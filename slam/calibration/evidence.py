@@ -8,8 +8,6 @@ import numpy as np
 
 from slam.geometry.se3 import Array
 
-_MOST_BLOCKS = 32  # cost: blocks of evidence kept separately, for their scatter
-_RANK = 1e-12  # numerics: least eigenvalue of an information that counts, as a share of the largest
 _PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts for
 
 
@@ -94,7 +92,7 @@ class Accumulator:
             self._blocks[-1] += evidence
         self._in_last += 1
         self.count += 1
-        if len(self._blocks) > _MOST_BLOCKS:
+        if len(self._blocks) > 32:  # 32: blocks of evidence kept separately, for their scatter
             self._join()
 
     def _join(self) -> None:
@@ -129,7 +127,8 @@ class Accumulator:
         if count < 2:
             return
         total_S, total_e = (sum(block[i] for block in self._blocks) for i in (0, 1))
-        own = mean + np.linalg.lstsq(total_S, total_e - total_S @ mean, rcond=_RANK)[0]
+        # 1e-12: least eigenvalue of an information that counts, as a share of the largest
+        own = mean + np.linalg.lstsq(total_S, total_e - total_S @ mean, rcond=1e-12)[0]
         scatter = terms = 0.0
         for S, e, _ in self._blocks:
             gradient = e - S @ own

@@ -17,7 +17,6 @@ from slam.geometry.se3 import Array
 
 #: Recordings agree in a parameter if they differ by less than this many standard deviations of the difference.
 AGREES = 2.0
-_SAYS = 1.0  # least information of a recording on a parameter, in units of the prior's, for it to be compared
 _DIFFERS = 3.0  # and disagree if by more than this many; differences between the two limits may be chance
 
 
@@ -102,7 +101,8 @@ def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic
         covariance = np.linalg.inv(np.linalg.inv(prior) + part.S)
         moved = recording.residual * covariance @ part.cross
         after = 1 / (np.diag(covariance) + residual_variance() * np.square(moved).sum(axis=1))
-        said = np.where(after - before > _SAYS * before, after - before, np.nan)
+        # 1.0: least information of a recording on a parameter, in units of the prior's, for it to be compared
+        said = np.where(after - before > 1.0 * before, after - before, np.nan)
         means.append(after * (covariance @ part.e) / said)
         informations.append(said)
     mean, own = np.array(means), 1 / np.array(informations)

@@ -30,7 +30,6 @@ _DEGREES = 5, 3
 RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
 _FIRST, _SECOND = np.array(RESIDUAL).T.copy()
 _SCALES = np.sqrt(2 * np.arange(max(_DEGREES) + 1) + 1)
-_BEYOND = 1.1  # polynomials are held constant beyond the image, this many half widths from its centre
 
 
 class RigModel:
@@ -144,7 +143,8 @@ class RigModel:
 
         out = np.empty((len(RESIDUAL), len(x)))
         at = np.ascontiguousarray(x), np.ascontiguousarray(y)
-        polynomials(*at, self._centre, self._half, _BEYOND, _SCALES, _FIRST, _SECOND, out)
+        # 1.1: polynomials are held constant beyond the image, this many half widths from its centre
+        polynomials(*at, self._centre, self._half, 1.1, _SCALES, _FIRST, _SECOND, out)
         return out.T
 
 

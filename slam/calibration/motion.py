@@ -18,11 +18,6 @@ from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, so3_exp
 
-_ITERATIONS = 20  # numerics: of Gauss-Newton at most
-_CONVERGED = 1e-3  # numerics: last change of a predicted point [px]; at 0.02 focal lengths were wrong by percents
-_NEARLY = 3e-3  # numerics: the same after the last iteration: in some pairs single points oscillate
-_EXACT = 1e-3  # numerics: least noise of pixels and disparities [px]
-
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -100,7 +95,7 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
 
     first, second = (np.ascontiguousarray(a, float) for a in (first, second))
     points, at = first, Linear.empty(len(first))
-    for _ in range(_ITERATIONS):
+    for _ in range(20):  # 20: of Gauss-Newton at most
         _linearise(first, second, points, R, t, focal, noise, at)
         distance = np.einsum("ni,ni->n", at.residual, at.residual)
         if not np.isfinite(distance).all():
@@ -115,9 +110,10 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
         R, t = so3_exp(step[:3]) @ R, t + step[3:]
         points = np.empty_like(first)
         last = move_points(first, at.J_point, at.J_motion, at.motion, at.white, at.residual, noise, step, points)
-        if last < _CONVERGED:
+        if last < 1e-3:  # 1e-3: last change of a predicted point [px]; at 0.02 focal lengths were wrong by percents
             break
-    return Fit(R, t, points, at, weights) if last < _NEARLY else None
+    # 3e-3: the same after the last iteration: in some pairs single points oscillate
+    return Fit(R, t, points, at, weights) if last < 3e-3 else None
 
 
 def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) -> Evidence | None:
@@ -163,7 +159,7 @@ def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
     squares = np.square(pair.second - moved) / growth
     squares = squares[np.isfinite(squares).all(axis=1)]
     found = np.array([median(squares[:, :2]), median(squares[:, 2])]) / chi_square_limit(1, 0.5)
-    return np.maximum(found, _EXACT**2)
+    return np.maximum(found, 1e-3**2)  # 1e-3: least noise of pixels and disparities [px]
 
 
 def parallax(model: RigModel, pair: Pair) -> float:

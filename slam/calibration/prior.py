@@ -22,9 +22,6 @@ SIGMAS = {
     "pitch": 0.014, "yaw": 0.02, "roll": 0.004, "down": 0.007, "forward": 0.02,
 }  # fmt: skip
 
-#: Root mean square over the image of errors that no lens model describes [focal lengths]: a fifth of a pixel at
-#: 1000 px.
-_RESIDUAL = 2e-4
 
 #: Possible scales of a rig's fields relative to that, equally probable a priori.
 RESIDUAL_SCALES = np.geomspace(0.05, 1.0, 7)
@@ -42,15 +39,11 @@ OFFSET = 7e-4
 #: focal length of 700 px, as reprojection errors would show larger ones. Such fields are smooth, so they have some ten
 #: independent values.
 FIELD = 1.4e-3
-_FREEDOM = 10  # independent values of such a field
 
 #: Error of the focal length common to both cameras, as the board's distance or curvature may compensate it [share].
 FOCAL = 0.005
 
-#: Scales of the prior, equally probable a priori: of all errors of a calibration, from none to as large as allowed.
-_SCALES = (0.02, 0.1, 0.3, 1.0)
 _OFFSETS = (0.03, 0.3, 1.0)  # the same of an offset of the disparity alone
-_FOCALS = (0.1, 1.0)  # the same of a common error of the focal lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +73,10 @@ def factory_prior(model: RigModel) -> Prior:
     """Prior of a calibration as delivered, by how calibrations are usually made."""
     spread = np.linalg.inv(prior_information(model))
     drift, zoom = (np.outer(sigma, sigma) for sigma in (offset_sigma(model), focal_sigma(model)))
-    scales, turned, zoomed = np.array(list(product(_SCALES, _OFFSETS, _FOCALS))).T
+    # (0.02, 0.1, 0.3, 1.0): Scales of the prior, equally probable a priori: of all errors of a calibration, from none
+    # to as large as allowed.
+    # (0.1, 1.0): the same of a common error of the focal lengths
+    scales, turned, zoomed = np.array(list(product((0.02, 0.1, 0.3, 1.0), _OFFSETS, (0.1, 1.0)))).T
     wide = [s[:, None, None] ** 2 * covariance for s, covariance in ((scales, spread), (turned, drift), (zoomed, zoom))]
     return Prior(np.zeros(len(model.names)), sum(wide))
 
@@ -108,7 +104,7 @@ def prior_information(model: RigModel) -> Array:
         change = changes / model.focal
         mean = change.mean(axis=0)
         information += np.outer(mean, mean) / sigma**2
-        information += change.T @ change * (_FREEDOM / (len(far) * FIELD**2))
+        information += change.T @ change * (10 / (len(far) * FIELD**2))  # 10: independent values of such a field
     return np.asarray(information)
 
 
@@ -124,7 +120,9 @@ def focal_sigma(model: RigModel) -> Array:
 
 def residual_variance() -> float:
     """Variance of each coefficient of the residual fields [focal lengths²]."""
-    return _RESIDUAL**2 / len(RESIDUAL)
+    # 2e-4: Root mean square over the image of errors that no lens model describes [focal lengths]: a fifth of a pixel
+    # at 1000 px.
+    return 2e-4**2 / len(RESIDUAL)
 
 
 def systematic_variance(model: RigModel, error: float) -> Array:

@@ -10,9 +10,6 @@ from slam.interfaces import Backend, RevisingBackend
 from slam.models import EstimatorModels
 from slam.rig_error import CommonError
 
-#: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
-_REVISION = 0.5
-
 
 class RemainingRigError:
     """Tracks the corrections with which a back end's measurements and path were made, and their uncertainty.
@@ -37,7 +34,9 @@ class RemainingRigError:
         For a back end that can revise, a change means processing all its measurements again, so it waits until the
         change is significant.
         """
-        return self._calibration.apply(_REVISION if isinstance(backend, RevisingBackend) else 0.0)
+        # 0.5: Change of the correction, in standard deviations of the disparities' error, for a back end to revise
+        # its past.
+        return self._calibration.apply(0.5 if isinstance(backend, RevisingBackend) else 0.0)
 
     def revise(self, backend: Backend, restarted: bool) -> Revision | None:
         """Correct a back end's earlier measurements, if it can revise them; returns the change, or None.

@@ -7,8 +7,6 @@ import numpy as np
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import Array, median
 
-_DEGREES = 4.0  # degrees of freedom of Student's t, with tails like those of matches, a few of which are wrong
-
 
 def student_weights(squared: Array, dof: int, least: float) -> Array:
     """Weights (N,) of residuals by Student's t distribution, as factors on their information.
@@ -21,4 +19,5 @@ def student_weights(squared: Array, dof: int, least: float) -> Array:
     if not len(squared):
         return squared
     scale = max(median(squared) / chi_square_limit(dof, 0.5), least**2)
-    return np.asarray((_DEGREES + dof) / (_DEGREES + squared / scale) / scale)
+    # 4.0: degrees of freedom of Student's t, with tails like those of matches, a few of which are wrong
+    return np.asarray((4.0 + dof) / (4.0 + squared / scale) / scale)

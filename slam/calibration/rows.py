@@ -9,8 +9,6 @@ from slam.calibration.model import RESIDUAL, RigModel
 from slam.calibration.robust import student_weights
 from slam.geometry.se3 import Array
 
-_LEAST_NOISE = 0.03  # of a row [px], the least that is believed
-
 
 def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> tuple[Evidence, Evidence]:
     """Likelihood of the parameters by one frame's vertical disparities, without and with residual fields.
@@ -27,7 +25,7 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
     """
     A, fields = model.vertical(points), model.residual_vertical(points)
     residual = vertical + A @ parameters
-    weights = student_weights(residual**2, 1, _LEAST_NOISE)[:, None]
+    weights = student_weights(residual**2, 1, 0.03)[:, None]  # 0.03: of a row [px], the least that is believed
     both = np.column_stack([A, fields[:, -len(RESIDUAL) :]])
     weighted, n = both * weights, A.shape[1]
     S, e = weighted.T @ both, -(weighted.T @ vertical)

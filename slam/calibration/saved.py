@@ -18,8 +18,6 @@ from slam.files import expanded, read_text, write_text
 from slam.geometry.rig import StereoRig
 
 _LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller
-_LARGEST = 1.0  # guard: correction [rad, focal lengths, 1] and variance that a file may hold
-_SAME = 1e-5  # guard: relative difference of numbers of the same calibration, written and read
 _NOT_KEPT = (
     "neither a file of `slam calibrate` nor the summary.json of a run; the calibration file of a rig belongs to the "
     "sequence: 'FOLDER?calibration=FILE'"
@@ -72,7 +70,8 @@ class RigNumbers:
     def difference(self, other: RigNumbers) -> str:
         """The first number that differs, in words; empty if none does."""
         for name, mine, theirs in zip(asdict(self), asdict(self).values(), asdict(other).values()):
-            if abs(mine - theirs) > _SAME * max(abs(mine), abs(theirs)):
+            # 1e-5: relative difference of numbers of the same calibration, written and read
+            if abs(mine - theirs) > 1e-5 * max(abs(mine), abs(theirs)):
                 return f"{name} {mine:g} there, {theirs:g} here"
         return ""
 
@@ -120,7 +119,8 @@ class SavedCalibration:
         posterior = RigPosterior.from_json(tree)
         if posterior.names != RigModel.names:
             raise CalibrationError("calibration: its parameters are not those of this version")
-        if max(np.abs(posterior.mean).max(), np.diag(posterior.covariance).max()) > _LARGEST:
+        # 1.0: correction [rad, focal lengths, 1] and variance that a file may hold
+        if max(np.abs(posterior.mean).max(), np.diag(posterior.covariance).max()) > 1.0:
             raise CalibrationError("calibration: a correction or its deviation is larger than the rig itself")
         symmetric = np.allclose(posterior.covariance, posterior.covariance.T, rtol=1e-6, atol=0)
         if not symmetric or np.linalg.eigvalsh(posterior.covariance).min() <= 0:

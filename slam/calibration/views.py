@@ -17,12 +17,8 @@ from slam.geometry.pnp import find_consensus
 from slam.geometry.se3 import Array, inverse
 
 _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
-_NEAREST = 1.0  # least disparity of a point that helps to find the motion [px]
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
 _EACH = _AGREES / np.sqrt(2)  # the same of each coordinate in each of the two views, all equally exact
-_FARTHEST = 16.3  # derived: χ²(3) at 99.9 %, largest squared distance of a match that agrees
-_REFITS = 2  # times that motion and inliers are recomputed
-_HYPOTHESES = 100  # cost: poses tried in the geometric check of a pair of views
 
 
 #: Rows of features in one view and in another, in pairs.
@@ -137,22 +133,25 @@ def pair_of(
     one, two = first.points[a], second.points[b]
     ideal = [p + model.shift(p, parameters) for p in (one, two)]
     T: Array = inverse(second.T_world_left) @ first.T_world_left
-    near = (ideal[0][:, 2] > _NEAREST) & (ideal[1][:, 2] > _NEAREST)
+    # 1.0: least disparity of a point that helps to find the motion [px]
+    near = (ideal[0][:, 2] > 1.0) & (ideal[1][:, 2] > 1.0)
     rig = model.rig.rectified.rig
     if near.sum() >= 3:
         before, after = (model.rows(p[near]) for p in ideal)
         local = rig.triangulate(before[:, :2], before[:, [2, 1]])
-        found = find_consensus(rig, local, after, inverse(T), _AGREES, _HYPOTHESES, seed)
+        # 100: poses tried in the geometric check of a pair of views
+        found = find_consensus(rig, local, after, inverse(T), _AGREES, 100, seed)
         T = np.asarray(inverse(found.T_world_left))
     R, t = T[:3, :3], T[:3, 3] / rig.baseline
     with np.errstate(all="ignore"):
         moved, J, _ = move(ideal[0], R, t, model.focal)
         agree = (np.abs(moved - ideal[1]) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
-    for _ in range(_REFITS):
+    for _ in range(2):  # 2: times that motion and inliers are recomputed
         fitted = fit_motion(ideal[0][agree], ideal[1][agree], R, t, model.focal, noise) if agree.sum() >= 3 else None
         if fitted is None:
             break
         R, t = fitted.R, fitted.t
         distance = squared_distance(ideal[0], ideal[1], R, t, model.focal, noise)
-        agree = distance <= _FARTHEST * median(distance[agree]) / chi_square_limit(3, 0.5)
+        # 16.3: χ²(3) at 99.9 %, largest squared distance of a match that agrees
+        agree = distance <= 16.3 * median(distance[agree]) / chi_square_limit(3, 0.5)
     return Pair(one[agree], two[agree], R, t)

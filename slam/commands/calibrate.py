@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from slam.commands.display import Progress
+from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import ConfigurationError
 from slam.files import noting_inputs
@@ -18,6 +19,7 @@ from slam.run.calibrating import Calibrated, Targets
 from slam.run.calibrating import calibrate as run
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
+from slam.settings import require_settable
 
 _COLUMNS = 3  # most recordings with a column of their own
 
@@ -44,6 +46,7 @@ def calibrate(
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
         raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
+    require_settable(settings, SystemConfig().to_json(), "surf")
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
     done = run(opened, targets, show, settings, frames, inputs)

@@ -157,11 +157,14 @@ def replay_command(
     from slam.commands.run import command_line, run_folder
     from slam.config import SystemConfig
     from slam.outputs import require_outputs
+    from slam.run.options import RunOptions
     from slam.run.recording import load_recording
-    from slam.run.runner import RunOptions, run_recording
+    from slam.run.runner import run_recording
+    from slam.settings import require_settable
 
     loaded, name = load_recording(recording), backend or "ekf"
     default = SystemConfig.for_kind(loaded.kind, None, name)
+    require_settable(settings or [], default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings or [])
     progress = Progress(len(loaded), _title(loaded, name), quiet)
     with run_folder(out, loaded.name, name) as folder:
@@ -198,7 +201,7 @@ def settings_command(
         str | None, typer.Argument(metavar="SECTION", help="A section, a setting, or a front end or back end.")
     ] = None,
 ) -> None:
-    """List all settings with default per kind of motion, unit, range and meaning."""
+    """List all settings with default per kind of motion, unit and meaning."""
     from slam.commands.settings import print_settings
 
     print_settings(section)
@@ -235,7 +238,7 @@ def compare_command(
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
     from slam.commands import compare as command
     from slam.compare.plan import Plan
-    from slam.run.runner import parse_frames
+    from slam.run.options import parse_frames
     from slam.sequences import with_mask
 
     sequences = [with_mask(text, mask) for text in sequences]
@@ -270,7 +273,7 @@ def calibrate_command(
     """Find what a rig's calibration is off by, from all its recordings together, and whether they agree."""
     from slam.commands.calibrate import calibrate
     from slam.run.calibrating import Targets
-    from slam.run.runner import parse_frames
+    from slam.run.options import parse_frames
     from slam.sequences import with_mask
 
     sequences = [with_mask(text, mask) for text in sequences]
@@ -291,7 +294,7 @@ def render_command(
     from slam.commands.display import counting
     from slam.files import noting_inputs
     from slam.outputs import Output, require_outputs
-    from slam.run.runner import parse_frames
+    from slam.run.options import parse_frames
     from slam.sequences import open_sequence
     from slam.worlds.export import FOLDER, require_world, write_euroc
 

@@ -13,9 +13,11 @@ from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
 from slam.compare.sweep import Run, check, sweep
 from slam.compare.tables import groups, write_tables
 from slam.compare.wording import beforehand
+from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.runtime.cores import available_cores
 from slam.sequences.faults import said_before
+from slam.settings import require_settable
 
 _QUICK_FRAMES, _QUICK_TRIALS = 30, 2
 _MOST_WORKERS = 1024
@@ -30,12 +32,14 @@ def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Seq
     """Front ends by name and variants by their texts; `settings` hold for all.
 
     Raises:
-        ConfigurationError: a variant is not of its form.
+        ConfigurationError: a variant is not of its form, or has a setting that users cannot set.
     """
     named = [Variant(name, name, tuple(settings)) for name in frontends]
-    return (*named, *(parse_variant(text, tuple(settings)) for text in variants)) or (
-        Variant("surf", "surf", tuple(settings)),
-    )
+    every = (*named, *(parse_variant(text, tuple(settings)) for text in variants))
+    every = every or (Variant("surf", "surf", tuple(settings)),)
+    for variant in every:
+        require_settable(variant.settings, SystemConfig().to_json(), variant.frontend)
+    return every
 
 
 def quick(plan: Plan) -> Plan:

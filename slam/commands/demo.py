@@ -13,11 +13,11 @@ from slam.files import write_png
 from slam.outputs import Output, require_outputs
 from slam.registry import ONLINE
 from slam.run.drawing import draw_objects, with_legend
-from slam.run.figures import draw_map_3d
+from slam.run.options import RunOptions
 from slam.run.outputs import NAMES, write_json
 from slam.run.plots import plot
 from slam.run.run_data import RunData
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.sequences import open_sequence
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.
@@ -26,15 +26,15 @@ _WHY = """The demo's cameras differ from their calibration as real ones do: by 0
 focal length, the right one turned by 0.7 mrad. Covariances count such errors;
 with exact cameras they would be too large."""
 
-#: The picture to be opened first, and the others.
-_FIRST, _FRAME, _TOP, _MAP = "summary.png", "frame.png", "top_view.png", "map_3d.png"
+#: The picture to be opened first, and the other one.
+_FIRST, _FRAME = "summary.png", "frame.png"
 
 
 def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -> list[dict[str, Any]]:
     """Run the demo; returns the runs' summaries, which are also in ``summary.json`` of each run's folder.
 
-    Leaves a folder per back end with the files of a run, ``comparison.json``, and the pictures ``summary.png``,
-    ``frame.png`` (the last frame in which the box was measured), ``top_view.png`` and ``map_3d.png``.
+    Leaves a folder per back end with the files of a run, ``comparison.json``, and the pictures ``summary.png`` and
+    ``frame.png`` (the last frame in which the box was measured).
 
     Args:
         out: folder for everything.
@@ -45,7 +45,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     Raises:
         SlamError: a file cannot be written, or is there already.
     """
-    own = Output(out, "--out", ["comparison.json", _FIRST, _FRAME, _TOP, _MAP])
+    own = Output(out, "--out", ["comparison.json", _FIRST, _FRAME])
     require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)
 
     world = _WORLD.format(frames)
@@ -65,8 +65,6 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
                 summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
     write_json(out / "comparison.json", {"runs": summaries})
     runs = [RunData.read(out / backend, backend) for backend in ONLINE]
-    plot(runs, out / _TOP, "map")
-    draw_map_3d(runs, out / _MAP)
     plot(runs, out / _FIRST)
     last = shown.get(True, shown.get(False))
     if last is not None:

@@ -16,10 +16,11 @@ from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
 from slam.run import drawing
 from slam.run import viewer as viewing
+from slam.run.options import RunOptions, parse_frames
 from slam.run.repeat import Origin, Repeat, changed_versions, load, versions
-from slam.run.runner import RunOptions, parse_frames
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
+from slam.settings import require_settable
 
 _BACKEND, _FRONTEND = "ekf", "surf"
 RESULTS = Path("results")
@@ -64,6 +65,7 @@ def prepare(
     chosen = SystemConfig.for_kind(kind, frontend, backend)
     if before is not None:
         chosen = _repeated(before, chosen, frontend, backend)
+    require_settable(settings, chosen.to_json(), frontend)
     chosen = chosen.with_settings([*(["map.monocular=true"] if mono else []), *settings])
     if frames is not None:
         start, stop = parse_frames(frames)

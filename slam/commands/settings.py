@@ -1,4 +1,4 @@
-"""``slam settings``: every setting with its default, unit, range and meaning."""
+"""``slam settings``: every setting with its default, unit and meaning."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def listing(wanted: str | None, width: int) -> str:
             title = _title(setting)
             lines += ["", *wrap(title, width)]
         lines += [*_entry(setting, width)]
-    note = "Change one with --set KEY=VALUE. Ranges hold while the other settings have their defaults."
+    note = "Change one with --set KEY=VALUE."
     return "\n".join([*lines[1:], "", *wrap(note, width)])
 
 
@@ -60,11 +60,7 @@ def _entry(setting: Setting, width: int) -> Iterator[str]:
     first, *others = setting.defaults.items()
     line = f"  {setting.key} = {_typed(first[1])}{unit}"
     line += "".join(f"; {kind}: {_typed(value)}" for kind, value in others if value != first[1])
-    if len(line) + len(setting.range) + 2 <= width:
-        yield line + setting.range.rjust(width - len(line))
-    else:
-        yield line
-        yield setting.range.rjust(width)
+    yield line
     yield from wrap(setting.text, width, initial_indent="      ", subsequent_indent="      ")
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from slam.compare.measure import figures
 from slam.data import FrameResult, IdArray
 from slam.evaluation.association_truth import SurfacePoints
 from slam.evaluation.consistency import stretch_nees
@@ -17,6 +16,7 @@ from slam.geometry.alignment import Alignment
 from slam.geometry.se3 import Array, inverse, nearest_rotation, rotation_angle
 from slam.geometry.stamps import pair
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.run.results import figures
 from slam.run.summary import RunRecord
 from slam.sequences import Sequence
 
@@ -34,7 +34,7 @@ class Measured:
     """A finished run in numbers.
 
     Attributes:
-        metrics: by key of `slam.compare.measure.METRICS`, and ``object …`` figures; what cannot be said of this
+        metrics: by key of `slam.run.results.METRICS`, and ``object …`` figures; what cannot be said of this
             sequence is left out.
         milliseconds: median per stage and ``total`` over all frames but the first.
         series: a row per frame that has a pose, of `SERIES_COLUMNS`; errors are NaN where there is no truth or the pose

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slam.compare.collect import SERIES_COLUMNS
-from slam.compare.measure import Metric
 from slam.compare.plan import is_world
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
@@ -22,6 +21,7 @@ from slam.files import read_numbers
 from slam.geometry.se3 import Array
 from slam.run.figures import place_of_truth, well_known
 from slam.run.plots import drawn
+from slam.run.results import Metric
 from slam.run.run_data import RunData
 from slam.run.style import backend_colours
 

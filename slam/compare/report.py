@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from slam.compare import figures, wording
-from slam.compare.measure import COMPLETED, Metric, number
 from slam.compare.plan import Plan
 from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_figures, run_head
 from slam.files import read_object, write_text
-from slam.run.style import stage_name, stages
+from slam.run.results import COMPLETED, Metric, number
+from slam.run.schema import STAGE_NAMES
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -177,14 +177,15 @@ def _cells(d: Difference) -> dict[str, str]:
 def _times(every: Sequence[Group]) -> dict[str, Any]:
     """What the stages do, and a row of medians per group and back end."""
     runs = [run for group in every for rs in group.runs.values() for run in rs]
-    known = ["total", *stages(stage for run in runs for stage in run.milliseconds)]
+    timed = {stage for run in runs for stage in run.milliseconds}
+    known = ["total", *(stage for stage in STAGE_NAMES if stage in timed)]
     rows = []
     for group in every:
         for backend, own in group.runs.items():
             values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in known)
             cells = (f"{np.median(each):.2f}" if each else "–" for each in values)
             rows.append((group.sequence, group.variant.name, group.mode, backend, *cells))
-    return {"stages": ["whole frame", *map(stage_name, known[1:])], "times": rows}
+    return {"stages": ["whole frame", *map(STAGE_NAMES.get, known[1:])], "times": rows}
 
 
 def _settings(every: Sequence[Group]) -> str:

@@ -19,8 +19,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from slam.compare.measure import Metric
 from slam.geometry.se3 import Array
+from slam.run.results import Metric
 
 #: Of confidence intervals.
 LEVEL = 0.95

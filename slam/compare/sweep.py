@@ -51,7 +51,7 @@ class Run:
     Attributes:
         trial: what was run.
         outcome: ``"completed"``, or ``"failed: …"`` with the reason.
-        metrics: figures by key of `slam.compare.measure.METRICS`; none where it failed.
+        metrics: figures by key of `slam.run.results.METRICS`; none where it failed.
         milliseconds: median per stage.
         folder: its files.
     """

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.compare.measure import BY_KEY, COMPLETED, METRICS, UNTRACKED, Metric, object_metric
 from slam.compare.plan import Plan, Variant
 from slam.compare.statistics import Difference, adjusted, difference, interval
 from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
 from slam.run.outputs import csv_rows
+from slam.run.results import BY_KEY, COMPLETED, METRICS, UNTRACKED, Metric, object_metric
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
+from slam.run.options import RunOptions
 from slam.run.recording import load_recording
-from slam.run.runner import RunOptions, run, run_recording
+from slam.run.runner import run, run_recording
 from slam.sequences import Sequence, open_sequence
 from slam.sequences.faults import said_before
 from slam.worlds import WorldSequence

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.compare.measure import Metric
 from slam.compare.plan import REPLAY
 from slam.compare.statistics import ALPHA, FEWEST, HINT_ALPHA, LEVEL, Difference, Verdict, fewest
 from slam.evaluation.metrics import chi_square_band
+from slam.run.results import Metric
 
 #: A verdict as a badge has it, in the report and on the terminal.
 WORDS = {
@@ -98,19 +98,6 @@ def in_short(differences: Sequence[Difference], reference: str, other: str) -> s
         if names := [f"{_name(d.metric)} ({WORDS[d.verdict]})" for d in told if d.better is better]:
             parts.append(f"{first} is better than {second} in {', '.join(names)}")
     return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
-
-
-def sentence(d: Difference, reference: str, other: str) -> str:
-    """What may be said of one difference."""
-    trials = "one trial" if d.pairs == 1 else f"{d.pairs} trials"
-    if d.verdict is Verdict.NONE:
-        return f"{d.metric.label}: no trial in which both {reference} and {other} have it."
-    said = f"{_brief(d)}, from {reference} to {other}, mean of {trials}"
-    if not direction(d):
-        return f"{said}: no difference can be concluded." if d.metric.better else f"{said}."
-    interval = f"; {round(100 * LEVEL)} % interval {shown_interval(d, ' to ')}" if np.isfinite(d.low) else ""
-    p = f", p {shown_p(d.p)}, adjusted {shown_p(d.p_holm)}" if d.varies else ""
-    return f"{said}{interval}{p}: {direction(d)}, {STRENGTH[d.verdict]}."
 
 
 def is_trifle(d: Difference) -> bool:
@@ -208,35 +195,39 @@ def measurements(mode: str, reference: str) -> str:
 # ------------------------------------------------------------------------------------------- numbers for people
 
 
-def shown_mean(d: Difference) -> str:
-    """The mean difference for people, with the digits of its interval.
+def shown(value: float, like: float | None = None) -> str:
+    """A number with the digits that show three of `like`, or of itself, six behind the point at most; else a dash."""
+    if not np.isfinite(value):
+        return "–"
+    like = abs(value if like is None else like)
+    digits = min(6, max(0, 2 - int(np.floor(np.log10(like))))) if like else 0
+    return f"{value:.{digits}f}".replace("-", "−")
 
-    Of figures that should be one it is the ratio of the factors by which they are off.
-    """
+
+def shown_mean(d: Difference) -> str:
+    """The mean difference for people; of figures that should be one, the ratio of the factors by which they are off."""
     if d.metric.better == "one" and np.isfinite(d.mean):
         return f"× {10**d.mean:.3f}"
-    if not np.isfinite(d.low):
-        return d.metric.show(d.mean)
-    return _fixed(d.metric.scale * d.mean, decimals(d.metric.scale * max(abs(d.low), abs(d.high))))
+    return shown(d.metric.scale * d.mean, _widest(d)) if np.isfinite(d.low) else d.metric.show(d.mean)
 
 
-def shown_interval(d: Difference, between: str = " … ") -> str:
+def shown_interval(d: Difference) -> str:
     """The bounds of its interval, with as many digits as the larger one needs; a dash where there is none."""
     if not np.isfinite(d.low):
         return "–"
     if d.metric.better == "one":
-        return f"{10**d.low:.3f}{between}{10**d.high:.3f}"
-    digits = decimals(d.metric.scale * max(abs(d.low), abs(d.high)))
-    return between.join(_fixed(d.metric.scale * bound, digits) for bound in (d.low, d.high))
+        return f"{10**d.low:.3f} … {10**d.high:.3f}"
+    return " … ".join(shown(d.metric.scale * bound, _widest(d)) for bound in (d.low, d.high))
+
+
+def _widest(d: Difference) -> float:
+    return d.metric.scale * max(abs(d.low), abs(d.high))
 
 
 def shown_spread(metric: Metric, mean: float, sd: float) -> tuple[str, str]:
     """Mean and standard deviation for people, with as many digits as the mean needs; empty where there is none."""
-    if not np.isfinite(mean):
-        return "–", ""
-    digits = decimals(metric.scale * mean)
-    spread = f"± {_fixed(metric.scale * sd, digits)}" if np.isfinite(sd) else ""
-    return _fixed(metric.scale * mean, digits), spread
+    mean, sd = metric.scale * mean, metric.scale * sd
+    return shown(mean), f"± {shown(sd, mean)}" if np.isfinite(mean) and np.isfinite(sd) else ""
 
 
 def shown_p(p: float) -> str:
@@ -244,15 +235,6 @@ def shown_p(p: float) -> str:
     if not np.isfinite(p):
         return "–"
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
-
-
-def decimals(value: float) -> int:
-    """Digits after the point that show three of a value; at most six."""
-    return min(6, max(0, 2 - int(np.floor(np.log10(abs(value)))))) if value else 0
-
-
-def _fixed(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}".replace("-", "−")
 
 
 def _name(metric: Metric) -> str:
@@ -267,7 +249,7 @@ def _brief(d: Difference) -> str:
 
 
 def _shown(d: Difference, value: float) -> str:
-    return shown_spread(d.metric, value, np.nan)[0]
+    return shown(d.metric.scale * value)
 
 
 def _apart(d: Difference) -> str:

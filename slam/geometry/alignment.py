@@ -10,9 +10,7 @@ from slam.errors import TrajectoryError
 from slam.geometry.se3 import Array, nearest_rotation, so3_exp
 from slam.geometry.trajectory import Trajectory
 
-_FARTHEST = 1e100  # guard: position [m] whose square is a number
 _STILL = 1e-12  # numerics: [m²] product of the two spreads: less than a micrometre each is no motion
-_COLLINEAR = 1e-12  # numerics: second singular value by the first, below which positions lie on a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +57,9 @@ def align_positions(
     source, target = np.asarray(source, float), np.asarray(target, float)
     if source.shape != target.shape or source.ndim != 2 or not len(source):
         raise TrajectoryError(f"alignment: positions {source.shape} and {target.shape} do not go together")
-    if not (np.abs(source).max() <= _FARTHEST and np.abs(target).max() <= _FARTHEST):
+    if not (
+        np.abs(source).max() <= 1e100 and np.abs(target).max() <= 1e100
+    ):  # 1e100: position [m] whose square is a number
         raise TrajectoryError("alignment: a position is not finite, or impossibly large")
     centre_s, centre_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - centre_s, target - centre_t
@@ -69,7 +69,8 @@ def align_positions(
     if np.sqrt((s**2).mean() * (t**2).mean()) < _STILL or d[0] < _STILL:
         rank, R = 0, nearest_rotation_any(guide)
     else:
-        rank = int((d > _COLLINEAR * d[0]).sum())
+        # 1e-12: second singular value by the first, below which positions lie on a line
+        rank = int((d > 1e-12 * d[0]).sum())
         R = U @ _reflection(U, Vt) @ Vt
         if rank == 1 and dimensions == 3:
             R = _turn_about(U[:, 0], R, guide)

@@ -17,8 +17,6 @@ BoolArray = NDArray[np.bool_]
 #: Places in arrays: row or slot numbers.
 IndexArray = NDArray[np.intp]
 
-_MANY = 500  # cost: NumPy is quicker with more
-
 
 def narrowed(values: np.ndarray, dtype: type[np.floating[Any]]) -> NDArray[Any]:
     """The values in a smaller floating-point type; those below its range become 0, also where NumPy is to raise."""
@@ -28,7 +26,7 @@ def narrowed(values: np.ndarray, dtype: type[np.floating[Any]]) -> NDArray[Any]:
 
 def isin(ids: IdArray | IndexArray, others: IdArray | IndexArray) -> BoolArray:
     """Which of `ids` (N,) are among `others` (M,): ``np.isin``, which takes several times as long for so few."""
-    if len(ids) + len(others) > 2 * _MANY:
+    if len(ids) + len(others) > 2 * 500:  # 500: NumPy is quicker with more
         return np.isin(ids, others)
     return np.fromiter(map(set(others.tolist()).__contains__, ids.tolist()), bool, len(ids))
 

@@ -15,15 +15,7 @@ from slam.geometry.se3 import Array
 #: Distortion models and the number of coefficients each accepts.
 DISTORTION_MODELS = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
 
-_MOST = 1e9  # guard: of a calibration's numbers
 _WIDEST = 100_000  # guard: width or height [px]
-
-#: guard: largest distance of a principal point from the middle of an image, as a share of its width or height. That
-#: of a calibration for images half or twice as large is off by a quarter or a half.
-_OFF_MIDDLE = 0.2
-
-_UNDISTORT_ITERATIONS = 50  # numerics: of the fixed point at most; usual lenses need fewer than ten
-_UNDISTORT_TOLERANCE = 1e-13  # numerics: in normalised coordinates: 1e-10 px at any usual focal length
 
 
 @dataclass(frozen=True)
@@ -58,7 +50,7 @@ class PinholeCamera:
         values = (self.fu, self.fv, self.u0, self.v0, *self.distortion)
         if not all(isinstance(v, numbers.Real) for v in (*values, self.width, self.height)):
             raise CalibrationError(f"camera calibration is not of numbers: {values}")
-        if not all(-_MOST <= v <= _MOST for v in values):
+        if not all(-1e9 <= v <= 1e9 for v in values):  # 1e9: of a calibration's numbers
             raise CalibrationError(f"camera calibration is not finite, or impossibly large: {values}")
         if self.fu <= 0 or self.fv <= 0:
             raise CalibrationError(f"focal lengths must be positive, got fu={self.fu}, fv={self.fv}")
@@ -214,7 +206,9 @@ def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     """What is wrong with a principal point far from the middle of the images; empty if it is near."""
     for side, camera in (("left", left), ("right", right)):
         point, middle = np.array([camera.u0, camera.v0]), np.array([camera.width, camera.height]) / 2
-        if (np.abs(point - middle) > 2 * _OFF_MIDDLE * middle).any():
+        # 0.2: largest distance of a principal point from the middle of an image, as a share of its width or height.
+        # That of a calibration for images half or twice as large is off by a quarter or a half.
+        if (np.abs(point - middle) > 2 * 0.2 * middle).any():
             return (
                 f"the principal point of the {side} camera, ({point[0]:.0f}, {point[1]:.0f}) px, is far from the "
                 f"middle of the images, ({middle[0]:.0f}, {middle[1]:.0f}) px: is the calibration for images of "
@@ -240,13 +234,13 @@ def _undistort_equidistant(target: Array, coefficients: Array) -> Array:
     k1, k2, k3, k4 = coefficients
     theta_d = np.hypot(target[:, 0], target[:, 1])
     theta = np.minimum(theta_d, 1.5)
-    for _ in range(_UNDISTORT_ITERATIONS):
+    for _ in range(50):  # 50: of the fixed point at most; usual lenses need fewer than ten
         t2 = theta * theta
         value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
         slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
         step = (value - theta_d) / slope
         theta = theta - step
-        if not (np.abs(step) > _UNDISTORT_TOLERANCE).any():
+        if not (np.abs(step) > 1e-13).any():  # 1e-13: in normalised coordinates: 1e-10 px at any usual focal length
             break
     with np.errstate(invalid="ignore"):
         good = (np.abs(step) < 1e-9) & (theta < np.pi / 2 - 1e-6) & (theta >= 0)

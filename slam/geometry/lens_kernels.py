@@ -6,10 +6,6 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-_ITERATIONS = 50  # numerics: Newton steps at most
-_TOLERANCE = 1e-13  # numerics: a step below it is the last
-_GOOD = 1e-9  # numerics: a last step above it means that no ray leads to the pixel
-
 
 @kernel
 def distort(ab, coefficients, limit, jacobian):
@@ -39,15 +35,16 @@ def undistort(target, coefficients, limit):
     out, D = np.empty_like(target), np.empty((2, 2))
     for i in range(len(target)):
         a, b, step = target[i, 0], target[i, 1], np.inf
-        for _ in range(_ITERATIONS):
+        for _ in range(50):  # 50: Newton steps at most
             x, y = _distorted(coefficients, a, b, D)
             x, y = x - target[i, 0], y - target[i, 1]
             det = D[0, 0] * D[1, 1] - D[0, 1] * D[1, 0]
             da, db = (D[1, 1] * x - D[0, 1] * y) / det, (D[0, 0] * y - D[1, 0] * x) / det
             a, b, step = a - da, b - db, max(abs(da), abs(db))
-            if not step > _TOLERANCE:
+            if not step > 1e-13:  # 1e-13: a step below it is the last
                 break
-        if not (step < _GOOD and np.sqrt(a * a + b * b) <= limit):
+        # 1e-9: a last step above it means that no ray leads to the pixel
+        if not (step < 1e-9 and np.sqrt(a * a + b * b) <= limit):
             a = b = np.nan
         out[i, 0], out[i, 1] = a, b
     return out

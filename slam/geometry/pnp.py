@@ -17,12 +17,9 @@ from slam.geometry.se3 import Array, exp, inverse, points_by_pose
 #: fixed: Stereo points that fix a pose.
 MINIMAL_POINTS = 3
 
-_REFINEMENTS = 3  # numerics: Gauss-Newton steps on each minimal set
 CLEAR_MAJORITY = 0.7  #: share of the matches that agree with the guess at which no other pose is tried
-_POLISHING_ROUNDS = 5  # numerics: of least squares on what agrees, at most
 STEPS = 10  #: numerics: of Gauss-Newton at most, from the last pose; it converges quadratically
 _BATCH = 50  # cost: hypotheses tried at once
-_APPROACHES = 3  # numerics: steps towards the better half of the matches, from a guess that is far off
 _ENOUGH = 100  # cost: matches that fix a pose far better than is needed to tell which others agree
 _CONVERGED = 1e-4  # numerics: step [rad], [m] after which the pose has converged, to far less than that
 
@@ -112,7 +109,7 @@ def _best_hypothesis(
 def _polish(rig: StereoRig, points: Array, measured: Array, T: Array, threshold: float) -> PoseConsensus:
     """Least squares on the matches that agree with a pose, repeated while their number grows."""
     inliers = _agreement(rig, points, measured, T[None], threshold)[0]
-    for _ in range(_POLISHING_ROUNDS):
+    for _ in range(5):  # 5: of least squares on what agrees, at most
         if inliers.sum() < MINIMAL_POINTS:
             break
         better = _refined(rig, points, measured, _some(inliers)[None], T[None], STEPS)[0]
@@ -128,7 +125,7 @@ def _polish(rig: StereoRig, points: Array, measured: Array, T: Array, threshold:
 
 def _approach(rig: StereoRig, points: Array, measured: Array, T: Array) -> Array:
     """A pose (4, 4) nearer to the better half of the matches, where the guess is too far off for any."""
-    for _ in range(_APPROACHES):
+    for _ in range(3):  # 3: steps towards the better half of the matches, from a guess that is far off
         error = _errors(rig, points, measured, T[None])[0]
         good = np.isfinite(error)
         if good.sum() < MINIMAL_POINTS:
@@ -173,7 +170,8 @@ def _minimal_poses(rig: StereoRig, points: Array, measured: Array, triples: NDAr
     triples = triples[good]
     if not len(triples):
         return np.zeros((0, 4, 4))
-    poses = _refined(rig, points, measured, triples, rigid_fit(local[triples], points[triples]), _REFINEMENTS)
+    # 3: Gauss-Newton steps on each minimal set
+    poses = _refined(rig, points, measured, triples, rigid_fit(local[triples], points[triples]), 3)
     return poses[np.isfinite(poses).all(axis=(1, 2))]
 
 

@@ -72,7 +72,8 @@ def gauss_newton(camera, R_left, points, z, whitener, rows, information, prior, 
     local, by_local = np.empty(3), np.empty((3, 3))
     H, step = np.empty((6, 6)), np.empty(6)
     for h in range(len(poses)):
-        off[:] = prior
+        for i in range(6):  # a slice would take longer to compile
+            off[i] = prior[i]
         for _ in range(steps):
             for i in range(6):
                 step[i] = 0.0

@@ -12,11 +12,7 @@ from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera, size_doubt
 from slam.geometry.se3 import Array, nearest_rotation
 
-_LONGEST = 1e6  # guard: baseline [m]
-
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
-
-_FISHEYE_ZOOM = 0.7  # focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
 
 
 def quarter_turn(turns: int) -> Array:
@@ -60,7 +56,7 @@ class StereoRig:
             raise CalibrationError("stereo extrinsics must be a finite (3, 3) rotation and (3,) translation")
         if np.abs(R).max() > 1.1 or np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
             raise CalibrationError("stereo extrinsics: R is not a rotation matrix")
-        if np.abs(b).max() > _LONGEST:
+        if np.abs(b).max() > 1e6:  # 1e6: baseline [m]
             raise CalibrationError(f"stereo baseline is impossibly long: {b.tolist()} m")
         if (self.left.width, self.left.height) != (self.right.width, self.right.height):
             raise CalibrationError(
@@ -356,7 +352,8 @@ def rectify(rig: StereoRig) -> RectifiedRig:
     f = float(P_left[0, 0])
     if rig.left.model == "equidistant":
         # A flat image cannot hold a fisheye's whole view: keep the middle at a useful resolution instead.
-        f = max(f, _FISHEYE_ZOOM * rig.left.fu)
+        # 0.7: focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
+        f = max(f, 0.7 * rig.left.fu)
         P_left[0, 2], P_left[1, 2] = (rig.width - 1) / 2, (rig.height - 1) / 2
         P_right[0, 2] = P_left[0, 2]
     if not (np.isfinite(P_left).all() and np.isfinite(P_right).all() and 0.05 * rig.left.fu < f < 20 * rig.left.fu):

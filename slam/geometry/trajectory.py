@@ -201,6 +201,8 @@ class TruthNoise:
             pose.
         mounting: standard deviation of a rotation between the truth's axes and the camera's [rad] that is the same in
             all poses: how the other sensor is mounted, and its own slow errors.
+        lever: likewise, of each coordinate of the camera's place beside the other sensor [m].
+        clock: likewise, of the time by which the other sensor's clock is ahead [s].
         wheels: the camera is on a vehicle that does not slip sideways, and looks ahead.
     """
 
@@ -208,6 +210,8 @@ class TruthNoise:
     translation: float = 0.0
     time: float = 0.0
     mounting: float = 0.0
+    lever: float = 0.0
+    clock: float = 0.0
     wheels: bool = False
 
     @property

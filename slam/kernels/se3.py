@@ -10,10 +10,6 @@ import numpy as np
 from slam.kernels.linear import row_times
 from slam.runtime.compilation import helper
 
-_SMALL = 1e-5  # numerics: below this angle [rad] series are exact to double precision
-_SMALL_CUBIC = 1e-2  # numerics: the same where a difference of third order is taken
-_SMALL_SINE = 1e-6  # numerics: sine of an angle below which the logarithm's series are exact
-
 
 @helper
 def transform(T, point, out):
@@ -57,9 +53,9 @@ def exp(step, out):
     t2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
     t = np.sqrt(t2)
     a, b, c = 1 - t2 / 6, 0.5 - t2 / 24, 1 / 6 - t2 / 120 + t2 * t2 / 5040
-    if t >= _SMALL:
+    if t >= 1e-5:  # 1e-5: below this angle [rad] series are exact to double precision
         a, b = np.sin(t) / t, 2 * np.sin(0.5 * t) ** 2 / t2
-    if t >= _SMALL_CUBIC:
+    if t >= 1e-2:  # 1e-2: the same where a difference of third order is taken
         c = (t - np.sin(t)) / (t * t2)
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -74,9 +70,12 @@ def exp(step, out):
 @helper
 def move(T, step):
     """``T ← T exp ξ`` by a tangent vector (6,)."""
-    change = np.empty((3, 4))
+    change, before = np.empty((3, 4)), np.empty((4, 4))
     exp(step, change)
-    compose(T.copy(), change, T)
+    for i in range(4):  # `copy` takes longer to compile
+        for j in range(4):
+            before[i, j] = T[i, j]
+    compose(before, change, T)
 
 
 @helper
@@ -90,7 +89,7 @@ def rotation_vector(R, w, inverse_J):
     sine = np.sqrt(a * a + b * b + c * c)
     angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1))
     scale, bend = 1.0, 1 / 12
-    if not sine < _SMALL_SINE:
+    if not sine < 1e-6:  # 1e-6: sine of an angle below which the logarithm's series are exact
         scale, half = angle / sine, 0.5 * angle
         bend = (1 - half / np.tan(half)) / (4 * half * half)
     x, y, z = scale * a, scale * b, scale * c

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_not_negative
@@ -27,15 +28,9 @@ class MapConfig:
             time the camera sees the same place.
         forget_after: landmarks not measured for this many frames are erased wherever they are, so that no place is
             ever recognised; 0 for never.
-        view_margin: distance from the image's border [px] within which a landmark may go undetected.
-        occlusion_radius: a landmark is taken to be hidden if most features within this radius of it [px] are nearer
-            to the camera; 0 for never.
-        same_distance: landmarks closer together than this [m], or than stereo can tell apart, are merged if their
-            descriptors are alike.
-        same_descriptor: largest descriptor distance at which landmarks are merged.
         descriptor_update: weight of the newest descriptor in a landmark's descriptor; 1 keeps the last, 0 the first.
         lost_after: the camera is lost after this many frames without a match, if the predicted pixels are less certain
-            than `association.tight_window`.
+            than `AssociationConfig.tight_window`.
         restart_after: after this many unmatched frames with enough features to be localised in a known place, a new map
             begins at the predicted pose; again after as many more.
         max_landmarks: largest size of the map; beyond it, the landmarks measured longest ago are erased.
@@ -52,15 +47,20 @@ class MapConfig:
     confirmed: int = 6
     spacing: float = 0.1
     forget_after: int = 0
-    view_margin: float = 16.0
-    occlusion_radius: float = 12.0
-    same_distance: float = 0.02
-    same_descriptor: float = 0.4
     descriptor_update: float = 0.0
     lost_after: int = 5
     restart_after: int = 5
     max_landmarks: int = 1000
     monocular: bool | None = None
+
+    #: Distance from the image's border [px] within which a landmark may go undetected.
+    view_margin: ClassVar[float] = 16.0
+    #: A landmark is taken to be hidden if most features within this radius of it [px] are nearer to the camera.
+    occlusion_radius: ClassVar[float] = 12.0
+    #: Landmarks closer together than this [m], or than stereo can tell apart, are merged if descriptors are alike.
+    same_distance: ClassVar[float] = 0.02
+    #: Largest descriptor distance at which landmarks are merged.
+    same_descriptor: ClassVar[float] = 0.4
 
     __pydantic_config__ = FORBID_UNKNOWN
 

@@ -10,9 +10,11 @@ import hashlib
 import io
 import json
 import zipfile
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +24,9 @@ from slam.checks import FARTHEST_POSITION, MOST_ID
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
 from slam.files import read_bytes, whole_file
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, nearest_rotation
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.atlas.saved import ATLAS_TYPES, from_arrays, to_arrays
 from slam.mapping.known_landmarks import require_known
 from slam.showing import count
 from slam.tracks.table import LandmarkTable
@@ -49,11 +50,79 @@ FIRST_FRAME = "left camera at the first frame"
 
 _LARGEST = 2**31  # bytes of a file
 _MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # guard: of descriptors
+_GREATEST = 1e12  # guard: entry of a covariance [rad², m²], and time [s]
+_TURNED = 1e-6  # guard: largest deviation from a rotation matrix
+_FAR, _HALF = FARTHEST_POSITION, 65504.0  # guard: [m]; the largest half float
 
-_TYPES = {
-    "ids": np.int64, "positions": np.float64, "covariances": np.float64, "descriptors": np.float32,
-    "laplacian": np.int8, "seen": np.int64, "in_view": np.int64, "seen_from": np.float64,
+
+class _Kind(NamedTuple):
+    """What an array must be.
+
+    Attributes:
+        dtype: of its entries.
+        shape: a letter for each size that other arrays share, a figure for each that is fixed.
+        least, most: bounds of its entries.
+        what: "pose" or "covariance" where each row must be one; "unknown" where entries may be NaN.
+    """
+
+    dtype: type
+    shape: str
+    least: float
+    most: float
+    what: str = ""
+
+
+#: Arrays of the landmarks.
+_LANDMARKS = {
+    "ids": _Kind(np.int64, "n", 0, MOST_ID), "positions": _Kind(np.float64, "n3", -_FAR, _FAR),
+    "covariances": _Kind(np.float64, "n33", -np.inf, np.inf),
+    "descriptors": _Kind(np.float32, "nd", -_LONGEST, _LONGEST), "laplacian": _Kind(np.int8, "n", -128, 127),
+    "seen": _Kind(np.int64, "n", 0, MOST_ID), "in_view": _Kind(np.int64, "n", 0, MOST_ID),
+    "seen_from": _Kind(np.float64, "n3", -_FAR, _FAR, "unknown"),
 }  # fmt: skip
+
+#: Scalars, poses and covariances by keyframe, features of all keyframes in succession, and loops.
+_PLACES = {
+    "keyframe_stamps": _Kind(np.float64, "k", -_GREATEST, _GREATEST),
+    "keyframe_poses": _Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
+    "keyframe_odometry": _Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
+    "keyframe_covariances": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance"),
+    "keyframe_steps": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance"),
+    "keyframe_shares": _Kind(np.float64, "k6m", -_GREATEST, _GREATEST),
+    "keyframe_travelled": _Kind(np.float64, "k", -_FAR, _FAR),
+    "keyframe_depths": _Kind(np.float64, "k", np.nextafter(0, 1), _FAR),
+    "keyframe_features": _Kind(np.int64, "k", 0, MOST_ID),
+    "place_points": _Kind(np.float32, "f3", -_FAR, _FAR), "place_descriptors": _Kind(np.float16, "fd", -_HALF, _HALF),
+    "place_laplacian": _Kind(np.int8, "f", -128, 127), "place_landmarks": _Kind(np.int64, "f", -1, MOST_ID),
+    "loop_pairs": _Kind(np.int64, "l2", 0, MOST_ID), "loop_motions": _Kind(np.float64, "l44", -_FAR, _FAR, "pose"),
+    "loop_covariances": _Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance"),
+    "loop_inliers": _Kind(np.int64, "l", 0, MOST_ID),
+}  # fmt: skip
+
+
+def _require(arrays: Mapping[str, Any], kinds: Mapping[str, _Kind], source: str) -> None:
+    """Raise SlamError where an array is not of its kind, or sizes that should be equal are not."""
+    sizes: dict[str, int] = {}
+    for name, kind in kinds.items():
+        a = arrays[name]
+        if not isinstance(a, np.ndarray) or a.dtype != kind.dtype or a.ndim != len(kind.shape):
+            raise SlamError(f"{source}: {name} must be of {np.dtype(kind.dtype)}, with {len(kind.shape)} dimensions")
+        fits = [sizes.setdefault(c, n) == n if c.isalpha() else int(c) == n for c, n in zip(kind.shape, a.shape)]
+        if not (fits[0] if not len(a) else all(fits)):  # of no rows the others may be anything
+            raise SlamError(f"{source}: {name} has the shape {a.shape}, which does not fit the other arrays")
+        good = (kind.least <= a) & (a <= kind.most)
+        if not (good | np.isnan(a) if kind.what == "unknown" else good).all():
+            raise SlamError(f"{source}: {name} holds an impossible number")
+        if kind.what == "covariance" and any(_no_covariance(P) for P in a):
+            raise SlamError(f"{source}: {name} holds what is no covariance")
+        if kind.what == "pose" and any(np.abs(nearest_rotation(T[:3, :3]) - T[:3, :3]).max() > _TURNED for T in a):
+            raise SlamError(f"{source}: {name} holds what is no pose")
+
+
+def _no_covariance(P: np.ndarray) -> bool:
+    """Whether a matrix (6, 6) is not symmetric, or has a negative eigenvalue beyond rounding."""
+    largest = np.abs(P).max()
+    return bool(np.abs(P - P.T).max() > 1e-6 * largest or np.linalg.eigvalsh(P).min() < -1e-6 * largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,36 +167,17 @@ class SavedMap:
     loops: tuple[Loop, ...] = ()
 
     def __post_init__(self) -> None:
-        arrays = [getattr(self, name) for name in _TYPES if name != "seen_from" or self.seen_from is not None]
-        if not all(isinstance(a, np.ndarray) and a.ndim for a in arrays):
-            raise SlamError(f"{self.source}: an array has the wrong number of dimensions")
-        n = len(self.ids)
+        n = len(self.ids) if isinstance(self.ids, np.ndarray) and self.ids.ndim else 0
         if self.seen_from is None:
             object.__setattr__(self, "seen_from", np.full((n, 3), np.nan))
         if self.keyframe_poses is None:
             poses = np.array([k.T_odom_left for k in self.keyframes]).reshape(-1, 4, 4)
             object.__setattr__(self, "keyframe_poses", poses)
-        for name, dtype in _TYPES.items():
-            array = getattr(self, name)
-            if array.dtype != dtype or array.ndim == 0 or len(array) != n:
-                raise SlamError(f"{self.source}: {name} must be {n} rows of {np.dtype(dtype)}")
-        if self.descriptors.ndim != 2 or any(
-            getattr(self, a).ndim != 1 for a in ("ids", "laplacian", "seen", "in_view")
-        ):
-            raise SlamError(f"{self.source}: an array has the wrong number of dimensions")
-        if self.seen_from.shape != (n, 3):
-            raise SlamError(f"{self.source}: seen_from must be {n} rows of 3 numbers")
-        if n and (self.ids[0] < 0 or self.ids[-1] > MOST_ID or (np.diff(self.ids) <= 0).any()):
-            raise SlamError(f"{self.source}: landmark ids must ascend from 0 on, up to {MOST_ID}")
-        if not (np.abs(self.descriptors) <= _LONGEST).all() or self.dimensions > _MOST_DIMENSIONS:
-            raise SlamError(f"{self.source}: a descriptor is not finite, or far too long")
-        if (
-            not (np.abs(self.positions) <= FARTHEST_POSITION).all()
-            or (np.abs(self.seen_from) > FARTHEST_POSITION).any()
-        ):
-            raise SlamError(f"{self.source}: the position of a landmark is not finite, or too far away")
-        if any(((c := getattr(self, name)) < 0).any() or (c > MOST_ID).any() for name in ("seen", "in_view")):
-            raise SlamError(f"{self.source}: a number of frames is impossible")
+        _require(vars(self), _LANDMARKS, self.source)
+        if (np.diff(self.ids) <= 0).any():
+            raise SlamError(f"{self.source}: landmark ids must ascend")
+        if self.dimensions > _MOST_DIMENSIONS:
+            raise SlamError(f"{self.source}: descriptors of {self.dimensions} numbers")
         try:
             require_known(self.source, self.ids, self.positions, self.covariances)
         except MeasurementError as error:
@@ -226,9 +276,7 @@ def encode(saved: SavedMap) -> bytes:
     texts = {"world_frame": saved.world_frame, "frontend": saved.frontend, "written_by": saved.written_by}
     header = {**texts, "holds": saved.holds}
     members = {"header.json": json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False).encode() + b"\n"}
-    arrays = {name: getattr(saved, name) for name in _TYPES} | to_arrays(
-        saved.keyframes, saved.keyframe_poses, saved.loops
-    )
+    arrays = {name: getattr(saved, name) for name in _LANDMARKS} | places_to_arrays(saved)
     for name, values in arrays.items():
         buffer = io.BytesIO()
         np.lib.format.write_array(buffer, np.ascontiguousarray(values), (1, 0), allow_pickle=False)
@@ -259,21 +307,63 @@ def decode(data: bytes, source: str) -> SavedMap:
 def _members(body: bytes, source: str, with_places: bool) -> dict[str, Any]:
     """The attributes of `SavedMap` in an archive."""
     members = unpack(body, source)
-    kinds = _TYPES | (ATLAS_TYPES if with_places else {})
-    missing = {"header.json", *(f"{name}.npy" for name in kinds)} - set(members)
+    names = [*_LANDMARKS, *(_PLACES if with_places else ())]
+    missing = {"header.json", *(f"{name}.npy" for name in names)} - set(members)
     if missing:
         raise SlamError(f"{source}: the map lacks {min(missing)}")
-    header = json_text(members["header.json"], f"{source}: header.json")
-    texts = [f.name for f in fields(SavedMap) if f.name in ("frontend", "world_frame", "written_by")]
+    header, texts = (
+        json_text(members["header.json"], f"{source}: header.json"),
+        ("frontend", "world_frame", "written_by"),
+    )
     if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in texts):
         raise SlamError(f"{source}: header.json must give {', '.join(texts)}")
-    content: dict[str, Any] = {name: header[name] for name in texts}
-    for name, kind in kinds.items():
-        content[name] = found = array(members[f"{name}.npy"], name, source)
-        if found.dtype != kind:  # of the other byte order, or of another kind
-            raise SlamError(f"{source}: {name} must be of {np.dtype(kind)}")
-    if with_places:
-        arrays = {name: content.pop(name) for name in ATLAS_TYPES}
-        names = ("keyframes", "keyframe_poses", "loops")
-        content |= dict(zip(names, from_arrays(arrays, content["descriptors"].shape[1:], source)))
-    return content
+    arrays = {name: array(members[f"{name}.npy"], name, source) for name in names}
+    content = {name: header[name] for name in texts} | {name: arrays[name] for name in _LANDMARKS}
+    return content | (places_from_arrays(arrays, source) if with_places else {})
+
+
+def places_to_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
+    """Keyframes, their poses in the map, and loops of a map as arrays by the names of `_PLACES`."""
+    k, loops = saved.keyframes, saved.loops
+    m = max((f.jacobian.shape[1] for f in k), default=0)
+    shares = [f.jacobian if f.jacobian.shape[1] == m else np.zeros((6, m)) for f in k]
+    sizes = {"k": len(k), "m": m, "l": len(loops), "d": saved.dimensions, "f": sum(map(len, k))}
+    names = ("points", "descriptors", "laplacian", "landmarks")
+    columns: list[Any] = [
+        [f.stamp for f in k], saved.keyframe_poses, [f.T_odom_left for f in k], [f.covariance for f in k],
+        [f.step_covariance for f in k], shares, [f.travelled for f in k], [f.depth for f in k], [len(f) for f in k],
+        *(np.concatenate([getattr(f, name) for f in k]) if k else () for name in names),
+        [x.pair for x in loops], [x.T_first_second for x in loops], [x.covariance for x in loops],
+        [x.inliers for x in loops],
+    ]  # fmt: skip
+    return {
+        name: np.array(column, kind.dtype).reshape([sizes[c] if c.isalpha() else int(c) for c in kind.shape])
+        for (name, kind), column in zip(_PLACES.items(), columns)
+    }
+
+
+def places_from_arrays(arrays: Mapping[str, np.ndarray], source: str) -> dict[str, Any]:
+    """The attributes of `SavedMap` for keyframes and loops, from arrays by the names of `_PLACES`, and descriptors.
+
+    Raises:
+        SlamError: the arrays do not fit together, or a value is impossible; `source` names them in the message.
+    """
+    a = arrays
+    _require(a, {"descriptors": _LANDMARKS["descriptors"]} | _PLACES, source)
+    begin, pairs = np.concatenate([[0], np.cumsum(a["keyframe_features"])]).astype(int), a["loop_pairs"]
+    if begin[-1] != len(a["place_points"]):
+        raise SlamError(f"{source}: the keyframes have other features than there are")
+    if (pairs >= len(begin) - 1).any() or (pairs[:, :1] >= pairs[:, 1:]).any():
+        raise SlamError(f"{source}: a loop is between keyframes that there are not")
+    keyframes = tuple(
+        Keyframe(
+            -1, float(a["keyframe_stamps"][i]), a["keyframe_odometry"][i], a["keyframe_covariances"][i],
+            a["keyframe_steps"][i], a["keyframe_shares"][i], float(a["keyframe_travelled"][i]),
+            float(a["keyframe_depths"][i]), a["place_points"][s], a["place_descriptors"][s], a["place_laplacian"][s],
+            a["place_landmarks"][s],
+        )
+        for i, s in enumerate(slice(x, y) for x, y in pairwise(begin))
+    )  # fmt: skip
+    columns = pairs.tolist(), a["loop_motions"], a["loop_covariances"], a["loop_inliers"].tolist()
+    loops = tuple(Loop(first, second, *rest) for (first, second), *rest in zip(*columns))
+    return {"keyframes": keyframes, "keyframe_poses": a["keyframe_poses"], "loops": loops}

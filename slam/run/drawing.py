@@ -74,7 +74,7 @@ def with_legend(picture: np.ndarray, bodies: Sequence[MovingObject] = ()) -> np.
     marks: list[tuple[tuple[int, int, int], str, bool | None]]
     marks = [(_BEACON, "landmark", None), (_NEW, "new landmark", None), (_MOVING, "feature that moves", None)]
     marks += known or [(body_colour(1), "body", False)]
-    for colour, text, dashed in [*marks, (body_colour(1), "body, not seen", True)]:
+    for colour, text, dashed in [*marks, (marks[-1][0], "body, not seen", True)]:
         (width, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
         if at + 20 + width > bar.shape[1]:
             break
@@ -117,7 +117,7 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
         return
     speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
     state = f"{speed:.2f} m/s" if thing.moving else "at rest"
-    text = f"{thing.id}  {state if thing.estimate.measured else 'not seen'}"
+    text = f"{thing.id}: {state if thing.estimate.measured else 'not seen'}"
     (width, height), base = cv2.getTextSize(text, _FONT, _TEXT, 1)
     u, v = corners.min(axis=0)
     left, top = _pixel(u, v - 3, scale)

@@ -1,19 +1,16 @@
-"""Pictures of runs, made from the files that they leave: maps with covariance ellipsoids, paths, errors over time."""
+"""What the pictures of runs show: maps with covariance ellipses, paths, and the errors of poses over time."""
 
 from __future__ import annotations
 
 from itertools import cycle
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam.evaluation.metrics import align, associate
-from slam.files import whole_file
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, rotation_angle
 from slam.geometry.trajectory import Trajectory
 from slam.run.run_data import RunData
-from slam.run.style import backend_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,10 +20,10 @@ _MARKS = {_SEEN: ("^", 3.5), _UNSEEN: (".", 2.0)}  # told apart by shape, too
 _CORRECTED, _CLOSED, _REFUSED = "#4527a0", "0.1", "#d81b60"  # what loops do
 _BODIES = ("#00838f", "#6a1b9a", "#5d4037", "#ad1457")
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
-_SIGMAS = 2.0  # size of ellipses and ellipsoids
+_SIGMAS = 2.0  # size of ellipses
 
 
-def draw_map(axis: Axes, run: RunData, truth: Trajectory | None, colour: str) -> None:
+def draw_map(axis: Axes, run: RunData, colour: str) -> None:
     """The map from above, the path in a colour, and the 2σ ellipses of the landmarks that are well known."""
     from matplotlib.collections import EllipseCollection
 
@@ -46,13 +43,17 @@ def draw_map(axis: Axes, run: RunData, truth: Trajectory | None, colour: str) ->
         axis.plot(*run.positions[rows][:, [0, 2]].T, mark, ms=size, color=shade, label=f"landmarks {label}")
     if len(run.old):
         axis.plot(*run.old[:, [0, 2]].T, ".", ms=1.5, color=_OLD, zorder=0, label="landmarks before")
-    draw_path(axis, run, run.online, f"path of {run.name}, online", color=colour, lw=3, alpha=0.6)
+    draw_path(axis, run, run.online, "path, online", color=colour, lw=3, alpha=0.6)
     draw_loops(axis, run)
     label = "moving bodies"
     for positions, body_colour in zip(run.bodies.values(), cycle(_BODIES)):
         axis.plot(*positions[:, [0, 2]].T, "-s", ms=4, lw=1.5, markevery=[-1], color=body_colour, label=label)
         label = "_"
-    _draw_truth(axis, run, truth)
+    if run.truth is not None:
+        _, true = associate(run.online, run.truth, 0.02, interpolated=True)
+        T = place_of_truth(run, run.truth)
+        points = true.positions @ T[:3, :3].T + T[:3, 3]
+        axis.plot(*points[:, [0, 2]].T, "--", color=_TRUTH, lw=1.2, label="true path")
     axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
     _limit_to_most(axis, run)
 
@@ -83,39 +84,6 @@ def is_revised(run: RunData) -> bool:
     return not (same and np.allclose(run.final.poses, run.online.poses, rtol=0, atol=1e-6))
 
 
-def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
-    """The map in 3D with covariance ellipsoids and the path (paper A, Fig. 5)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4 * len(runs), 5.4))
-    FigureCanvasAgg(figure)
-    u, v = np.mgrid[0 : 2 * np.pi : 9j, 0 : np.pi : 6j]
-    sphere = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
-    for i, run in enumerate(runs):
-        axis: Any = figure.add_subplot(1, len(runs), i + 1, projection="3d")
-        for row in well_known(run)[-most:]:
-            values, vectors = np.linalg.eigh(run.covariances[row])
-            shape = (sphere * _SIGMAS * np.sqrt(np.maximum(values, 0))) @ vectors.T + run.positions[row]
-            colour = _SEEN if run.seen_last[row] else _UNSEEN
-            axis.plot_wireframe(shape[..., 0], shape[..., 2], -shape[..., 1], color=colour, lw=0.35)
-        p, colour = run.online.positions, backend_colours([run.backend])[0]
-        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=colour, lw=1.5, label="path")
-        for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
-            axis.plot([], [], [], color=colour, lw=1, label=label)
-        axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
-        axis.set_title(run.name, y=0.92)
-        for side in (axis.xaxis, axis.yaxis, axis.zaxis):
-            side.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.yaxis.labelpad = axis.zaxis.labelpad = 9  # clear of the numbers
-        axis.set_box_aspect(np.ptp([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()], axis=1))  # one scale for all
-        axis.view_init(elev=25, azim=-65)
-    labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*labels, loc="lower center", bbox_to_anchor=(0.5, 0.05), ncols=3, fontsize=8, frameon=False)
-    with whole_file(path) as file:
-        figure.savefig(file, dpi=110, metadata={"Software": None}, bbox_inches="tight")
-
-
 def stretch(axis: Axes, points: np.ndarray) -> bool:
     """Give each axis a scale of its own where points (N, 2) lie nearly in a line along one; whether it did."""
     extent = np.ptp(points, axis=0)
@@ -131,9 +99,9 @@ def stretch(axis: Axes, points: np.ndarray) -> bool:
     return True
 
 
-def widths(count: int, last: float) -> list[float]:
-    """Widths of lines, the first the widest: where lines coincide, each is seen beside the one drawn over it."""
-    return [last * (1 + 1.2 * (count - 1 - i)) for i in range(count)]
+def widths(count: int) -> Array:
+    """Widths of lines (N,), the first the widest: where lines coincide, each is seen beside the one drawn over it."""
+    return 1 + 1.2 * np.arange(count)[::-1]
 
 
 def place_of_truth(run: RunData, truth: Trajectory) -> Array:
@@ -150,25 +118,21 @@ def place_of_truth(run: RunData, truth: Trajectory) -> Array:
     return T
 
 
-def position_errors(run: RunData, truth: Trajectory) -> tuple[Array, Array, Array]:
-    """Time since the start (N,) [s], error of the online position and its claimed standard deviation, (N, 3) [m] each.
+def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
+    """Time since the start (N,) [s], errors of the online pose and their claimed standard deviations, (N, 4) each.
 
-    Both are along the axes of the run's world, see `place_of_truth`.
+    The first three columns are the position along the axes of the run's world [m], see `place_of_truth`; the last one
+    is the angle of the rotation's error [deg]. Without a truth the errors are zero.
     """
-    own, true = associate(run.online, truth, 0.02, interpolated=True)
-    T = place_of_truth(run, truth)
+    if run.truth is None:
+        stamps = run.online.stamps
+        return stamps - stamps[0], np.zeros((len(stamps), 4)), run.deviations
+    own, true = associate(run.online, run.truth, 0.02, interpolated=True)
+    T = place_of_truth(run, run.truth)
     expected = true.positions @ T[:3, :3].T + T[:3, 3]
-    rows = np.searchsorted(run.online.stamps, own.stamps)
-    return own.stamps - run.online.stamps[0], own.positions - expected, run.deviations[rows]
-
-
-def _draw_truth(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
-    """The true path of the estimated poses, from above, as `place_of_truth` says."""
-    if truth is None:
-        return
-    _, true = associate(run.online, truth, 0.02, interpolated=True)
-    T = place_of_truth(run, truth)
-    axis.plot(*(true.positions @ T[:3, :3].T + T[:3, 3])[:, [0, 2]].T, "--", color=_TRUTH, lw=1.2, label="true path")
+    turned = np.swapaxes(T[:3, :3] @ true.poses[:, :3, :3], 1, 2) @ own.poses[:, :3, :3]
+    errors = np.column_stack([own.positions - expected, np.degrees(rotation_angle(turned))])
+    return own.stamps - run.online.stamps[0], errors, run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
 
 
 def well_known(run: RunData) -> np.ndarray:

@@ -31,7 +31,7 @@ class RunData:
         positions: landmarks (N, 3) [m].
         covariances: (N, 3, 3) [m²].
         seen_last: which landmarks were measured in the last frame (N,).
-        deviations: of the online position in world axes (F, 3) [m], a row for each pose of `online`.
+        deviations: of the online position in world axes [m] and of the rotation [deg], (F, 4), by pose of `online`.
         measured: whether each pose of `online` was measured (F,), or is the motion model's alone.
         status: of each frame.
         milliseconds: by stage, of each frame [ms].
@@ -100,7 +100,7 @@ class RunData:
             _numbers(landmarks, ("x", "y", "z")),
             upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
             last_seen == int(frames[-1]["frame"]),
-            _numbers(located, ("sd_x", "sd_y", "sd_z")),
+            _numbers(located, ("sd_x", "sd_y", "sd_z", "sd_rotation")) * [1, 1, 1, np.degrees(1)],
             np.array([row["status"] in ("started", "tracked") for row in located], bool),
             [row["status"] for row in frames],
             {stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},

@@ -162,16 +162,3 @@ def _described(name: str, columns: Columns) -> dict[str, str]:
     if name.removeprefix("ms_") in STAGE_NAMES:
         return {"unit": columns.unit, "meaning": f"wall time of a stage: {STAGE_NAMES[name.removeprefix('ms_')]}"}
     return {"unit": columns.unit, "meaning": columns.text}
-
-
-def markdown(table: tuple[Columns, ...]) -> list[str]:
-    """The rows of a table in Markdown, for ``docs/files.md``."""
-    rows = [f"| {_spelled(c.names)} | {c.unit or '–'} | {c.text} |" for c in table]
-    return ["| column | unit | holds |", "| --- | --- | --- |", *rows]
-
-
-def _spelled(names: tuple[str, ...]) -> str:
-    """Names of columns; of many the first and the last."""
-    return (
-        ", ".join(f"`{name}`" for name in names) if len(names) <= 8 else f"`{names[0]}`, `{names[1]}` … `{names[-1]}`"
-    )

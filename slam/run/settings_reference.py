@@ -1,26 +1,21 @@
-"""All settings with meaning, unit, default and range, from the configuration classes: their docstrings and checks."""
+"""All settings with meaning, unit and default, from the configuration classes and their docstrings."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from inspect import cleandoc
-from math import inf
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 from slam import registry
-from slam.bounds import LEAST
 from slam.config import SystemConfig
-from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.models import KINDS
+from slam.settings import can_be_set
 
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
 _UNIT = re.compile(r"\[((?:px|m|rad|s|degrees|grey levels)(?:[²³]|/s²?|/√s)*(?: / √s)?)\]")
-_TRIED = 130  # whole numbers from zero on that are tried one by one, to find sets such as 16 and 64
-_LARGE, _SMALL, _STEPS = 1e15, 1e-12, 110  # taken for infinity, and for zero; bisections between the two
 _PARTS = ("frontend", "backend")  # sections whose settings are those of a class chosen by name
 
 
@@ -34,7 +29,6 @@ class Setting:
         defaults: by kind of motion.
         unit: empty for words, counts and ratios.
         text: what it means.
-        range: the values that are accepted while all others have their defaults, as an interval or as a list.
     """
 
     key: str
@@ -42,11 +36,10 @@ class Setting:
     defaults: dict[str, Any]
     unit: str
     text: str
-    range: str
 
 
 def settings() -> Iterator[Setting]:
-    """All settings: those of every run, and those of each front end and back end that can be loaded."""
+    """All that a user can set: in every run, and of each front end and back end that can be loaded."""
     configs = {kind: SystemConfig.for_kind(kind) for kind in KINDS}
     for f in fields(SystemConfig):
         if f.name not in _PARTS:
@@ -96,14 +89,14 @@ def documented(kind: type) -> dict[str, tuple[str, str]]:
 def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
     """Settings of one configuration class, given its instances by kind of motion."""
     first = next(iter(configs.values()))
-    texts, types = documented(type(first)), get_type_hints(type(first))
+    texts = documented(type(first))
     for f in fields(first):
         values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
         if is_dataclass(getattr(first, f.name)):
             yield from _of_class(values, key, owner)
-        else:
+        elif can_be_set(key, owner):
             unit, text = texts.get(f.name, ("", ""))
-            yield Setting(key, owner, values, unit, text, _range(first, f.name, types[f.name], text))
+            yield Setting(key, owner, values, unit, text)
 
 
 def _config_of(section: str, name: str, kind: str) -> Any:
@@ -112,64 +105,6 @@ def _config_of(section: str, name: str, kind: str) -> Any:
     named: dict[str, Any] = {section: name}
     options = getattr(SystemConfig.for_kind(kind, **named), section)
     return getattr(registry.create(f"{section}s", name, rig, **options), "config", None)
-
-
-def _range(config: Any, name: str, annotation: Any, text: str) -> str:
-    """What a field accepts, as the class itself checks it."""
-    accepts = partial(_accepts, config, name)
-    kinds, default = get_args(annotation) or (annotation,), getattr(config, name)
-    if isinstance(default, tuple):
-        return f"{len(default)} {'whole ' if int in kinds else ''}numbers"
-    also = " or null" if type(None) in kinds else ""
-    if kinds == (type(None),):
-        return "null"
-    if bool in kinds:
-        return "true or false"
-    if str in kinds:
-        words = re.findall(r'"(\w+)"', text)
-        return ", ".join(words) if default in words else "text"
-    if int in kinds or float in kinds:
-        return _range_of_numbers(accepts, default, int in kinds) + also
-    return "list" + also
-
-
-def _range_of_numbers(accepts: Callable[[float], bool], default: float | None, whole: bool) -> str:
-    """Which numbers are accepted: a list such as ``"16, 64"``, or an interval such as ``"(0, 1]"``."""
-    tried = [n for n in range(_TRIED) if accepts(n)] if whole else []
-    if tried and tried[-1] < _TRIED - 1 and tried != list(range(tried[0], tried[-1] + 1)):
-        return ", ".join(map(str, tried))
-    inside = default if default is not None else next(iter(tried), None)
-    if inside is None:
-        return "numbers"
-    low, high = (_last(accepts, max(-_LARGE, min(inside, _LARGE)), sign * _LARGE, whole) for sign in (-1, 1))
-    first = "(-∞" if low == -inf else f"{'[' if accepts(low) else '('}{low:.10g}"
-    return f"{first}, " + ("∞)" if high == inf else f"{high:.10g}{']' if accepts(high) else ')'}")
-
-
-def _last(accepts: Callable[[float], bool], inside: float, outside: float, whole: bool) -> float:
-    """The last accepted number on the way from one inside to one outside; infinite where all are accepted."""
-    if accepts(int(outside) if whole else outside):
-        return inf if outside > 0 else -inf
-    for _ in range(_STEPS):
-        middle = (inside + outside) / 2
-        if whole:
-            middle = int(inside + outside) // 2 if outside > inside else -(int(-inside - outside) // 2)
-        if middle in (inside, outside):
-            break
-        inside, outside = (middle, outside) if accepts(middle) else (inside, middle)
-    if abs(inside) < 2 * LEAST and accepts(0):  # nothing between zero and `LEAST` is accepted where zero is
-        return 0
-    end = float(f"{0 if abs(inside) < _SMALL else inside:.9g}")
-    return int(end) if end.is_integer() else end
-
-
-def _accepts(config: Any, name: str, value: Any) -> bool:
-    """Whether a configuration can be made with this value."""
-    try:
-        replace(config, **{name: value})
-    except (ConfigurationError, TypeError, ValueError, OverflowError):
-        return False
-    return True
 
 
 def in_force(part: object) -> dict[str, Any] | None:

@@ -1,13 +1,11 @@
-"""How pictures of runs and of comparisons look alike: a colour a back end, a colour and a name a stage."""
+"""How pictures of runs and of comparisons look alike: a colour a back end, a colour a stage."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import cycle
 
-from slam.run.schema import STAGE_NAMES, STAGES
-
-_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#00838f"}
+_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#00838f", "iekf": "#ad1457"}
 _OTHERS = ("#2e7d32", "#c62828", "#5d4037", "#9e9d24")
 
 _BODIES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))  # BGR
@@ -15,7 +13,8 @@ _BODIES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60
 #: Of lines around bands: where bands of two back ends are equal, both are seen.
 DASHES = ("-", "--", ":", "-.")
 
-_STAGES = {
+#: Stages of a step, in their order.
+STAGE_COLOURS = {
     "read": "#bdbdbd", "extract": "#1565c0", "predict": "#90caf9", "associate": "#ef6c00", "update": "#c62828",
     "estimate": "#f48fb1", "objects": "#6a1b9a", "manage": "#2e7d32", "atlas": "#00838f",
 }  # fmt: skip
@@ -35,24 +34,3 @@ def backend_colours(backends: Sequence[str]) -> list[str]:
 def body_colour(number: int) -> tuple[int, int, int]:
     """The colour (BGR) of a moving body in images, by its number."""
     return _BODIES[(number - 1) % len(_BODIES)]
-
-
-def stages(known: Iterable[str]) -> list[str]:
-    """Those of some stages that a step has, in the order of a step."""
-    names = set(known)
-    return [stage for stage in STAGES if stage in names]
-
-
-def stage_name(stage: str) -> str:
-    """What a stage does, for a legend."""
-    return STAGE_NAMES[stage]
-
-
-def stage_colour(stage: str) -> str:
-    """The colour of a stage."""
-    return _STAGES[stage]
-
-
-def repeated(styles: tuple[str, ...], count: int) -> list[str]:
-    """So many of some styles, from the first on again where they are too few."""
-    return [styles[i % len(styles)] for i in range(count)]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from slam.data import Estimate, FrameResult
+from slam.evaluation.consistency import EXACT
 from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array, inverse
@@ -142,6 +143,8 @@ def results_of(
         },
     }
     if isinstance(system, StereoSlam):
+        if found["consistency"].get("mean NEES") is not None and system.config.self_calibration.enabled:
+            found["consistency"] |= _exactness(sequence)
         found["self_calibration"] = system.calibration.summary()
         found["loops"] = system.atlas.summary()
         found["bodies"] = len(record.bodies)
@@ -155,6 +158,12 @@ def results_of(
     return {
         **found, "milliseconds": _timings(record), "frames_per_second": _rate(record), "compile_seconds": compiled,
     }  # fmt: skip
+
+
+def _exactness(sequence: Sequence | Recording) -> dict[str, bool]:
+    """Whether a world's cameras are those of its calibration; nothing of recordings, where nobody knows."""
+    values = getattr(sequence, "values", None)
+    return {} if values is None else {EXACT: not (values["focal_error"] or values["turn_error"])}
 
 
 def live_frames(live: LiveFrames, record: RunRecord) -> dict[str, Any]:

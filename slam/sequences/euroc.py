@@ -31,8 +31,9 @@ from slam.sequences.tables import numbers, read_rows, shorten, stamp_and_name
 from slam.sequences.truth import LARGEST, require_truth
 
 #: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
-#: half a metre apart, which makes 2 mrad. The camera's orientation in the vehicle is calibrated to half a degree or so.
-MOCAP_NOISE = TruthNoise(rotation=0.002, translation=0.001, mounting=0.01)
+#: half a metre apart, which makes 2 mrad. The camera's orientation in the vehicle is calibrated to half a degree or so,
+#: its place to a centimetre, and its clock against the camera's to half an exposure.
+MOCAP_NOISE = TruthNoise(rotation=0.002, translation=0.001, mounting=0.01, lever=0.01, clock=0.01)
 
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")  # both give the body's (IMU's) pose
 _CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "../camchain.yaml", "../dso/camchain.yaml")

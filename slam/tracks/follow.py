@@ -18,8 +18,6 @@ from slam.tracks.config import AssociationConfig
 
 Descriptors = NDArray[np.float32]
 
-_ROOM = 8  # cost: pairs a box for which there is room at once
-
 
 @dataclass(frozen=True, eq=False)
 class Matches:
@@ -86,12 +84,13 @@ def _followed(
 
     order = among[np.argsort(features.uv_left[among, 0], kind="stable")]
     limits = np.array(d_match, np.float32)
-    found = follow_kernels.follow(
+    pairs = np.empty((2, len(pixels)), np.intp)
+    count = follow_kernels.follow(
         np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), bounds, sizes, limits, np.float32(ratio),
-        np.ascontiguousarray(descriptors), laplacian, rows, features.uv_left, features.descriptors, features.laplacian,
-        order,
+        np.ascontiguousarray(descriptors), laplacian, rows, np.ascontiguousarray(features.uv_left),
+        features.descriptors, features.laplacian, order, pairs,
     )  # fmt: skip
-    return Matches(rows[found[0]], found[1])
+    return Matches(rows[pairs[0, :count]], pairs[1, :count])
 
 
 def match_everywhere(
@@ -109,9 +108,10 @@ def match_everywhere(
     rows, columns = np.nonzero(near)
     product = np.einsum("pd,pd->p", descriptors.take(rows, axis=0), features.descriptors.take(columns, axis=0))
     distance = np.sqrt(np.maximum(2 - 2 * product, 0))
-    best = mutual_best(
-        rows, columns, distance, np.ones(len(rows), bool), (len(descriptors), len(features)),
-        np.float32(config.wide_d_match), np.float32(config.wide_ratio),
+    best = np.empty(len(rows), bool)
+    mutual_best(
+        rows, columns, distance, (len(descriptors), len(features)), np.float32(config.wide_d_match),
+        np.float32(config.wide_ratio), best,
     )  # fmt: skip
     return Matches(rows[best], columns[best])
 
@@ -126,7 +126,7 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
     order = np.argsort(uv[:, 0], kind="stable")
     x, y = uv[:, 0].take(order), uv[:, 1].take(order)
     boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach)
-    rows, places = np.empty((2, _ROOM * len(centres)), np.intp)
+    rows, places = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
     count = follow_kernels.pairs_in_boxes(*boxes, x, y, rows, places)
     if count > len(rows):
         rows, places = np.empty((2, count), np.intp)

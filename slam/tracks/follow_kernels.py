@@ -34,11 +34,15 @@ def pairs_in_boxes(centres, reach, x, y, rows, places):
 
 
 @helper
-def best_pairs(rows, columns, distance, allowed, size, d_match, ratio):
-    """`mutual_best`, for kernels."""
-    nearest, second = np.full(size[0], np.float32(np.inf)), np.full(size[0], np.float32(np.inf))
-    of_column, good = np.full(size[1], np.float32(np.inf)), np.zeros(len(rows), np.bool_)
-    for p in range(len(rows)):
+def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, good):
+    """`mutual_best` of the first `count` pairs into `good`, for kernels."""
+    nearest, second = np.empty(size[0], np.float32), np.empty(size[0], np.float32)
+    of_column, most = np.empty(size[1], np.float32), np.float32(np.inf)
+    for row in range(size[0]):  # slices and fills take a second to compile
+        nearest[row] = second[row] = most
+    for column in range(size[1]):
+        of_column[column] = most
+    for p in range(count):
         if allowed[p]:
             row, column, d = rows[p], columns[p], distance[p]
             if d < nearest[row]:
@@ -47,21 +51,22 @@ def best_pairs(rows, columns, distance, allowed, size, d_match, ratio):
                 second[row] = d
             if d < of_column[column]:
                 of_column[column] = d
-    for p in range(len(rows)):
+    for p in range(count):
         row, d = rows[p], distance[p]
         mutual = allowed[p] and d == nearest[row] and d <= of_column[columns[p]]
         good[p] = mutual and d < d_match and d < ratio * second[row]
-    return good
 
 
 @kernel
-def mutual_best(rows, columns, distance, allowed, size, d_match, ratio):
-    """Which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than the row's second.
+def mutual_best(rows, columns, distance, size, d_match, ratio, good):
+    """Mark in `good` which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than others.
 
-    Pairs are of rows and columns, of which there are `size`, and have a distance; those that are not allowed do not
-    count.
+    Pairs are of rows and columns, of which there are `size`, and have a distance. It must be less than `ratio` times
+    that of the row's second.
     """
-    return best_pairs(rows, columns, distance, allowed, size, d_match, ratio)
+    for p in range(len(good)):
+        good[p] = True
+    best_pairs(rows, columns, distance, good, len(good), size, d_match, ratio, good)
 
 
 @helper
@@ -87,13 +92,13 @@ def product(a, b):
 
 
 @kernel
-def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows, uv, others, other_signs, order):
-    """Pairs (2, K) of tracks and of the features that continue them: those in the smallest window, then in larger ones.
+def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows, uv, others, other_signs, order, pairs):
+    """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
 
     Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows; their half axes
     are `sizes` (L,) times standard deviations within `bounds`, or [px] of squares if these are zero. In each window,
     descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs` at `rows` (M,); the features are
-    at `uv`, those that count in the `order` of their columns.
+    at `uv`, those that count in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
     """
     levels, last = len(sizes), sizes[len(sizes) - 1]
     count, room = 0, 4 * len(pixels) + 64
@@ -140,24 +145,25 @@ def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows,
             a[count], b[count], level[count] = row, feature, smallest
             distance[count] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
             count += 1
-    a, b, level, distance = a[:count], b[:count], level[:count], distance[:count]
-    pairs, found = np.empty((2, len(pixels)), np.intp), 0  # tracks that look alike to the bit may share a feature
-    done, taken, allowed = np.zeros(len(pixels), np.bool_), np.zeros(len(uv), np.bool_), np.empty(count, np.bool_)
+    found = 0  # tracks that look alike to the bit may share a feature
+    done, taken = np.zeros(len(pixels), np.bool_), np.zeros(len(uv), np.bool_)
+    allowed, good = np.empty(count, np.bool_), np.empty(count, np.bool_)
     for number in range(levels):
         for p in range(count):
             allowed[p] = level[p] <= number and not done[a[p]] and not taken[b[p]]
-        good = best_pairs(a, b, distance, allowed, (len(pixels), len(uv)), limits[number], ratio)
+        best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[number], ratio, good)
         for p in range(count):
             if good[p]:
                 done[a[p]] = taken[b[p]] = True
                 pairs[0, found], pairs[1, found] = a[p], b[p]
                 found += 1
-    return pairs[:, :found]
+    return found
 
 
 @helper
 def grown(array, room):
     """A copy with more room."""
     new = np.empty(room, array.dtype)
-    new[: len(array)] = array
+    for k in range(len(array)):
+        new[k] = array[k]
     return new

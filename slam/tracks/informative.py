@@ -17,8 +17,6 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.models import EstimatorModels
 
-_ROUNDS = 10  # cost: rounds of the choice; more are closer to one by one
-
 
 def most_informative(
     rig: StereoRig, models: EstimatorModels, prediction: Prediction, ids: NDArray[np.int64], positions: Array,
@@ -60,7 +58,7 @@ def _own_variance(prediction: Prediction, ids: NDArray[np.int64], J: Array, moti
 def _greedy(A: Array, information: Array, most: int) -> NDArray[np.intp]:
     """Rows of A (K, 3, 6) that increase the log determinant of the information (6, 6) most."""
     free, chosen = np.ones(len(A), bool), np.zeros(len(A), bool)
-    at_once = -(-most // _ROUNDS)
+    at_once = -(-most // 10)  # 10: rounds of the choice; more are closer to one by one
     while (missing := most - int(chosen.sum())) > 0:
         # One inverse (6, 6) serves all K rows.
         gains = np.linalg.det(np.eye(3) + A @ np.linalg.inv(information) @ np.swapaxes(A, 1, 2))

@@ -25,8 +25,6 @@ from slam.tracks.state import NO_POSE, PoseHypotheses, TrackingState
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import similar_view
 
-_MOST = 0.5  # fixed: share of what is in view that makes a majority
-
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMatches:
@@ -184,7 +182,8 @@ class Localizer:
             return False
         view = self.rig.left.in_image(self.rig.left.project(transform(inverse(matches.T_world_left), positions)))
         shown = view & self._looked_for(matches.T_world_left, landmarks, positions)
-        enough = max(_MOST * min(int(shown.sum()), len(features)), 2 * self.config.minimum_consistent)
+        # 0.5: share of what is in view that makes a majority
+        enough = max(0.5 * min(int(shown.sum()), len(features)), 2 * self.config.minimum_consistent)
         return len(matches) >= enough
 
     def informative(
@@ -303,12 +302,16 @@ class Localizer:
     def _consensus(
         self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False
     ) -> PoseConsensus:
-        measured = measurement_rows(features.uv_left[matches.features], features.uv_right[matches.features])
+        """The pose on which matches agree, found in rectified pixels: lenses would be the larger part of its cost."""
+        r, rows = self.rig.rectified, matches.features
+        measured = measurement_rows(r.rectify_left(features.uv_left[rows]), r.rectify_right(features.uv_right[rows]))
         threshold = self.config.consistency_sigmas * self.pixel_sigma
         if wide and len(matches) < self.config.minimum_consistent:
             return PoseConsensus(guess, np.zeros(len(matches), bool))
         hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses
-        return find_consensus(self.rig, positions[matches.landmarks], measured, guess, threshold, hypotheses, seed)
+        X, points = r.T_left_rectified, positions[matches.landmarks]
+        found = find_consensus(r.rig, points, measured, guess @ X, threshold, hypotheses, seed)
+        return PoseConsensus(found.T_world_left @ X.T, found.inliers)
 
     def _expected(
         self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkTable, positions: Array

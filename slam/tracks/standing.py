@@ -22,20 +22,13 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
-_LOOKALIKE = 0.5  # largest distance of descriptors of one feature in unchanged light
-_LEAST_NOISE = 0.05  # [px] of a pixel: no feature is found more precisely
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
 _MOVES = chi_square_limit(6, 1 - 1e-4)  # of a common motion; asked in every frame
 _MEDIAN = chi_square_limit(3, 0.5)
-_SOME = 0.1  # share of landmarks that a motion must move, for it to be one
-_SHARED = 0.25  # of the variance of a pixel, that features may share: light moves them alike, too
 _FEW = 2 * MINIMAL_POINTS  # features that tell nothing of a motion
-_ROUNDS = 3  # numerics: of reweighting
-_AVERAGED = 10  # sights whose mean is a feature's place; later ones would follow a slow motion
 _BLIND = (
     10  # frames without enough features that stay, for which a rest is believed to last: the camera may be carried off
 )
-_REMEMBERED = 3000  # cost: features
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +60,8 @@ class Places:
         distance, nearest = cKDTree(self.z[:, :2]).query(z[:, :2], distance_upper_bound=radius)
         rows = np.flatnonzero(np.isfinite(distance))
         places = nearest[rows]
-        alike = np.linalg.norm(self.descriptors[places] - descriptors[rows], axis=1) < _LOOKALIKE
+        # 0.5: largest distance of descriptors of one feature in unchanged light
+        alike = np.linalg.norm(self.descriptors[places] - descriptors[rows], axis=1) < 0.5
         rows, places = rows[alike], places[alike]
         order = np.argsort(distance[rows], kind="stable")
         _, first = np.unique(places[order], return_index=True)
@@ -79,10 +73,11 @@ class Places:
         sights, missed, mean = self.sights.copy(), self.missed + 1, self.z.copy()
         sights[places] += 1
         missed[places] = 0
-        share = np.where(sights[places] <= _AVERAGED, 1.0 / sights[places], 0.0)
+        # 10: sights whose mean is a feature's place; later ones would follow a slow motion
+        share = np.where(sights[places] <= 10, 1.0 / sights[places], 0.0)
         mean[places] += share[:, None] * (z[rows] - mean[places])
         keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
-        keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:_REMEMBERED])
+        keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:3000])  # 3000: features
         new = np.delete(np.arange(len(z)), rows)
         return Places(
             np.concatenate([mean[keep], z[new]]), np.concatenate([self.descriptors[keep], descriptors[new]]),
@@ -158,7 +153,8 @@ class Standing:
         """
         motion = inverse(T_world_left) @ self.T_world_left
         landmarks, witnesses = (_moved(rig, sigma, features, rows, motion) for rows in (matched, self.witnesses))
-        return self.moving() if landmarks > _SOME and witnesses < 0.5 else self
+        # 0.1: share of landmarks that a motion must move, for it to be one
+        return self.moving() if landmarks > 0.1 and witnesses < 0.5 else self
 
     def moving(self) -> Standing:
         """The same features, of a camera that does not stand."""
@@ -194,14 +190,15 @@ def _staying(rig: StereoRig, before: Array, now: Array, sigma: float, variance: 
     _, J = rig.project_stereo(local[used])
     J = J @ points_by_pose(local[used])
     d, weight = d[used], np.ones(len(used))
-    for _ in range(_ROUNDS):
+    for _ in range(3):  # 3: of reweighting
         WJ = weight[:, None, None] * J
         information = np.einsum("nij,nik->jk", WJ, J)
         xi = np.linalg.lstsq(information, np.einsum("nij,ni->j", WJ, d), rcond=1e-12)[0]
         squares = ((d - J @ xi) ** 2).sum(axis=1)
-        variance = max(median(squares) / _MEDIAN, _LEAST_NOISE**2)
+        variance = max(median(squares) / _MEDIAN, 0.05**2)  # 0.05: [px] of a pixel: no feature is found more precisely
         weight = 1.0 / np.maximum(1.0, squares / (_MEDIAN * variance))
     by_motion = J @ xi
     test = float(np.einsum("n,nij,nij->", weight, by_motion[:, :, None], by_motion[:, :, None])) / variance
-    within_noise = float((by_motion**2).mean()) < _SHARED * variance
+    # 0.25: of the variance of a pixel, that features may share: light moves them alike, too
+    within_noise = float((by_motion**2).mean()) < 0.25 * variance
     return stay, test < _MOVES or within_noise, variance

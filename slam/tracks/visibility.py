@@ -13,8 +13,6 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.tracks.follow import pairs_in_boxes
 
-_NEARER = 0.9  # a surface nearer than this share of a landmark's depth may hide it
-
 
 @dataclass(frozen=True, eq=False)
 class MapView:
@@ -99,6 +97,7 @@ def hidden_landmarks(view: MapView, rows: NDArray[np.intp], features: StereoFeat
     at, which = pairs_in_boxes(view.uv_left[rows], np.full((len(rows), 2), radius), features.uv_left[stereo])
     feature = stereo[which]
     depth = view.points[feature, 2] + SIGMAS * view.depth_sigma[feature]
-    nearer = depth < _NEARER * view.local[rows[at], 2]
+    # 0.9: a surface nearer than this share of a landmark's depth may hide it
+    nearer = depth < 0.9 * view.local[rows[at], 2]
     around = np.bincount(at, minlength=len(rows))
     return 2 * np.bincount(at, nearer, minlength=len(rows)) > around

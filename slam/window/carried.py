@@ -21,10 +21,12 @@ def carried_rows(poses, column, cameras, covariance, triple, interval, mean, var
     """
     count = len(poses)
     bodies, Ad = np.zeros((count, 4, 4)), np.empty((count, 6, 6))
-    back = np.empty((3, 4))
+    back, one = np.empty((3, 4)), np.zeros((4, 4))
+    for i in range(4):
+        one[i, i] = 1.0
     for k in range(count):
         adjoint(poses[k], Ad[k])
-        between(poses[k], np.eye(4), back)
+        between(poses[k], one, back)
         for i in range(3):
             for j in range(4):
                 total = cameras[k, i, 3] if j == 3 else 0.0
@@ -56,14 +58,17 @@ def carried_rows(poses, column, cameras, covariance, triple, interval, mean, var
 @helper
 def _whiten(J, covariance, triple, variance, S, r):
     """J (6, 18) and r (6,) times the inverse Cholesky factor of their noise ``diag(variance) + J P Jᵀ``, in place."""
-    P = np.zeros((18, 18))
-    for p in range(3):
+    for i in range(6):
+        for j in range(6):
+            S[i, j] = 0.0
         for o in range(3):
-            if triple[p] >= 0 and triple[o] >= 0:
-                for i in range(6):
-                    for j in range(6):
-                        P[6 * p + i, 6 * o + j] = covariance[6 * triple[p] + i, 6 * triple[o] + j]
-    S[:, :] = np.dot(J, np.dot(P, J.T))
+            for j in range(6 if triple[o] >= 0 else 0):
+                product = 0.0  # of row i of J and a column of P
+                for p in range(3):
+                    for h in range(6 if triple[p] >= 0 else 0):
+                        product += J[i, 6 * p + h] * covariance[6 * triple[p] + h, 6 * triple[o] + j]
+                for k in range(6):
+                    S[i, k] += product * J[k, 6 * o + j]
     for i in range(6):
         S[i, i] += variance[i]
     for i in range(6):

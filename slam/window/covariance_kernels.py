@@ -42,7 +42,9 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
                         total += X[row, 3 * d + i] * X[row, newest + j]
                     by[i, j] = total
         elif d == ELIMINATED and inverse[p, 0, 0] > 0.0:
-            A[:], AP[:] = 0.0, 0.0
+            for i in range(3):
+                for a in range(size):
+                    A[i, a] = AP[i, a] = 0.0
             for o in range(first[p], first[p + 1]):
                 m = order[o]
                 to = column[pose[m]] - prior
@@ -89,31 +91,6 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
             for j in range(3):
                 camera[c, i, j] += tmp[i, j] + tmp[j, i]
     return camera, world
-
-
-@kernel
-def lower_inverse(L):
-    """``L⁻¹`` of a lower triangular L (n, n), by blocks that double in size."""
-    n, size = len(L), 32
-    X = np.zeros((n, n))
-    for start in range(0, n, size):
-        stop = min(start + size, n)
-        for j in range(start, stop):
-            X[j, j] = 1.0 / L[j, j]
-            for i in range(j + 1, stop):
-                total = 0.0
-                for k in range(j, i):
-                    total += L[i, k] * X[k, j]
-                X[i, j] = -total / L[i, i]
-    while size < n:
-        for start in range(0, n - size, 2 * size):
-            middle, stop = start + size, min(start + 2 * size, n)
-            below = np.ascontiguousarray(L[middle:stop, start:middle])
-            first = np.ascontiguousarray(X[start:middle, start:middle])
-            last = np.ascontiguousarray(X[middle:stop, middle:stop])
-            X[middle:stop, start:middle] = -np.dot(last, np.dot(below, first))
-        size *= 2
-    return X
 
 
 @kernel

@@ -292,7 +292,9 @@ def by_point(point, count):
         first[point[m] + 1] += 1
     for p in range(count):
         first[p + 1] += first[p]
-    at = first.copy()
+    at = np.empty(count, np.int64)
+    for p in range(count):
+        at[p] = first[p]
     for m in range(len(point)):
         order[at[point[m]]] = m
         at[point[m]] += 1

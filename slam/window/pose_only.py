@@ -67,11 +67,17 @@ def least_squares(problem: PoseProblem, start: Array) -> tuple[Array, Array]:
     """
     whitener = _whiteners(problem.noise, problem.z)
     T = _gauss_newton(problem, whitener, start, np.ones(len(problem.z), bool))
-    _, J = residuals(problem, T)
-    G = (whitener @ J).reshape(-1, 6)
+    G = whitened_residuals(problem, T)[1].reshape(-1, 6)
     if not np.isfinite(T).all():
         raise np.linalg.LinAlgError("nothing determines the pose")
     return T, np.linalg.inv(problem.information + G.T @ G)
+
+
+def whitened_residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
+    """`residuals` and Jacobians scaled to unit variance (M, 3), (M, 3, 6); zero where a pixel is missing."""
+    r, J = residuals(problem, T)
+    whitener = _whiteners(problem.noise, problem.z)
+    return (whitener @ np.nan_to_num(r)[:, :, None])[:, :, 0], whitener @ J
 
 
 def residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from slam.geometry.arrays import Array, IndexArray
 from slam.window import covariance_kernels, kernels
@@ -57,7 +57,7 @@ class NormalEquations:
         """
         if not len(self.H):
             return self.H
-        L, info = dpotrf(self.H.T, lower=0, clean=0, overwrite_a=0)
+        L, info = dpotrf(self.H.T, lower=0, clean=1, overwrite_a=0)
         if info or not np.isfinite(L[-1:, -1:]).all():
             raise np.linalg.LinAlgError("the window's information is not positive definite")
         return np.asarray(L)  # upper triangle, Lᵀ in Fortran's order
@@ -179,7 +179,8 @@ class Solution:
     @cached_property
     def inverse_factor(self) -> Array:
         """``L⁻¹`` (n, n), lower triangular."""
-        return np.asarray(covariance_kernels.lower_inverse(self.equations.factor.T))
+        upper = self.equations.factor
+        return np.asarray(dtrtri(upper, lower=0)[0].T if len(upper) else upper)
 
     @cached_property
     def pose_covariance(self) -> Array:

@@ -35,3 +35,23 @@ def test_the_pose_and_its_covariance_are_the_filters(name):
     marginals = [np.sqrt(np.diagonal(e.covariances, axis1=1, axis2=2)) for e in estimates]
     np.testing.assert_allclose(marginals[1], marginals[0], rtol=0.02)
     assert (np.abs(other.positions - filtered.positions) / marginals[0]).max() < 5e-3
+
+
+def test_the_smoother_gives_what_least_squares_does_where_velocities_are_well_known():
+    """The motion model ties three poses: as a prediction of the third it would count twice what the first two tell."""
+    models = EstimatorModels(MotionModel(0.02, 0.02), pixel_sigma=0.3)
+    poses = path(16, 0.1, np.array([0.05, 0.0, 0.3]), np.array([0.0, 0.05, 0.0]))
+    data = scene(poses, points=60, sigma=0.3, limit=8)
+    estimates = []
+    for name, options in (
+        ("batch", {}),
+        ("smoother", {"motion": 0.0, "track": 1000, "lag": None}),
+    ):  # it leaves nothing out
+        backend = backends.create(name, RIG, models=models, **options)
+        run(backend, data)
+        estimates.append(backend.estimate())
+    best, ours = estimates
+    deviation = np.sqrt(np.diag(best.covariance))
+    difference = se3.log(se3.inverse(best.T_world_left) @ ours.T_world_left) / deviation
+    assert np.abs(difference).max() < 0.05  # standard deviations
+    np.testing.assert_allclose(np.sqrt(np.diag(ours.covariance)), deviation, rtol=0.03)

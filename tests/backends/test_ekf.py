@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 from backends.ekf import EkfBackend
 from backends.ekf.landmarks import COORDINATES, gauge_jacobian
 from backends.ekf.motion import turning
+from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError
 from slam.geometry import se3
@@ -90,12 +91,12 @@ def test_the_trajectory_is_not_revised(drive):
 # --- landmarks that have left the state ---
 
 
-def rounds(monkeypatch, most: int) -> EkfBackend:
+def rounds(monkeypatch, make, most: int) -> EkfBackend:
     """Two rounds past the same landmarks, of which at most so many are in the state."""
     monkeypatch.setattr("backends.ekf.state._MOST", most)
     monkeypatch.setattr("backends.ekf.state._LEAST", most - 10)
     data = scene(path(126, 0.1, FORWARD, YAW), points=500, seed=4)
-    backend = EkfBackend(RIG, MODELS)
+    backend = make(RIG, MODELS)
     run(backend, data)
     assert errors(backend, data.poses)[1] < 0.06
     assert nees(backend, data.poses[-1]) < chi2.ppf(0.999, 6)
@@ -106,8 +107,9 @@ def rounds(monkeypatch, most: int) -> EkfBackend:
     return backend
 
 
-def test_landmarks_leave_the_state_and_come_back(monkeypatch):
-    whole, some = rounds(monkeypatch, 1000), rounds(monkeypatch, 60)
+@pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
+def test_landmarks_leave_the_state_and_come_back(make, monkeypatch):
+    whole, some = rounds(monkeypatch, make, 1000), rounds(monkeypatch, make, 60)
     assert whole.state.covariance.count == len(whole.state.landmarks)
     assert some.state.covariance.count <= 60
     assert some.state.covariance.correlated - some.state.covariance.count > 60
@@ -200,10 +202,10 @@ def test_what_nothing_measures_stays_unknown(drive, landmarks, iterations):
     learnt = []
     for consistent in (True, False):
         backend, _ = halfway(drive, 25, models, landmarks=landmarks, consistent=consistent, iterations=iterations)
-        marks, camera = backend.state.landmarks, backend.state.camera
+        marks, camera = backend.state.landmarks, backend.state.camera.x
         shift = np.zeros((12 + 3 * len(marks), 6))
         shift[:3, :3], shift[:3, 3:] = np.eye(3), -se3.hat(camera[:3])
-        shift[3:6, 3:] = np.linalg.inv(turning(backend.state.R_world_angles, camera))
+        shift[3:6, 3:] = np.linalg.inv(turning(backend.state.camera.R_world_angles, camera))
         shift[6:9, 3:] = -se3.hat(camera[6:9])
         gauge = gauge_jacobian(COORDINATES[landmarks], marks.anchors, marks.c, marks.points)
         shift[12:] = gauge.reshape(-1, 6)

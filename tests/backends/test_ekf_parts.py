@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,13 +13,12 @@ from backends.ekf.angles import CANONICAL, anchor, attitude, body_rate_derivativ
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, InverseDepth, Landmarks, gauge_jacobian
 from backends.ekf.measurement import Jacobian, Measurement
-from backends.ekf.motion import Motion, advanced
-from backends.ekf.recovery import Agreement
-from backends.ekf.solve import Problem, UnsolvableError, gate, solve
+from backends.ekf.motion import EulerCamera
+from backends.ekf.solve import Iterate, Linear, Problem, System, UnsolvableError, gate, solve
 from backends.ekf.state import State
 from slam.errors import MeasurementError
 from slam.geometry import se3
-from slam.geometry.euler import angles, body_rate_matrix, rotation
+from slam.geometry.euler import angles, body_rate_matrix
 from slam.models import EstimatorModels, MotionModel
 from slam.testing import GENERAL_RIG
 from tests.backends.scenes import RIG
@@ -97,35 +97,37 @@ def test_the_jacobian_of_a_new_angles_world(phi):
 # --- measurements ---
 
 
-def model(rig, world, coordinates=None, anchors=None) -> Measurement:
+def model(rig, coordinates=None, anchors=None) -> Measurement:
     """With landmarks in world coordinates, which have no anchors, unless others are given."""
-    return Measurement(rig, world, coordinates or Euclidean(), np.zeros((0, 3, 4)) if anchors is None else anchors)
-
-
-def dense(H: Jacobian, n: int) -> np.ndarray:
-    whole = H.times(np.eye(n))
-    for i in range(len(whole)):
-        np.testing.assert_allclose(H.transposed_times(np.eye(len(whole))[i]), whole[i], atol=1e-9)
-    return whole
+    return Measurement(rig, coordinates or Euclidean(), np.zeros((0, 3, 4)) if anchors is None else anchors)
 
 
 @pytest.mark.parametrize("rig", [RIG, GENERAL_RIG], ids=["rectified", "general"])
 @pytest.mark.parametrize("phi", ATTITUDES)
 def test_measurement_jacobians(rig, phi):
+    """By the papers' [r, φ] and by the landmark, also where the pose has columns through the landmark's alone."""
     rng = np.random.default_rng(2)
-    world, r = se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(3)
+    camera = EulerCamera(np.concatenate([rng.standard_normal(3), phi, np.zeros(6)]), se3.so3_exp(np.ones(3)), False)
     h = rng.uniform((-1, -1, 4), (1, 1, 10), (5, 3))
-    points, pose, measured = h @ attitude(world, phi).T + r, np.concatenate([r, phi]), model(rig, world)
-    z, J = measured.linearise(pose, points, 6 + 3 * np.arange(5))
+    points, measured = se3.transform(camera.pose, h), model(rig)
+    z, own = measured.linearise(camera.pose, points)
     np.testing.assert_allclose(z, rig.project_stereo(h)[0], atol=1e-9)
-    H = dense(J, 21)
-    expected = jacobian(lambda x: measured.predict(x[:6], x[6:].reshape(-1, 3)), np.append(pose, points.reshape(-1)))
+    lever = gauge_jacobian(Euclidean(), np.zeros((5, 3, 4)), points, points) @ camera.world()
+    J = Jacobian.of(own, lever, 6 + 3 * np.arange(5))
+    H = J.times(np.eye(21))
+    for i in range(len(H)):
+        np.testing.assert_allclose(J.transposed_times(np.eye(len(H))[i]), H[i], atol=1e-9)
+
+    def predicted(x):
+        return measured.predict(replace(camera, x=np.append(x[:6], np.zeros(6))).pose, x[6:].reshape(-1, 3))
+
+    expected = jacobian(predicted, np.append(camera.x[:6], points.reshape(-1)))
     np.testing.assert_allclose(H, expected, rtol=1e-6, atol=1e-5)
     P = positive(21, rng)
     S = J.covariance(H @ P, 0.25)
     np.testing.assert_allclose(np.tril(S), np.tril(H @ P @ H.T + 0.25 * np.eye(15)), rtol=1e-9, atol=1e-6)
-    own = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(5)])
-    found = J.own_covariances(P[:6, :6], P[6:, :6].reshape(5, 3, 6), own)
+    blocks = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(5)])
+    found = J.own_covariances(P[:6, :6], P[6:, :6].reshape(5, 3, 6), blocks)
     for i in range(5):
         rows = slice(3 * i, 3 * i + 3)
         np.testing.assert_allclose(found[i], H[rows] @ P @ H[rows].T, rtol=1e-9, atol=1e-6)
@@ -133,9 +135,9 @@ def test_measurement_jacobians(rig, phi):
 
 def test_rows_not_measured_are_zero():
     points = np.array([[0.1, 0.2, 5.0], [0.3, -0.1, -4.0]])
-    _, H = model(RIG, np.eye(3)).linearise(np.zeros(6), points, np.array([6, 9]))
+    _, own = model(RIG).linearise(np.eye(4), points)
     rows = np.array([[True, True, False], [False] * 3])
-    H = H.only(rows).times(np.eye(12))
+    H = Jacobian.of(own, np.ones((2, 3, 6)), np.array([6, 9]), rows).times(np.eye(12))
     assert np.isfinite(H).all() and (H[2:] == 0).all() and (H[:2, :9] != 0).any(axis=1).all()
 
 
@@ -270,7 +272,7 @@ def state_of(landmarks: int, coordinates) -> tuple[State, np.ndarray, np.random.
     """A camera that moves among landmarks, and their true places in its coordinates."""
     rng = np.random.default_rng(5)
     h = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (landmarks, 3))
-    s = replace(State.first(MODELS), stamp=0.0, frame=0)
+    s = replace(State.first(*EulerCamera.first(MODELS, False)), stamp=0.0, frame=0)
     s = replace(s, covariance=s.covariance.camera_moved(np.eye(CAMERA), 1e-4 * positive(CAMERA, rng)))
     return s.placed(coordinates, np.arange(landmarks), h, RIG.triangulation_covariance(h, 0.5)), h, rng
 
@@ -283,14 +285,14 @@ def in_deviations(P: np.ndarray, of: np.ndarray) -> np.ndarray:
 
 def test_the_prediction_is_as_printed():
     s, _, _ = state_of(4, InverseDepth())
-    camera, P, dt = s.camera + 0.1 * np.arange(12.0) / 12, s.covariance.dense, 0.25
-    s = replace(s, camera=camera)
-    found = s.advanced(dt, advanced(MODELS, Motion(camera, s.R_world_angles), P[:12, :12], dt, False))
+    camera, P, dt = s.camera.x + 0.1 * np.arange(12.0) / 12, s.covariance.dense, 0.25
+    s = replace(s, camera=replace(s.camera, x=camera))
+    found = s.advanced(dt, s.camera.advanced(MODELS, P[:12, :12], dt))
     A, W = np.eye(len(P)), np.zeros((len(P), 6))
     A[:6, 6:12] = dt * np.eye(6)
     W[:6], W[6:12] = dt * np.eye(6), np.eye(6)
     linear, angular = MODELS.motion.velocity_variance(dt)
-    assert_equal_to_rounding(found.camera, A[:12, :12] @ camera)
+    assert_equal_to_rounding(found.camera.x, A[:12, :12] @ camera)
     expected = A @ P @ A.T + W @ np.diag([linear] * 3 + [angular] * 3) @ W.T
     assert_equal_to_rounding(in_deviations(found.covariance.dense, expected), in_deviations(expected, expected))
 
@@ -300,21 +302,24 @@ def test_the_update_is_the_joseph_form(coordinates):
     s, h, rng = state_of(12, coordinates)
     P, marks, first = s.covariance.dense, s.landmarks, CAMERA + 3 * np.arange(12)
     z = RIG.project_stereo(h + 0.01 * rng.standard_normal(h.shape))[0] + 0.3 * rng.standard_normal((12, 3))
-    measured = model(RIG, s.R_world_angles, coordinates, marks.anchors)
-    problem = Problem(P, s.camera[:6], marks.c, first, z, 0.5, measured, 1, 0.9999)
+    measured, rows = model(RIG, coordinates, marks.anchors), np.arange(12)
+    problem = Problem(partial(s.view, rows), marks.c, first, z, 0.5, measured, 1, 0.9999)
     solution = solve(problem, gate(problem))
     assert solution.used.all()
-    x = np.concatenate([s.camera, marks.c.reshape(-1)])
-    predict = lambda x: measured.predict(x[:6], x[12:].reshape(-1, 3)).reshape(-1)  # noqa: E731
+    x = np.concatenate([s.camera.x, marks.c.reshape(-1)])
+
+    def predict(x):
+        return measured.predict(replace(s.camera, x=x[:12]).pose, x[12:].reshape(-1, 3)).reshape(-1)
+
     H, nu = jacobian(predict, x, 1e-5), z.reshape(-1) - predict(x)
     S = H @ P @ H.T + 0.25 * np.eye(36)
     K = np.linalg.solve(S, H @ P).T
     J = np.eye(len(P)) - K @ H
     joseph = J @ P @ J.T + 0.25 * K @ K.T
-    after = s.corrected(coordinates, Agreement(solution), np.arange(12), False)
+    after = s.corrected(coordinates, solution, rows)
     difference = in_deviations(after.covariance.dense - joseph, joseph)
     assert np.abs(difference).max() < 1e-5  # what the differences leave in H
-    found = np.concatenate([after.camera, after.landmarks.c.reshape(-1)])
+    found = np.concatenate([after.camera.x, after.landmarks.c.reshape(-1)])
     np.testing.assert_allclose(found, x + K @ nu, rtol=1e-6, atol=1e-6)
     assert solution.system.w @ solution.system.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
 
@@ -323,11 +328,11 @@ def test_the_update_is_the_joseph_form(coordinates):
 def test_augmentation_is_the_derivative_of_triangulation(coordinates):
     s, _, _ = state_of(3, coordinates)
     h = np.array([[0.4, -0.3, 6.0]])
-    noise, P, camera = RIG.triangulation_covariance(h, 0.5), s.covariance.dense, s.camera
+    noise, P, camera = RIG.triangulation_covariance(h, 0.5), s.covariance.dense, s.camera.x
     after = s.placed(coordinates, np.array([9]), h, noise)
 
     def of(x):
-        turned = attitude(s.R_world_angles, x[3:6])
+        turned = attitude(s.camera.R_world_angles, x[3:6])
         return coordinates.of(after.landmarks.anchors[-1:], x[:3] + (h + x[6:]) @ turned.T)[0]
 
     J = jacobian(of, np.concatenate([camera[:6], np.zeros(3)]))
@@ -343,18 +348,22 @@ def test_augmentation_is_the_derivative_of_triangulation(coordinates):
 # --- the update: iterated, gated ---
 
 
-def far_off(iterations: int, guess: bool = False) -> Problem:
+def far_off(iterations: int, guess: bool = False) -> tuple[State, Problem]:
     """An update whose prior is 1.5 m and 0.15 rad off, with points at 4 to 8 m."""
     rng = np.random.default_rng(13)
-    world, phi = anchor(np.eye(3))
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (12, 3))
-    truth = np.concatenate([[0.3, -0.2, 1.5], phi + np.array([0.05, 0.15, -0.1])])
-    measured, pose = model(RIG, world), np.concatenate([np.zeros(3), phi])
-    z = measured.predict(truth, points) + 0.5 * rng.standard_normal((12, 3))
-    c = points + 0.05 * rng.standard_normal((12, 3))
-    P = np.diag(np.concatenate([np.full(3, 1.5**2), np.full(3, 0.2**2), np.full(36, 0.05**2)]))
-    change, first = truth - pose if guess else None, 6 + 3 * np.arange(12)
-    return Problem(P, pose, c, first, z, 0.5, measured, iterations, 0.9999, change)
+    s = State.first(*EulerCamera.first(MODELS, False))
+    truth = s.camera.moved(np.concatenate([[0.3, -0.2, 1.5, 0.05, 0.15, -0.1], np.zeros(6)])).pose
+    z = model(RIG).predict(truth, points) + 0.5 * rng.standard_normal((12, 3))
+    marks = Landmarks.at(
+        Euclidean(), np.arange(12), np.zeros((12, 3, 4)), points + 0.05 * rng.standard_normal((12, 3)), 0
+    )
+    P = np.diag(np.concatenate([np.full(3, 1.5**2), np.full(3, 0.2**2), np.ones(6), np.full(36, 0.05**2)]))
+    covariance = Covariance(P, np.zeros((48, 0)), np.zeros((0, 0)), np.zeros((0, 3, 3)))
+    s, rows = replace(s, landmarks=marks, covariance=covariance), np.arange(12)
+    view = partial(s.view, rows)
+    guessed = truth if guess else None
+    return s, Problem(view, marks.c, CAMERA + 3 * rows, z, 0.5, model(RIG), iterations, 0.9999, guessed)
 
 
 def ungated(problem: Problem):
@@ -362,20 +371,29 @@ def ungated(problem: Problem):
     return solve(problem, replace(gate(replace(problem, gate_probability=1 - 1e-15)), limits=np.full(12, 1e9)))
 
 
-def residuals(problem: Problem, change: np.ndarray) -> np.ndarray:
+def corrected(s: State, problem: Problem) -> np.ndarray:
+    """The change of the state (48,) that an update makes."""
+    after = s.corrected(Euclidean(), ungated(problem), np.arange(12))
+    return np.concatenate([after.camera.x - s.camera.x, (after.landmarks.c - s.landmarks.c).reshape(-1)])
+
+
+def residuals(s: State, problem: Problem, change: np.ndarray) -> np.ndarray:
     """Whitened: of the prior, whose covariance is diagonal, and of the measurements."""
-    z = problem.model.predict(problem.pose + change[:6], problem.c + change[6:].reshape(-1, 3))
-    return np.concatenate([change / np.sqrt(np.diag(problem.P)), ((problem.z - z) / problem.sigma).reshape(-1)])
+    z = problem.model.predict(s.camera.moved(change[:12]).pose, problem.c + change[12:].reshape(-1, 3))
+    prior = change / np.sqrt(np.diag(s.covariance.dense))
+    return np.concatenate([prior, ((problem.z - z) / problem.sigma).reshape(-1)])
 
 
 @pytest.mark.parametrize("guess", [False, True])
 def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch):
     monkeypatch.setattr("backends.ekf.solve._LINEAR", 1e-6)
-    problem = far_off(30, guess)
-    solution, deviation = ungated(problem), np.sqrt(np.diag(problem.P))
+    s, problem = far_off(30, guess)
+    deviation = np.sqrt(np.diag(s.covariance.dense))
+    solution = ungated(problem)
     assert solution.used.all()
-    best = least_squares(lambda x: residuals(problem, deviation * x), np.zeros(42), xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    np.testing.assert_allclose(solution.change, deviation * best.x, atol=1e-5)
+    cost = lambda x: residuals(s, problem, deviation * x)  # noqa: E731
+    best = least_squares(cost, np.zeros(48), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    np.testing.assert_allclose(corrected(s, problem), deviation * best.x, atol=1e-5)
     w = solution.system.w
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
@@ -383,55 +401,55 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch)
 def test_more_iterations_never_raise_the_cost():
     costs = []
     for iterations in (2, 3, 5, 8):
-        r = residuals(far_off(iterations), ungated(far_off(iterations)).change)
+        s, problem = far_off(iterations)
+        r = residuals(s, problem, corrected(s, problem))
         costs.append(r @ r)
-    start = residuals(far_off(2), np.zeros(42))
+    start = residuals(s, problem, np.zeros(48))
     assert costs[0] < start @ start and (np.diff(costs) <= 1e-9).all()
     assert costs[-1] < 2 * 36
 
 
 def test_a_step_that_lowers_no_cost_is_no_information(monkeypatch):
     """Where the mean does not move towards the measurements, the variance must not fall either."""
-    monkeypatch.setattr("backends.ekf.solve._descend", lambda problem, rows, now, target: (now, False))
+    monkeypatch.setattr("backends.ekf.solve._descend", lambda problem, rows, now, s, change: (now, change))
     with pytest.raises(UnsolvableError, match="cost"):
-        ungated(far_off(5))
+        ungated(far_off(5)[1])
 
 
 def test_what_is_taken_out_was_never_there():
     """A landmark's distance from what the others predict is the fall of the NIS when it is left out."""
-    problem = far_off(1)
-    system, P = gate(replace(problem, gate_probability=1 - 1e-15)).system(), problem.P
+    s, problem = far_off(1)
+
+    def system(problem: Problem) -> System:
+        linear = gate(replace(problem, gate_probability=1 - 1e-15)).linear
+        return System.of(linear, np.zeros_like(linear.rows))
+
+    every, P = system(problem), s.covariance.dense
     for gone in ([0], [5], [11], [3, 4, 8]):
         mask = np.isin(np.arange(12), gone)[:, None] & np.ones(3, bool)
-        without = system.without(mask)
+        without = every.without(mask)
         if len(gone) == 1:
-            fall = system.w @ system.w - without.w @ without.w
-            assert fall == pytest.approx(system.distances()[gone[0]], rel=1e-6)
-        fresh = gate(replace(problem, z=np.where(mask, np.nan, problem.z), gate_probability=1 - 1e-15)).system()
+            fall = every.w @ every.w - without.w @ without.w
+            assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
+        fresh = system(replace(problem, z=np.where(mask, np.nan, problem.z)))
         np.testing.assert_allclose(without.y @ without.HP, fresh.y @ fresh.HP, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
         V, W = without.whitened(without.HP), fresh.whitened(fresh.HP)
         np.testing.assert_allclose(in_deviations(V @ V.T, P), in_deviations(W @ W.T, P), atol=1e-9)
 
 
-def test_a_large_displacement_of_the_world_changes_no_prediction():
-    """By metres, in coordinates that are not linear in it: nor does an update that is linearised there measure it."""
-    rng = np.random.default_rng(3)
-    world, phi = anchor(np.eye(3))
-    points, anchors = rng.uniform((-4, -2, 8), (4, 2, 30), (40, 3)), np.tile(np.eye(3, 4), (40, 1, 1))
-    coordinates, pose = InverseDepth(), np.concatenate([np.zeros(3), phi])
-    c, U = coordinates.of(anchors, points), np.zeros((126, 6))
-    U[:3, :3] = np.eye(3)
-    U[3:6, 3:] = np.linalg.inv(world @ rotation(phi) @ body_rate_matrix(phi))
-    U[6:] = gauge_jacobian(coordinates, anchors, c, points).reshape(-1, 6)
-    own = np.diag(np.concatenate([np.full(3, 0.1**2), np.full(3, 0.01**2), np.tile([1e-6, 1e-6, 1e-7], 40)]))
-    P = own + U @ np.diag(np.repeat([3.0, 0.03], 3) ** 2) @ U.T
-    measured, first = model(RIG, world, coordinates, anchors), 6 + 3 * np.arange(40)
-    z = measured.predict(pose, c)
-    problem = Problem(0.5 * (P + P.T), pose, c, first, z, 0.5, measured, 5, 0.999, gauge=lambda: U)
-    change = U @ np.array([2.0, -1.0, 3.0, 0.03, -0.02, 0.05])
-    assert np.nanmax(np.abs(measured.predict(*problem.mean(change, whole=True)) - z)) > 1.0
-    np.testing.assert_allclose(measured.predict(*problem.mean(change)), z, atol=1e-5)
-    there = problem.mean(change + np.linalg.cholesky(own) @ rng.standard_normal(126))
-    H = measured.linearise(*there, first)[1].without(problem.displacement)
-    np.testing.assert_allclose(dense(H, 126) @ U, 0, atol=1e-4)  # [px/m], [px/rad]
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
+def test_no_linearisation_measures_a_displacement_of_the_world(coordinates):
+    """By metres, seen from wherever, with landmarks changed by whatever: H is zero along it."""
+    s, _, rng = state_of(12, coordinates)
+    s, rows = replace(s, camera=replace(s.camera, transports=True)), np.arange(12)
+    z, measured = np.full((12, 3), 100.0), model(RIG, coordinates, s.landmarks.anchors)
+    problem = Problem(partial(s.view, rows), s.landmarks.c, CAMERA + 3 * rows, z, 0.5, measured, 5, 0.9)
+    for T in (None, s.pose @ se3.exp(np.array([0.05, -0.1, 0.02, 0.5, -0.2, 0.3]))):
+        view = problem.view(T, None)
+        at = Iterate.at(problem, view, 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c)
+        H = Linear.at(problem, np.ones((12, 3), bool), at).H.times(np.eye(48))
+        U = np.zeros((48, 6))
+        U[:6] = np.linalg.inv((s.camera if T is None else s.camera.at(T)).world())
+        U[12:] = s.landmarks.gauge.reshape(-1, 6)
+        np.testing.assert_allclose(H @ U, 0, atol=1e-7)  # [px/m], [px/rad]

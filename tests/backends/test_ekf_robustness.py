@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from backends.ekf import EkfBackend
+from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
@@ -29,6 +30,8 @@ from tests.backends.ekf_runs import (
 from tests.backends.scenes import RIG, Scene, cloud, observe, path, run, scene, step
 
 # --- gaps and turns ---
+
+BOTH = pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +63,13 @@ def test_a_turn_through_the_singularity_in_one_step():
     assert errors(backend, data.poses)[0] < 0.02
 
 
-def test_the_first_step_may_be_long():
+@BOTH
+def test_the_first_step_may_be_long(make):
     """A car at 15 m/s with points at 10 m, when nothing is known of its speed."""
     for seed in range(5):
         poses, rng = path(3, 0.1, 10 * FORWARD, 0.1 * YAW), np.random.default_rng(seed)
         points = cloud(poses, 60, rng, 6.0, 14.0)
-        backend, known = EkfBackend(RIG, replace(models_for("driving"), pixel_sigma=0.5)), set()
+        backend, known = make(RIG, replace(models_for("driving"), pixel_sigma=0.5)), set()
         for k, T in enumerate(poses):
             report = step(backend, 0.1 * k, observe(T, points, 0.5, rng, 60), known)
         assert len(report.used) > 15 and len(report.rejected) <= 1
@@ -73,35 +77,38 @@ def test_the_first_step_may_be_long():
         assert nees(backend, poses[-1]) < chi2.ppf(0.9999, 6)
 
 
+@BOTH
 @pytest.mark.parametrize("gap", [1.0, 3.0])
-def test_gaps_of_seconds(gap):
+def test_gaps_of_seconds(make, gap):
     poses, rng = path(6, gap, 3 * FORWARD, 0.05 * YAW), np.random.default_rng(0)
     points = cloud(poses, 300, rng, 5.0, 40.0)
-    backend, known = EkfBackend(RIG, replace(models_for("driving"), pixel_sigma=0.5)), set()
+    backend, known = make(RIG, replace(models_for("driving"), pixel_sigma=0.5)), set()
     for k, T in enumerate(poses):
         report = step(backend, gap * k, observe(T, points, 0.5, rng, 40), known)
         assert k == 0 or len(report.used) > 5 * len(report.rejected)
     assert np.linalg.norm(backend.trajectory().poses[-1][:3, 3] - poses[-1][:3, 3]) < 0.05 * 5 * gap * 4.5
 
 
-def test_a_shock_beyond_the_motion_model_is_followed():
+@BOTH
+def test_a_shock_beyond_the_motion_model_is_followed(make):
     before = path(15, 0.1, 0.3 * FORWARD, STILL)
     after = before[-1] @ path(15, 0.1, np.array([1.2, 0, 0]), 0.8 * YAW)[1:]
     data = scene(np.concatenate([before, after]), points=300)
-    backend = EkfBackend(RIG, EstimatorModels(MotionModel(0.1, 0.1), pixel_sigma=0.5))
+    backend = make(RIG, EstimatorModels(MotionModel(0.1, 0.1), pixel_sigma=0.5))
     reports = run(backend, data)
     assert all(len(r.used) > len(r.rejected) for r in reports[1:])
     assert errors(backend, data.poses).max() < 0.05
 
 
+@BOTH
 @pytest.mark.parametrize("gap", [1e3, 1e5, 1e9])
-def test_a_gap_of_any_length(gap):
+def test_a_gap_of_any_length(make, gap):
     """A paused recording, while the camera was moved a little: tracked again from the first frame on."""
     for moved in (np.zeros(6), np.array([0.1, -0.3, 0.05, 0.4, -0.2, 0.3])):
         before = path(15, 0.1, 0.5 * FORWARD, 0.1 * YAW)
         poses = np.concatenate([before, before[-1] @ se3.exp(moved) @ path(15, 0.1, 0.5 * FORWARD, 0.1 * YAW)])
         data = scene(poses, points=200)
-        backend, known = EkfBackend(RIG, MODELS), set()
+        backend, known = make(RIG, MODELS), set()
         for k, (stamp, _, seen) in enumerate(data):
             report = step(backend, stamp + (gap if k >= 15 else 0), seen, known)
             assert k == 0 or len(report.used) > 5 * len(report.rejected)
@@ -110,15 +117,16 @@ def test_a_gap_of_any_length(gap):
         assert np.linalg.eigvalsh(P / np.sqrt(np.outer(P.diagonal(), P.diagonal()))).min() > 0
 
 
+@BOTH
 @pytest.mark.parametrize("count", [5, 7, 20])
-def test_known_landmarks_are_found_again_after_a_blind_stretch(count):
+def test_known_landmarks_are_found_again_after_a_blind_stretch(make, count):
     """The camera went where the motion model does not expect it, and sees but landmarks it knows: it starts there."""
     before, after = path(15, 0.1, 0.3 * FORWARD, STILL), path(20, 0.1, 0.3 * FORWARD, 0.1 * YAW)
     hidden = se3.exp(np.array([0.05, 0.3, -0.1, 1.5, -0.5, 1.0]))
     poses = np.concatenate([before, before[-1] @ hidden @ after])
     rng = np.random.default_rng(2)
     points = cloud(poses[:1], 60, rng, 6.0, 12.0)
-    backend, known = EkfBackend(RIG, EstimatorModels(MotionModel(0.02, 0.02), pixel_sigma=0.5)), set()
+    backend, known = make(RIG, EstimatorModels(MotionModel(0.02, 0.02), pixel_sigma=0.5)), set()
     for k, T in enumerate(before):
         step(backend, 0.1 * k, observe(T, points, 0.5, rng, 60), known)
     backend.predict(1.6)
@@ -155,12 +163,13 @@ def test_an_update_that_ends_a_great_uncertainty_keeps_all_its_digits(landmarks)
     assert (np.linalg.eigvalsh(backend.estimate().covariances)[:, 0] > 0).all()
 
 
-def test_a_pair_that_is_not_in_step_moves_nothing():
+@BOTH
+def test_a_pair_that_is_not_in_step_moves_nothing(make):
     """The first right images were taken at other times, at 10 m/s: their landmarks contradict all that follows."""
     poses, rng = path(10, 0.1, 6.7 * FORWARD, STILL), np.random.default_rng(1)
     models = replace(models_for("driving"), pixel_sigma=0.5)
     points = cloud(poses, 150, rng, 10.0, 50.0)
-    backend, known = EkfBackend(RIG, models), set()
+    backend, known = make(RIG, models), set()
     late = se3.pose(np.eye(3), [0, 0, 0.5])
     for k, T in enumerate(poses):
         seen = observe(T, points, 0.5, rng, 150)
@@ -177,10 +186,11 @@ def test_a_pair_that_is_not_in_step_moves_nothing():
 # --- robustness ---
 
 
+@BOTH
 @pytest.mark.parametrize("share", [0.1, 0.4])
-def test_wrong_matches_are_found(drive, share):
+def test_wrong_matches_are_found(make, drive, share):
     rng = np.random.default_rng(3)
-    backend, known, missed, false, wrong = EkfBackend(RIG, MODELS), set(), 0, 0, 0
+    backend, known, missed, false, wrong = make(RIG, MODELS), set(), 0, 0, 0
     for stamp, _, seen in drive:
         old = np.array([i in known for i in seen.ids.tolist()], bool)
         backend.predict(stamp)

@@ -82,6 +82,26 @@ def test_errors_fit_the_covariances_over_seeds():
     assert 1.5 < np.mean(squared) < 9  # 6 expected; the path is smoother than the motion model expects
 
 
+def test_landmarks_that_were_found_together_do_not_all_begin_anew_together():
+    """That would leave but the motion model between two poses, and the newest one 2.8 times as uncertain."""
+    data = drive(22, points=150)
+    ours, best = (
+        SmootherBackend(RIG, MODELS, motion=0.0),
+        SmootherBackend(RIG, MODELS, motion=0.0, lag=None, track=1000),
+    )
+    deviations = []
+    for backend in (ours, best):
+        run(backend, data)
+        deviations.append(np.sqrt(np.trace(backend.estimate(landmarks=False).covariance[3:, 3:])))
+    assert deviations[0] < 1.4 * deviations[1], deviations
+    serials = np.concatenate([sight.serials for sight in ours.state.sights[1:]])
+    begun = np.concatenate([sight.begun for sight in ours.state.sights[1:]])
+    first = np.array([begun[serials == n].min() for n in np.unique(serials)])
+    second = np.array([np.setdiff1d(begun[serials == n], [m])[:1] for n, m in zip(np.unique(serials), first)], object)
+    at = np.concatenate([np.asarray(x, int) for x in second])
+    assert len(at) > 10 and np.bincount(at).max() < 0.4 * len(at), "one after the other"
+
+
 def test_what_removed_landmarks_have_told_stays_known():
     data = drive(25)
     backend = SmootherBackend(RIG, MODELS)
@@ -241,6 +261,20 @@ def test_right_pixels_are_mended_afterwards(options):
     assert np.median((np.linalg.norm(local - truth, axis=1) / deviations)[seen]) < 0.6  # of its own uncertainty
 
 
+def test_a_revision_that_changes_nothing_leaves_the_covariances():
+    """Up to what poses that have left the lag told of it: the graph is built anew from the poses of the lag alone."""
+    data = drive(30, points=250)
+    backend = tracked(data)
+    before = backend.estimate()
+    backend.revise(lambda z: z)
+    after = backend.estimate()
+    np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-6, atol=1e-12)
+    seen = np.isin(before.ids, data.observations[-1].ids)
+    sizes = [np.sqrt(np.trace(e.covariances, axis1=1, axis2=2))[seen] for e in (before, after)]
+    np.testing.assert_allclose(sizes[1], sizes[0], rtol=0.12)
+    assert abs(np.median(sizes[1] / sizes[0]) - 1) < 0.01
+
+
 def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
     data = drive(60, points=400)
     backend = tracked(data, lag=6, past=0, motion=0.0)
@@ -305,7 +339,7 @@ def test_a_track_that_cannot_be_triangulated_does_not_end_the_solver():
     values = gtsam.Values()
     for i, pose in enumerate(T):
         values.insert(pose_key(i), to_pose3(pose))
-    make.smart([make.point(row) for row in z], range(3)).linearize(values)
+    make.smart([make.point(row) for row in z], [pose_key(i) for i in range(3)]).linearize(values)
 
 
 def test_a_landmark_close_by_does_not_explain_any_pixel():

@@ -21,8 +21,8 @@ from slam.registry import BUILT_IN, ONLINE
 from tests.backends.scenes import RIG, cloud, observe, path, random_path, run, scene, step
 
 
-def test_the_online_back_ends_are_all_but_the_one_that_solves_at_the_end():
-    assert set(ONLINE) == set(BUILT_IN["backends"]) - {"batch"}
+def test_the_online_back_ends_are_all_but_the_one_that_solves_at_the_end_and_the_second_filter():
+    assert set(ONLINE) == set(BUILT_IN["backends"]) - {"batch", "iekf"}
 
 
 def test_a_path_longer_than_the_window_is_the_optimum():

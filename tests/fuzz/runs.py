@@ -21,9 +21,10 @@ from slam.errors import SequenceError, SlamError
 from slam.files import lock_folder
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.map_io import load_map
+from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS
 from slam.run.recording import load_recording
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.sequences.base import Sequence
 from tests.fuzz.harness import Broken, Subject, require_line
 from tests.fuzz.hostile import choose

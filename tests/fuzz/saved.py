@@ -21,10 +21,11 @@ from slam.config import SystemConfig
 from slam.mapping.map_io import SavedMap, decode, encode
 from slam.objects.config import ObjectsConfig
 from slam.objects.procedure1 import ObjectDatabase
+from slam.run.options import RunOptions
 from slam.run.recorded import record
 from slam.run.recording import load_recording, save_recording
 from slam.run.run_data import RunData, read_objects
-from slam.run.runner import RunOptions, run_recording
+from slam.run.runner import run_recording
 from slam.system import StereoSlam
 from tests.fuzz.harness import Broken, Subject
 from tests.fuzz.hostile import VALUES, broken_bytes, broken_text, choose

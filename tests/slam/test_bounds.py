@@ -9,7 +9,7 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, one_line
-from slam.run.runner import parse_frames
+from slam.run.options import parse_frames
 from tests.fuzz.settings import CLASSES
 
 HOSTILE = (None, "x", b"x", [], {}, 1j, 10**23, 10**400, 1e308, -1e308, np.nan, np.inf, -1, (1, 2, 3, 4), object())

@@ -119,7 +119,7 @@ def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monke
         ("mpa.grid=3", "'map.grid'"),
         ("mapp.gird=3", "'map'"),
         ("max_landmarks=3", "'map.max_landmarks'"),
-        ("map.pixel_sigma=3", "'models.pixel_sigma' or 'self_calibration.pixel_sigma'"),
+        ("map.max_speed=3", "'models.objects.max_speed' or 'objects.max_speed'"),
     ],
 )
 def test_a_setting_is_suggested(setting, meant):

@@ -12,7 +12,8 @@ import slam
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFrame
 from slam.input.warnings import REPEATED
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 
 SEQUENCE = slam.open_sequence("synthetic:desk?frames=20")
 FRAMES = list(SEQUENCE)

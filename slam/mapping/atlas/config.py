@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from slam.chi_square import chi_square_beyond
 from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_not_negative
 
@@ -35,7 +36,8 @@ class AtlasConfig:
             image's width.
         agreeing: number of keyframes, 1 or 2, that must see the same loop before it is closed; the second at most three
             keyframes after the first.
-        gate_sigmas: a loop is refused if it contradicts the path by more than this many standard deviations.
+        gate_sigmas: a loop is closed if its distance from the path is at most this many standard deviations. Beyond
+            what is as rare as a Gaussian number so far off, it is refused; between the two it is left out.
         most_loops: largest number of loops in the pose graph, as each makes the next one slower; beyond it, those
             spread most evenly along the path are kept.
         give_back: landmarks of a revisited place return to the back end, if it can place landmarks.
@@ -64,3 +66,8 @@ class AtlasConfig:
         require_not_negative(self, _RANGES, "atlas")
         if self.keyframe_share > 1:
             raise ConfigurationError("atlas: keyframe_share is a share between 0 and 1")
+
+    @property
+    def refused_beyond(self) -> float:
+        """Squared Mahalanobis distance of a loop's six numbers from the path beyond which it shows another place."""
+        return max(self.gate_sigmas**2, chi_square_beyond(6, self.gate_sigmas))

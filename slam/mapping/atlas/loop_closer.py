@@ -336,7 +336,7 @@ class LoopCloser:
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
         limit, off = self._config.gate_sigmas**2, disagreement(graph, loop)
         if off > limit and not (same_view and np.isfinite(off)):
-            return self._refuse(atlas, chain, loop, seen, rig)
+            return self._left_out(atlas, chain, loop, seen, rig, off > self._config.refused_beyond)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
@@ -345,30 +345,35 @@ class LoopCloser:
             atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
             chain = atlas.chain(rig, path())
             graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
-        elif atlas.loops and not is_informative(graph, atlas.loops[-1], loop):
+        elif atlas.loops and not is_informative(graph, loop):
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
-            return self._refuse(replace(atlas, pending=None), chain, loop, seen, rig)
+            return self._left_out(replace(atlas, pending=None), chain, loop, seen, rig)
         atlas = atlas.with_loop(loop, self._config.most_loops).solved_by(graph.solution(), rig)
         return atlas, self._returned(seen) if self._config.give_back else None
 
-    def _refuse(
-        self, atlas: Atlas, chain: Chain, loop: Loop, seen: Verified, rig: CommonError
+    def _left_out(
+        self, atlas: Atlas, chain: Chain, loop: Loop, seen: Verified, rig: CommonError, refused: bool = True
     ) -> tuple[Atlas, Returned | None]:
-        """Refuse a loop that contradicts the others, or refuse the others if fewer places support them."""
+        """Leave out a loop that contradicts the others, or the others if fewer places support them.
+
+        One that is not `refused` contradicts them by no more than may be: it does not count as another place.
+        """
         from slam.mapping.atlas.consensus import agreeing, spaced
         from slam.mapping.atlas.pose_graph import PoseGraph
 
-        most, limit, refused = self._config.most_loops, self._config.gate_sigmas**2, {*atlas.refused, loop.pair}
-        atlas = replace(atlas.with_inactive_loop(loop, most), refused=(*atlas.refused, loop.pair))
+        most, limit = self._config.most_loops, self._config.gate_sigmas**2
+        atlas = atlas.with_inactive_loop(loop, most)
+        if refused:
+            atlas = replace(atlas, refused=(*atlas.refused, loop.pair))
         left = self._config.return_depths * np.array([k.depth for k in atlas.keyframes])
         every, start = (*atlas.loops, *atlas.inactive_loops), atlas.in_map(chain)
 
         def places(loops: Sequence[Loop]) -> list[Loop]:
             return spaced(loops, atlas.travelled, left)
 
-        if not atlas.loops or len(places([x for x in atlas.inactive_loops if x.pair in refused])) < 2:
+        if not atlas.loops or len(places(atlas.inactive_loops)) < 2:
             return atlas, None
         rival = agreeing(chain, every, loop, chain.poses, limit)
         if len(places(rival)) <= len(places(agreeing(chain, every, atlas.loops[-1], start, limit))):
@@ -403,13 +408,12 @@ class LoopCloser:
         return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
 
 
-def is_informative(graph: PoseGraph, last: Loop, loop: Loop) -> bool:
-    """Whether a loop is more certain than the path since the last loop, in any direction.
+def is_informative(graph: PoseGraph, loop: Loop) -> bool:
+    """Whether a loop is more certain than what path and loops so far say of it, in any direction.
 
-    The path's uncertainty includes that of the common errors after the loops so far: in a place that is seen again and
-    again these are soon known, and most loops add nothing.
+    In a place that is seen again and again they soon know as much, and most loops add nothing.
     """
-    _, P = graph.relative_pose(last.second, loop.second)
+    _, P = graph.relative_pose(loop.first, loop.second)
     return bool(eigvalsh(P, loop.covariance)[-1] > 1.0)
 
 

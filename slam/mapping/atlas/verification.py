@@ -11,12 +11,12 @@ from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe
+from slam.mapping.atlas.keyframes import Keyframe, covariance_growth
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import Matches, match_everywhere
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
-from slam.window.pose_only import PoseProblem, least_squares
+from slam.window.pose_only import PoseProblem, least_squares, whitened_residuals
 from slam.window.stereo import RectifiedStereo
 
 _ROUNDS = 2  # numerics: of least squares, with the points' noise in the pixels as seen from the last pose
@@ -30,7 +30,7 @@ class Verified:
         keyframe: that shows it.
         T_keyframe_left: pose (4, 4) of the present camera in the keyframe's coordinates.
         covariance: of that pose (6, 6), perturbing on the right.
-        noise: the part of the covariance (6, 6) due to pixel noise of both frames.
+        noise: the part of the covariance (6, 6) due to the features' own errors in both frames.
         matches: inliers, as rows of the keyframe's features and of the present frame's.
     """
 
@@ -89,7 +89,10 @@ def refined_pose(
 ) -> tuple[Array, Array]:
     """Least-squares pose (4, 4) and its covariance (6, 6) from points triangulated in one earlier stereo frame.
 
-    Both frames have noise: the points' covariance is propagated to the present pixels.
+    Both frames have noise: the points' covariance is propagated to the present pixels. From another viewpoint a feature
+    is found at another point of the surface, and some matches are wrong, so errors may be many times as large. The
+    residuals tell: the covariance has what the jackknife finds beyond that by pixel noise, how far the pose moves when
+    one match is left out (Efron and Stein, Annals of Statistics 9(3), 1981).
 
     Args:
         rig: the cameras, rectified.
@@ -107,8 +110,23 @@ def refined_pose(
     for _ in range(_ROUNDS):
         H = rig.project_stereo(transform(inverse(T), points))[1] @ T[:3, :3].T
         noise = pixel_sigma**2 * np.eye(3) + H @ own @ np.swapaxes(H, 1, 2)
-        T, P = least_squares(PoseProblem(stereo, points, z, noise, T, np.zeros((6, 6)), 1.0), T)
-    return T, P
+        problem = PoseProblem(stereo, points, z, noise, T, np.zeros((6, 6)), 1.0)
+        T, P = least_squares(problem, T)
+    return T, P + covariance_growth(_jackknife(problem, T, P), P)
+
+
+def _jackknife(problem: PoseProblem, T: Array, P: Array) -> Array:
+    """Covariance (6, 6) of a least-squares pose (4, 4) by leaving out each match in turn, to first order.
+
+    Args:
+        problem: of which the pose is the solution.
+        T: the pose.
+        P: its covariance (6, 6) by the problem's noise.
+    """
+    r, G = whitened_residuals(problem, T)
+    leverage = G @ P @ np.swapaxes(G, 1, 2)
+    moved = P @ (np.swapaxes(G, 1, 2) @ np.linalg.solve(np.eye(3) - leverage, r[:, :, None]))
+    return np.asarray(moved[:, :, 0].T @ moved[:, :, 0])
 
 
 def _rows(keyframe: Keyframe) -> LandmarkTable:

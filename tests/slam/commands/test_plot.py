@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import shutil
 
+import numpy as np
 import pytest
 
 from slam.commands.plot import plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
+from slam.run.figures import pose_errors
+from slam.run.options import RunOptions
 from slam.run.plots import KINDS
-from slam.run.runner import RunOptions, run
+from slam.run.run_data import RunData
+from slam.run.runner import run
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=8&width=160&height=120"
@@ -52,3 +56,12 @@ def test_a_picture_that_is_there_is_not_replaced(runs, tmp_path):
     with pytest.raises(SlamError, match="is there already"):
         plot_runs([runs / "a"], tmp_path / "paper.pdf", "path")
     assert (tmp_path / "paper.pdf").read_text() == "mine"
+
+
+def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
+    """What the headline says of the covariances counts both."""
+    run_ = RunData.read(runs / "a", "a")
+    _, error, sigma = pose_errors(run_)
+    summary = run_.summary["accuracy"]["online"]
+    assert np.sqrt(np.mean(error[:, 3] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
+    assert (error[1:, 3] < 5 * sigma[1:, 3]).all() and (sigma[1:, 3] > 0).all()

@@ -52,11 +52,11 @@ def test_a_run_is_repeated_byte_for_byte(here):
 
 def test_what_is_said_beside_the_config_holds(here):
     slam("run", WORLD, "--frames", "0:3", "--set", "map.max_landmarks=301", "--out", "first", "-q", "--no-picture")
-    words = ["--backend", "smoother", "--frames", "1:3", "--set", "map.confirmed=4"]
+    words = ["--backend", "smoother", "--frames", "1:3", "--set", "map.restart_after=4"]
     slam("run", "--config", "first", *words, "--out", "other", "-q", "--no-picture")
     tree = json.loads((here / "other" / "config.json").read_text())
     assert (tree["backend"], tree["frames"]) == ("smoother", [1, 3])
-    assert (tree["settings"]["map"]["max_landmarks"], tree["settings"]["map"]["confirmed"]) == (301, 4)
+    assert (tree["settings"]["map"]["max_landmarks"], tree["settings"]["map"]["restart_after"]) == (301, 4)
     assert tree["settings"]["backend"] == {}
 
 

@@ -10,7 +10,7 @@ from slam.commands.settings import listing
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.run.settings_reference import settings
-from slam.settings import leaves
+from slam.settings import SETTABLE, can_be_set, leaves, require_settable
 
 RIG = slam.StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
 
@@ -26,32 +26,62 @@ def read(every, monkeypatch):
     monkeypatch.setattr("slam.commands.settings.settings", lambda: every)
 
 
-def test_every_setting_is_there_with_its_defaults(every):
+def test_what_can_be_set_is_there_with_its_defaults(every):
     shown = {s.key: s for s in every if not s.owner}
     for kind in ("handheld", "driving"):
         tree = SystemConfig.for_kind(kind).to_json()
         keys = [key for key in leaves(tree) if key.partition(".")[0] not in ("frontend", "backend")]
-        assert set(keys) == set(shown)
-        for key in keys:
+        assert {key for key in keys if can_be_set(key)} == set(shown)
+        for key in shown:
             value = tree
             for part in key.split("."):
                 value = value[part]
             assert shown[key].defaults[kind] == value, key
+    assert len(every) <= 40
+
+
+def test_every_name_of_the_list_is_a_setting(every):
+    shown = {(s.owner or s.key.partition(".")[0], s.key.partition(".")[2]) for s in every}
+    assert {(owner, name) for owner, names in SETTABLE.items() for name in names} <= shown
+
+
+def test_a_setting_of_the_program_itself_is_refused():
+    tree = SystemConfig().to_json()
+    for text, frontend in (("map.grid=[4, 4]", "surf"), ("frontend.octaves=3", "surf")):
+        with pytest.raises(ConfigurationError, match=r"setting (map\.grid|frontend\.octaves): cannot be set"):
+            require_settable([text], tree, frontend)
+    require_settable(["map.max_landmarks=300", "backend.lag=8", "frontend.octaves=3", "map.colour=1"], tree, "other")
+
+
+def test_a_setting_of_an_earlier_version_is_one_line():
+    tree = SystemConfig().to_json()
+    tree["association"]["hypotheses"] = 100  # as it is now: the run can be repeated
+    assert SystemConfig.from_json(tree) == SystemConfig()
+    tree["association"]["hypotheses"] = 50
+    with pytest.raises(
+        ConfigurationError, match=r"^setting association\.hypotheses: no longer a setting; its value is"
+    ):
+        SystemConfig.from_json(tree)
+    for tree in ([], "x", {"map": {"__doc__": 1}}, {"association": {"hypotheses": [1]}}):
+        with pytest.raises(ConfigurationError):
+            SystemConfig.from_json(tree)
+    with pytest.raises(ConfigurationError, match=r"^setting map\.colour: there is no such setting in this version$"):
+        SystemConfig.from_json({"map": {"colour": 1}})
 
 
 @pytest.mark.parametrize("role", ["frontend", "backend"])
-def test_every_option_of_front_ends_and_back_ends_is_there(every, role):
+def test_options_of_front_ends_and_back_ends_are_there(every, role):
     for name in registry.names(f"{role}s"):
         part = registry.create(f"{role}s", name, RIG)
-        wanted = {f"{role}.{f.name}" for f in fields(part.config)}
+        wanted = {f"{role}.{f.name}" for f in fields(part.config) if can_be_set(f"{role}.{f.name}", name)}
         assert {s.key for s in every if s.owner == name and s.key.startswith(role)} == wanted
 
 
 def test_an_unknown_section(read):
     with pytest.raises(SlamError, match="did you mean 'map'"):
         listing("mapp", 80)
-    with pytest.raises(SlamError, match=r"there is map\.grid"):
-        listing("grid", 80)
+    with pytest.raises(SlamError, match=r"there is map\.max_landmarks"):
+        listing("max_landmarks", 80)
 
 
 def test_values_at_the_ends_of_ranges_are_accepted_and_beyond_refused():

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from slam.compare.collect import SERIES_COLUMNS, Collector
-from slam.compare.measure import BY_KEY, UNTRACKED
 from slam.data import Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.run.results import BY_KEY, UNTRACKED
 from slam.run.summary import RunRecord, results_of
 
 N, SIGMA = 120, 0.01

@@ -9,7 +9,6 @@ import signal
 
 import pytest
 
-from slam.compare.measure import BY_KEY
 from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Variant
 from slam.compare.report import write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler
@@ -18,6 +17,7 @@ from slam.compare.tables import groups, write_tables
 from slam.compare.trial import failure, result_files, run_trial
 from slam.errors import SlamError
 from slam.run.repeat import running_code
+from slam.run.results import BY_KEY
 
 pytestmark = pytest.mark.slow  # all share one sweep
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from slam.evaluation.consistency import consistency_figures, stretch_nees, verdict
 from slam.evaluation.summary import evaluate
@@ -119,9 +120,13 @@ def test_errors_that_all_poses_share_count_once():
     assert not 5.0 < np.mean(alike) < 7.0
 
 
-def test_how_the_other_sensor_is_mounted_is_found():
-    noise = TruthNoise(rotation=1e-4, translation=0.01, mounting=0.02)
-    mounted = exp(np.array([0.01, -0.02, 0.005, 0, 0, 0]))
+@pytest.mark.parametrize(("constant", "known"), [
+    ([0.01, -0.02, 0.005, 0, 0, 0], {"mounting": 0.02}),
+    ([0, 0, 0, 0.5, 0.4, -0.3], {"lever": 0.5}),
+])  # fmt: skip
+def test_how_the_other_sensor_is_mounted_is_found(constant, known):
+    noise = TruthNoise(rotation=1e-4, translation=0.01, **known)
+    mounted = exp(np.array(constant, float))
     figures = []
     for seed in range(10):
         own, true, P = odometry(seed, noise=noise)
@@ -129,3 +134,19 @@ def test_how_the_other_sensor_is_mounted_is_found():
     assert 4.5 < np.mean([f["NEES over 10 m"] for f in figures]) < 7.0
     fixed = consistency_figures(own, Trajectory(true.stamps, true.poses @ mounted), P, TruthNoise(1e-4, 0.01))
     assert fixed["NEES over 10 m"] > 12
+
+
+def test_a_clock_that_is_ahead_is_found():
+    """A camera that is waved: at a constant rate a clock's error would be none of the relative pose."""
+    stamps, late, NEES = np.arange(200) / 20, 0.02, {}
+    waved = np.array([0.02, 0.0, 0.03, 0.1, 0.05, 0.0])
+
+    def true(times):
+        return exp(waved * np.sin(4 * times)[:, None] + np.array([0, 0, 0, 0, 0, 0.4]) * times[:, None])
+
+    P = np.tile(np.diag(np.repeat([1e-6, 1e-5], 3)), (len(stamps), 1, 1)) * (1 + np.arange(len(stamps)))[:, None, None]
+    own, shown = Trajectory(stamps, true(stamps)), Trajectory(stamps, true(stamps + late))
+    for clock in (0.0, 0.01):
+        figures = consistency_figures(own, shown, P, TruthNoise(1e-5, 1e-4, clock=clock))
+        NEES[clock] = figures["NEES over 1 m"]
+    assert NEES[0.01] < 0.05 * NEES[0.0]

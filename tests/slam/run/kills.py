@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 
 from slam.config import SystemConfig
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from slam.sequences import open_sequence
 from tests.fuzz.runs import Features, Numbered, Scripted
 

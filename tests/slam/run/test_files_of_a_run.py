@@ -17,9 +17,9 @@ from slam.errors import SlamError
 from slam.files import RowFile, read_bytes, whole_file
 from slam.mapping.map_io import load_map
 from slam.run import runner
+from slam.run.options import RunOptions
 from slam.run.outputs import RunFiles
 from slam.run.recording import load_recording
-from slam.run.runner import RunOptions
 from tests.fuzz.runs import Features, Scripted, disk_of
 
 LAST = ("trajectory_final.txt", "landmarks.csv", "summary.json")

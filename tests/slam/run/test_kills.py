@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from slam.config import SystemConfig
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from tests.fuzz.runs import Features, Scripted, require_whole
 
 ROOT = Path(__file__).parents[3]

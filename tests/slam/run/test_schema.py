@@ -11,13 +11,27 @@ from slam.config import SystemConfig
 from slam.geometry.euler import rotation
 from slam.geometry.se3 import pose
 from slam.object_data import MovingObject, ObjectEstimate
+from slam.run.options import RunOptions
 from slam.run.outputs import RunFiles
 from slam.run.repeat import Origin
-from slam.run.runner import RunOptions, run
+from slam.run.runner import run
 from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, header
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=4&width=160&height=120"
+
+
+def markdown(table):
+    """The rows of a table as ``docs/files.md`` has them."""
+    rows = [f"| {_spelled(c.names)} | {c.unit or '–'} | {c.text} |" for c in table]
+    return ["| column | unit | holds |", "| --- | --- | --- |", *rows]
+
+
+def _spelled(names):
+    """Names of columns; of many the first and the last."""
+    return (
+        ", ".join(f"`{name}`" for name in names) if len(names) <= 8 else f"`{names[0]}`, `{names[1]}` … `{names[-1]}`"
+    )
 
 
 def body(id, seed):

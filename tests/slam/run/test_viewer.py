@@ -7,7 +7,8 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.run.runner import RunOptions, run
+from slam.run.options import RunOptions
+from slam.run.runner import run
 from slam.run.viewer import Viewer, view_run
 from slam.sequences import open_sequence
 

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from slam.runtime.sources import stamp
+from slam.kernels.linear import factorise
+from slam.kernels.se3 import move
+from slam.runtime.sources import makes_arrays, stamp
 
 ROOT = Path(__file__).parents[3]
 
@@ -81,3 +83,15 @@ def test_a_stamp_covers_helpers_of_helpers_and_numbers(monkeypatch):
     monkeypatch.setattr(stereo, "NEAREST", 2 * stereo.NEAREST)
     assert stamp(stereo.residual.py_func) != before
     assert stamp(se3.exp.py_func) == stamp(se3.exp.py_func) != before
+
+
+def test_what_makes_arrays_is_told_by_its_text_and_its_helpers():
+    assert not makes_arrays(factorise.py_func)
+    assert makes_arrays(move.py_func)
+    assert makes_arrays(lambda a, b: a @ b)
+    assert not makes_arrays(lambda a, b: a[0] * b[0])
+    assert makes_arrays(_moves)  # through a helper
+
+
+def _moves(T, step):
+    move(T, step)

@@ -169,7 +169,7 @@ def test_crowded():
         {"window_sigmas": (5.0, 2.5)},
         {"window_min": 0.0},
         {"ratio": 1.5},
-        {"hypotheses": 0},
+        {"wide_hypotheses": 0},
         {"windows": "round"},
         {"windows": "fixed", "window_sizes": (30.0, 10.0)},
     ],

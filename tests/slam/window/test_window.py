@@ -7,7 +7,7 @@ import pytest
 
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.window import covariance_kernels, kernels, solver
+from slam.window import kernels, solver
 from slam.window.marginal import marginalised
 from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.solver import linearised
@@ -227,10 +227,3 @@ def test_what_nothing_determines_is_refused():
     w = window(prior=RelativePrior.none())
     with pytest.raises(np.linalg.LinAlgError):
         solve(replace(w, rows=w.rows.select(w.rows.pose != 2)))
-
-
-def test_triangular_inverse():
-    rng = np.random.default_rng(0)
-    for n in (1, 5, 31, 32, 33, 64, 130):
-        L = np.tril(rng.standard_normal((n, n))) + 5 * np.eye(n)
-        np.testing.assert_allclose(covariance_kernels.lower_inverse(L) @ L, np.eye(n), atol=1e-12)

@@ -124,6 +124,24 @@ def test_least_squares_knows_how_sure_it_is():
     assert 4.0 < np.mean(nees) < 8.5  # 6 is right; 60 draws have a deviation of 0.45, and depths are skewed
 
 
+@pytest.mark.parametrize("count", [40, 120])
+def test_features_that_slid_make_it_less_sure(count: int):
+    """From another viewpoint each feature is found at another point of its surface, by three times the pixel noise."""
+    nees, narrow = [], []
+    for seed in range(60):
+        rng, points = np.random.default_rng(seed), world(seed)[0][:count]
+        moved, _ = RIG.project_stereo(transform(inverse(MOVED), points), jacobian=False)
+        good = np.isfinite(moved).all(axis=1)
+        slid = moved + rng.normal(0, 3 * SIGMA, moved.shape)
+        T, P = refined_pose(RIG, points[good], slid[good], MOVED, SIGMA)
+        error = log(inverse(T) @ MOVED)
+        nees.append(error @ np.linalg.solve(P, error))
+        T, P = refined_pose(RIG, points[good], moved[good], MOVED, SIGMA)
+        narrow.append(error @ np.linalg.solve(P, error))
+    assert np.mean(narrow) > 12  # by the pixels' and the depths' noise alone
+    assert 3.5 < np.mean(nees) < 9.0
+
+
 def test_another_place_is_not_the_same():
     old = keyframe(view(np.eye(4), *world(0), 0))
     for seed in range(1, 11):

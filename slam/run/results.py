@@ -1,9 +1,13 @@
-"""The figures of merit of a comparison: names, places in a run's summary, units, and which way is better."""
+"""What the figures of a run are: the one table that terminal, pictures and comparisons read its ``summary.json`` by.
+
+A row has the figure's name, unit, place in the summary, and which way is better. What is computed, and how, is in
+`slam.evaluation` and `slam.objects.metrics`.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,6 +100,29 @@ METRICS = (
     Metric("used_per_frame", "observations used per frame"),
 )  # fmt: skip
 
+#: What a run's own table says besides, without a better or worse.
+OF_A_RUN = (
+    Metric("landmarks", "landmarks at the end", place=("landmarks",)),
+    Metric("path_m", "path length", unit="m", place=("path_length_m",)),
+    Metric("speed", "speed, median", unit="m/s", place=("speed_m_per_s",)),
+    Metric("sigma_m", "sigma of the last position", "", False, *_MM, ("final_sigma_m",)),
+    Metric("bodies", "moving bodies found", place=("bodies",)),
+    Metric("dropped", "frames dropped", place=("live", "frames dropped")),
+    Metric("behind", "behind, median", unit="ms", place=("live", "milliseconds behind", "median")),
+    Metric("behind_most", "behind, most", unit="ms", place=("live", "milliseconds behind", "max")),
+    Metric("milliseconds", "stages of a frame, median", unit="ms", place=("milliseconds", "median_total")),
+    Metric("rate", "frames per second", place=("frames_per_second",)),
+    Metric("compiling", "kernels compiled, beside these times", unit="s", place=("compile_seconds",)),
+)  # fmt: skip
+
+#: Figures of a comparison that a run's own table leaves out: shares of its status, which it shows in words.
+_NOT_OF_ONE_RUN = ("tracked", "frames_lost", "frames_predicted", "frames_failed", "scale_sigma_percent")
+
+#: Of a moving body, what a run's own table says.
+_OF_BODIES = ("coverage", "ME translation median [m]", "ME rotation median [deg]")
+
+_COMPILED = 0.05  # compile times below this [s] are not worth a row
+
 #: Frames whose pose was not measured: they are in no figure of accuracy, and counted here. The share tracked is tested.
 UNTRACKED = ("frames_lost", "frames_predicted", "frames_failed")
 
@@ -107,16 +134,46 @@ _SHARES = ("precision", "recall", "F1", "coverage", "counted right")
 _UNITS = {"m": _MM, "deg": ("deg", 1.0), "frames": _FRAMES}
 
 
-def figures(summary: Mapping[str, Any]) -> dict[str, float]:
-    """What a run's summary says, by key of `METRICS`, and ``object …`` figures; what it does not say is left out."""
+def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str]]]:
+    """The table of some runs for people: label with unit, and a text per run; what no run has is left out."""
+    yield "frames tracked", list(map(_tracked, summaries))
+    found = [_placed(OF_A_RUN, s) | figures(s) for s in summaries]
+    objects = [object_metric(key) for key in dict.fromkeys(key for one in found for key in one) if _is_of_body(key)]
+    left_out = [m.key for m in OF_A_RUN[-1:] if not any(one.get(m.key, 0.0) > _COMPILED for one in found)]
+    for metric in (*OF_A_RUN[:5], *METRICS, *objects, *OF_A_RUN[5:]):
+        values = [one.get(metric.key, float("nan")) for one in found]
+        if metric.key not in (*_NOT_OF_ONE_RUN, *left_out) and np.isfinite(values).any():
+            yield metric.title, list(map(metric.show, values))
+
+
+def _tracked(summary: Mapping[str, Any]) -> str:
+    """How many frames had a measured pose, and what became of the others; the first one starts the map."""
+    status = summary["status"]
+    own = status.get("tracked", 0) + status.get("started", 0)
+    others = [f"{n} {name}" for name, n in status.items() if name not in ("tracked", "started")]
+    return ", ".join([f"{own} of {summary['frames']}", *others])
+
+
+def _is_of_body(key: str) -> bool:
+    return key.startswith(f"{_OBJECT} bodies") and key.endswith(_OF_BODIES)
+
+
+def _placed(metrics: Sequence[Metric], summary: Mapping[str, Any]) -> dict[str, float]:
+    """What a summary says of some figures that have a place in it, by key."""
     found = {}
-    for metric in METRICS:
+    for metric in metrics:
         tree: Any = summary
         for key in metric.place[:-1]:
             tree = tree.get(key, {}) if isinstance(tree, Mapping) else {}
         if metric.place and isinstance(tree, Mapping) and tree.get(metric.place[-1]) is not None:
             divisor = tree[metric.share_of] if isinstance(metric.share_of, str) else metric.share_of
             found[metric.key] = float(tree[metric.place[-1]]) / divisor
+    return found
+
+
+def figures(summary: Mapping[str, Any]) -> dict[str, float]:
+    """What a run's summary says, by key of `METRICS`, and ``object …`` figures; what it does not say is left out."""
+    found = _placed(METRICS, summary)
     if "scale_error_percent" in found:
         found["scale_error_percent"] = abs(found["scale_error_percent"])
     if not found.get("loops_closed", 0) + found.get("loops_refused", 0):
@@ -132,7 +189,7 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
 
 def object_metric(key: str) -> Metric:
     """A figure of moving objects by the key that `object_figures` gives it."""
-    text = re.sub(r"^bodies (\d+) ", r"body \1: ", key.removeprefix(f"{_OBJECT} "))
+    text = re.sub(r"^bodies (\d+) (ME )?", _named_body, key.removeprefix(f"{_OBJECT} "))
     label = text if text.startswith("body") else f"objects: {text}"
     if key.endswith(_SHARES):
         return Metric(key, label, "higher", False, *_PERCENT)
@@ -143,6 +200,10 @@ def object_metric(key: str) -> Metric:
     if found is None or found[2] not in _UNITS:
         return Metric(key, label, lower)
     return Metric(key, found[1], lower, False, *_UNITS[found[2]])
+
+
+def _named_body(found: re.Match[str]) -> str:
+    return f"body {found[1]}: {'motion error, ' if found[2] else ''}"
 
 
 def object_figures(summary: Mapping[str, Any]) -> dict[str, float]:

@@ -1,0 +1,173 @@
+"""NEES of the camera along a corridor without end: the papers' filter, the back ends, and what each claims to know.
+
+    python experiments/corridor.py [--quick] [--seeds 4] [--frames 1000] [--out DIR]
+
+The world is the corridor of `experiments/long_run.py`, with true association. Every run starts at a pose drawn from the
+prior about the true one, with its own pixel noise; all back ends get the same. Nothing measures where the world is and
+which way it faces, so that an honest filter never knows its heading better than at the start. The band is that of 95 %
+of the means over so many runs; NEES above it says that errors are larger than claimed.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import backends
+from experiments.common import script_options
+from experiments.long_run import DT, MODELS, RIG, Corridor, measured
+from experiments.tables import markdown
+from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
+from slam.geometry import se3
+from slam.geometry.se3 import Array
+from slam.models import EstimatorModels
+
+#: What runs, by its name in the table: the back end, and its options.
+FILTERS: dict[str, tuple[str, dict[str, object]]] = {
+    "ekf, papers=true": ("ekf", {"papers": True}),
+    "ekf": ("ekf", {}),
+    "iekf": ("iekf", {}),
+    "window": ("window", {}),
+    "smoother": ("smoother", {}),
+}
+_START = replace(MODELS, initial_position_sigma=0.05, initial_rotation_sigma=0.01)
+HEADING, AT = slice(1, 2), slice(3, 6)  # of a pose's error: about the vertical, and of the position
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One back end in one run of F frames.
+
+    Attributes:
+        errors: of the newest pose (F, 6), [rotation, translation] [rad], [m].
+        deviations: what it claims of them (F, 6).
+        nees: of the pose (F,).
+        lost: updates that used nothing.
+    """
+
+    errors: Array
+    deviations: Array
+    nees: Array
+    lost: int
+
+
+def start(seed: int) -> EstimatorModels:
+    """Models whose first pose is drawn from the prior about the true one."""
+    sigma = np.repeat([_START.initial_rotation_sigma, _START.initial_position_sigma], 3)
+    off = sigma * np.random.default_rng([seed, 1]).standard_normal(6)
+    return replace(_START, T_world_left=Corridor().pose(0.0) @ se3.exp(off))
+
+
+def run(name: str, options: Mapping[str, object], frames: int, seed: int) -> Run:
+    """Along the corridor; landmarks join where they come into view and leave once they lie behind."""
+    route, rng = Corridor(), np.random.default_rng(seed)
+    backend = backends.create(name, RIG, models=start(seed), **options)
+    known: set[int] = set()
+    poses, covariances, lost = [], [], 0
+    for k in range(frames):
+        stamp = DT * k
+        ids, points = route.landmarks(stamp)
+        seen = measured(route.pose(stamp), points, ids, rng)
+        old = np.array([i in known for i in seen.ids.tolist()], bool)
+        gone = known - set(ids.tolist())
+        backend.predict(stamp)
+        report = backend.update(seen.select(old))
+        lost += k > 0 and not len(report.used)
+        backend.remove(sorted(gone))
+        backend.add(seen.select(~old))
+        known = (known | set(seen.ids.tolist())) - gone
+        estimate = backend.estimate(landmarks=False)
+        poses.append(estimate.T_world_left)
+        covariances.append(estimate.covariance)
+    P = np.array(covariances)
+    errors = pose_residuals(np.array([route.pose(DT * k) for k in range(frames)]), np.array(poses))
+    return Run(errors, np.sqrt(np.diagonal(P, axis1=1, axis2=2)), nees(errors, P), lost)
+
+
+HEADER = (
+    "filter", "NEES, first tenth", "NEES, last tenth (6)", "frames in the band", "heading at the end [deg]", "claimed",
+    "position at the end [m]", "claimed", "lost updates",
+)  # fmt: skip
+
+
+def rms(values: Array, part: slice) -> float:
+    """Root of the mean square over runs (S, 6) of a part of the errors."""
+    return float(np.sqrt((values[:, part] ** 2).sum(axis=1).mean()))
+
+
+def row(name: str, runs: list[Run]) -> list[str]:
+    """What the table says of a filter."""
+    mean = np.mean([r.nees for r in runs], axis=0)
+    low, high = chi_square_band(6, len(runs))
+    tenth = max(1, len(mean) // 10)
+    errors, claimed = (np.array([getattr(r, what)[-1] for r in runs]) for what in ("errors", "deviations"))
+    return [
+        name, f"{mean[:tenth].mean():.1f}", f"{mean[-tenth:].mean():.1f}",
+        f"{np.mean((mean > low) & (mean < high)):.0%}",
+        f"{np.rad2deg(rms(errors, HEADING)):.2f}", f"{np.rad2deg(rms(claimed, HEADING)):.2f}",
+        f"{rms(errors, AT):.2f}", f"{rms(claimed, AT):.2f}", str(sum(r.lost for r in runs)),
+    ]  # fmt: skip
+
+
+def draw(path: Path, done: Mapping[str, list[Run]]) -> None:
+    """Mean NEES frame by frame, and the claimed deviation of the heading."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
+    for name, runs in done.items():
+        left.semilogy(np.mean([r.nees for r in runs], axis=0), label=name, linewidth=0.9)
+        right.plot(np.rad2deg(np.mean([r.deviations[:, HEADING] for r in runs], axis=0)), label=name, linewidth=0.9)
+    left.axhspan(*chi_square_band(6, len(next(iter(done.values())))), color="0.85")
+    left.set(xlabel="frame", ylabel="mean NEES of the pose")
+    right.set(xlabel="frame", ylabel="claimed deviation of the heading [deg]", ylim=(0, None))
+    left.legend(fontsize="small")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def write_csv(path: Path, done: Mapping[str, list[Run]]) -> None:
+    """A row per filter and frame: means over the runs."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["filter", "frame", "nees", "rmse_m", "rmse_heading_rad", "claimed_heading_rad"])
+        for name, runs in done.items():
+            for k in range(len(runs[0].nees)):
+                errors, claimed = np.array([r.errors[k] for r in runs]), np.array([r.deviations[k] for r in runs])
+                mean = np.mean([r.nees[k] for r in runs])
+                writer.writerow([name, k, mean, rms(errors, AT), rms(errors, HEADING), rms(claimed, HEADING)])
+
+
+def main() -> int:
+    parser = script_options(__file__, __doc__, "two seeds of forty frames")
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument("--filters", nargs="*", default=list(FILTERS), choices=list(FILTERS))
+    given = parser.parse_args()
+    seeds, frames = (2, 40) if given.quick else (given.seeds, given.frames)
+    done = {}
+    for name in given.filters:
+        backend, options = FILTERS[name]
+        done[name] = [run(backend, options, frames, seed) for seed in range(seeds)]
+        print(row(name, done[name]), file=sys.stderr, flush=True)
+    low, high = chi_square_band(6, seeds)
+    print(f"{seeds} runs of {frames} frames; 95 % of the means lie between {low:.1f} and {high:.1f}.\n")
+    print(markdown(HEADER, [row(name, runs) for name, runs in done.items()], 1))
+    given.out.mkdir(parents=True, exist_ok=True)
+    write_csv(given.out / "corridor.csv", done)
+    draw(given.out / "corridor.png", done)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,86 @@
+"""What to run, with what, and where the files go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from slam.calibration import load_calibration
+from slam.config import SystemConfig
+from slam.errors import SlamError
+from slam.files import noting_inputs
+from slam.outputs import Output
+from slam.run.outputs import NAMES
+
+_MOST_FRAMES = 10**12  # of a sequence: more than any has
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What to run and where to leave the files.
+
+    Attributes:
+        backend, frontend: names.
+        config: all settings.
+        out: folder for the files.
+        start, stop: range of frames; `stop` None for all.
+        record: file for a recording of what the back end is given, see `slam.run.replay`; None for none.
+        prior_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
+        save_map: file for the map at the end; None for none.
+        calibration: file with what is known of the rig's error, see `slam.calibration.saved`; None for nothing.
+        mono: use the left images alone.
+        overlap: read and extract the next frame while the present one is estimated; the results are the same.
+        live: take frames at their own rate, and leave out those that come too late; of a camera always.
+        origin: goes into ``config.json`` as it is: what else it takes to repeat the run, see `slam.run.repeat`.
+    """
+
+    backend: str
+    frontend: str
+    config: SystemConfig
+    out: Path
+    start: int = 0
+    stop: int | None = None
+    record: Path | None = None
+    prior_map: Path | None = None
+    save_map: Path | None = None
+    calibration: Path | None = None
+    mono: bool = False
+    overlap: bool = True
+    live: bool = False
+    origin: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Files that the run reads besides its sequence; raises SlamError where the calibration cannot be read."""
+        with noting_inputs() as found:
+            if self.calibration is not None:
+                load_calibration(self.calibration)
+        return found if self.prior_map is None else [*found, self.prior_map]
+
+    @property
+    def outputs(self) -> list[Output]:
+        """What the run writes."""
+        files = ((self.record, "--record"), (self.save_map, "--save-map"))
+        return [Output(self.out, "--out", NAMES), *(Output(path, option) for path, option in files if path is not None)]
+
+
+def parse_frames(text: str | None) -> tuple[int, int | None]:
+    """``A:B`` (either may be left out) as a range of frames.
+
+    Raises:
+        SlamError: not of that form.
+    """
+    if text is None:
+        return 0, None
+    first, colon, last = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        start, stop = int(first or 0), int(last) if last else None
+    except ValueError:
+        raise SlamError(f"frames {text!r} is not of the form A:B") from None
+    if start < 0 or max(start, stop or 0) > _MOST_FRAMES:
+        raise SlamError(f"frames {text!r}: numbers of frames go from 0 to {_MOST_FRAMES}")
+    return start, stop
