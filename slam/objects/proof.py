@@ -93,7 +93,7 @@ class Way:
 def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
     """The evidence that a body moves still, after one more frame, and whether it is proven to have moved.
 
-    The evidence is a cumulative sum of −log10 of the chance of its way; it fades while a body rests.
+    The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
     For a proof both tests must be certain at once.
 
     Args:
@@ -108,7 +108,7 @@ def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, fa
         return evidence, far and by_frames >= way.bar
     by_members = -float(np.log10(max(_by_members(moved, scene, way.by_rig), 10.0**-_MOST)))
     proven = by_frames >= way.bar and (far or by_members >= way.bar)
-    return max(0.0, evidence + by_frames - _ALLOWANCE), proven
+    return max(0.0, evidence + (by_frames if far else min(by_frames, by_members)) - _ALLOWANCE), proven
 
 
 def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> float:
