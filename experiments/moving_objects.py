@@ -39,11 +39,11 @@ from experiments.object_runs import (
 )  # fmt: skip
 from experiments.tables import picture
 from slam.data import FrameResult, StereoFeatures
+from slam.evaluation.objects import ObjectScore, absolute_pose_errors, body_alignment
 from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, rotation_angle
 from slam.object_data import MovingObject
-from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother", "window")

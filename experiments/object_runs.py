@@ -14,9 +14,9 @@ from experiments.tables import markdown
 from slam import registry
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
+from slam.evaluation.objects import ObjectScore, labels_in_images, score_for
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.trajectory import Trajectory
-from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 
 
 @lru_cache(maxsize=2)

@@ -34,8 +34,8 @@ from experiments.parameters import ROOT, Parameter, find
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors, associate
+from slam.evaluation.objects import labels_in_images, score_for
 from slam.geometry.trajectory import Trajectory
-from slam.objects.metrics import labels_in_images, score_for
 
 BACKENDS = ("ekf", "smoother")
 FACTORS = (0.5, 2.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
-from slam.geometry.se3 import Array, adjoint, inverse, so3_exp
+from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
 from slam.object_models import ObjectModels
 from slam.objects.belief import BodyBelief
 from slam.objects.existence import EVEN, when_measured, when_missed
@@ -48,6 +49,7 @@ class Body:
         measured: whether it was in this frame.
         moving: whether it moves now.
         evidence: that it has moved, given all that is uncertain; see `slam.objects.proof`.
+        far: whether it was followed for farther than it is wide before it became a body.
         proven: whether it has moved for certain by its tracks, and
         moved: by its estimate, see `slam.objects.estimator`: only then it is reported.
         alike: number of frames in which it moved as an older body did, as a part of that would.
@@ -82,6 +84,7 @@ class Body:
     measured: bool = True
     moving: bool = True
     evidence: float = 0.0
+    far: bool = False
     proven: bool = False
     moved: bool = False
     alike: int = 0
@@ -207,6 +210,19 @@ def continued(body: Body, known: Body) -> Body:
         reported=known.reported, reported_unmeasured=known.reported_unmeasured,
         measured_at=known.measured_at, belief=None, refused=0,
     )  # fmt: skip
+
+
+def hidden(bodies: Iterable[Body], eye: Array, points: Array) -> BoolArray:
+    """Which points (N, 3) lie behind one of the bodies, seen from `eye` (3,): beyond the far side of its extent."""
+    behind = np.zeros(len(points), bool)
+    for body in bodies:
+        start = transform(inverse(body.T), eye[None])
+        rays = transform(inverse(body.T), points) - start
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sides = (np.stack([body.lower, body.upper])[:, None] - start) / rays  # of the way to the point
+        enters, leaves = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+        behind |= (enters > 0) & (enters < leaves) & (leaves < 1)
+    return behind
 
 
 def with_evidence(body: Body, gain: float) -> Body:

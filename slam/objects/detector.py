@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import IndexArray, among, median
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.interfaces import Backend
@@ -24,6 +25,7 @@ from slam.objects.bodies import (
     Body,
     advanced,
     continued,
+    hidden,
     with_evidence,
     with_extent,
 )
@@ -38,7 +40,7 @@ from slam.objects.following import follow
 from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
-from slam.objects.proof import PROVEN, with_frame
+from slam.objects.proof import Way, with_frame
 from slam.objects.recovery import locate
 from slam.objects.regions import Scene, classify_scene
 from slam.objects.revision import CorrectRows, revise_tracks
@@ -99,7 +101,7 @@ class MovingObjectDetector:
         """See `slam.objects.modes.ObjectDetector`."""
         if not 0 <= self._frame < self.config.window - 1:
             return np.zeros(0, np.int64)
-        pixels, now = membership.measured(features, rows), self._frame + 1
+        pixels, now = measurement_rows(features.uv_left[rows], features.uv_right[rows]), self._frame + 1
         self._first = self._first.after(ids, places, np.maximum(now - ages, 0))
         return ids[moving_landmarks(self.rig, T_world_left, self._first.of(ids), pixels, now, self.sigma, self.config)]
 
@@ -178,6 +180,9 @@ class MovingObjectDetector:
         """Locate the bodies by their members, and add this frame's measurements to the tracks, in world coordinates."""
         c = self.config
         for body in list(self.bodies.values()):
+            mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
+            front = (other for other in self.bodies.values() if other.proven and other.id != body.id)
+            tracks.row[mine[hidden(front, T_world_left[:3, 3], tracks.position[mine])]] = -1
             located = locate(body, tracks, features, local, T_world_left, self.rig, self.sigma, c, self._frame)
             if located is not None:
                 times_seen = body.seen + 1
@@ -187,7 +192,7 @@ class MovingObjectDetector:
             tracks.position[mine] = transform(body.T, tracks.local[mine])
         make_room(tracks, self.slot)
         seen = np.flatnonzero(tracks.seen)
-        z = membership.measured(features, tracks.row[seen])
+        z = measurement_rows(features.uv_left[tracks.row[seen]], features.uv_right[tracks.row[seen]])
         record(tracks, seen, self.slot, *measure(self.rig, T_world_left, tracks.position[seen], z, self.sigma))
 
     def _fit(self, tracks: Tracks, times: Array) -> None:
@@ -211,8 +216,9 @@ class MovingObjectDetector:
             members = np.flatnonzero((tracks.body == body.id) & tracks.seen)
             members = members[tracks.count(members) >= c.min_frames - 1]
             moved = displacements(tracks, members, ages, self._poses[self.slot, :3, 3])
-            evidence = with_frame(body.evidence, moved, scene)
-            body = replace(body, evidence=evidence, proven=body.proven or evidence >= PROVEN)
+            way = Way.of(body, self._stamps, self._poses, self.rig, self.sigma)
+            evidence, proven = with_frame(body.evidence, moved, scene, way, body.far)
+            body = replace(body, evidence=evidence, proven=body.proven or proven)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
                 self._drop(body)
@@ -265,26 +271,22 @@ class MovingObjectDetector:
         return scene
 
     def _found(
-        self, group: MovingGroup, initializer: BodyInitializer, whole: int | None = None, evidence: float = 0.0
+        self, group: MovingGroup, initializer: BodyInitializer, whole: int | None = None, far: bool = False
     ) -> None:
-        """Make a body of tracks with a common twist, or add them to the body that they belong to.
+        """Make a body of tracks with a common twist; where they belong to another one, they are merged later.
 
-        There may be evidence already that it moves.
-
-        If they are a part of the body `whole` with a motion of its own, they are not added to that one.
+        Args:
+            group: the tracks.
+            initializer: of bodies.
+            whole: id of the body that they are a part of, with a motion of their own; None for none.
+            far: whether they were followed for farther than they are wide already.
         """
         tracks, members = self.tracks, group.members
         assert tracks is not None
-        body = replace(initializer.body(self._next_body, tracks, group), evidence=evidence, proven=evidence >= PROVEN)
-        others = {id: other for id, other in self.bodies.items() if id != whole}
-        known = membership.body_around(others, tracks, members, body)
-        known = known or membership.body_with_part(others, tracks, members, body)
-        if known is None:
-            body = replace(self._again(self._grown(body, members), whole), apart_from=whole)
-            self.bodies[body.id] = body
-            self._next_body = max(self._next_body, body.id + 1)
-        else:
-            body = self.bodies[known.id] = membership.with_reach(known, tracks, members)
+        body = replace(initializer.body(self._next_body, tracks, group), far=far)
+        body = replace(self._again(body, whole), apart_from=whole)
+        self.bodies[body.id] = body
+        self._next_body = max(self._next_body, body.id + 1)
         membership.add_members(body, tracks, members, sure=True)
 
     def _again(self, body: Body, whole: int | None) -> Body:
@@ -294,24 +296,12 @@ class MovingObjectDetector:
         """
         tracks, known = self.tracks, None
         assert tracks is not None
-        if body.id not in self.bodies:
-            parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
-            known = membership.reappeared(parts, body)
+        parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
+        known = membership.reappeared(parts, body)
         if known is None:
             return body
         tracks.give_up(np.flatnonzero(tracks.body == known.id))
         return continued(body, known)
-
-    def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
-        """A new body, or a known one that is a part of it: then it keeps that one's id and takes over its members."""
-        tracks = self.tracks
-        assert tracks is not None
-        for known in self.bodies.values():
-            mine = np.flatnonzero((tracks.body == known.id) & tracks.seen)
-            fewer = known.measured and len(mine) < len(members)
-            if fewer and membership.is_part_of(body, members, tracks, mine, known):
-                return self._in_place_of(known, body, mine)
-        return body
 
     def _in_place_of(self, known: Body, body: Body, mine: NDArray[np.intp]) -> Body:
         """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
@@ -342,7 +332,7 @@ class MovingObjectDetector:
             else:
                 centre = tracks.position[candidate.members].mean(axis=0)
                 twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
-                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), initializer, evidence=PROVEN)
+                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), initializer, far=True)
 
     def _shared_error(self, place: Array, T_world_left: Array) -> Array:
         """Covariance (3, 3) of a place (3,) as seen from the camera, given that of the camera's pose."""
@@ -423,7 +413,7 @@ class MovingObjectDetector:
         self._next_track += len(rows)
         new = tracks.begin(ids, features, rows, points)
         tracks.landmark[new] = landmark[rows]
-        z = membership.measured(features, rows)
+        z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
         record(tracks, new, self.slot, *measure(self.rig, T_world_left, points, z, self.sigma))
         fit_positions(tracks, new)
 

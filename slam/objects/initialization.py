@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, points_by_pose
 from slam.object_models import ObjectModels
 from slam.objects import membership
 from slam.objects.bodies import Body, new_body
@@ -16,7 +16,6 @@ from slam.objects.candidates import region_radius
 from slam.objects.config import ObjectsConfig
 from slam.objects.points import compact
 from slam.objects.tracks import Tracks, constant_velocity
-from slam.objects.twists import fit_twist
 
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
@@ -83,7 +82,13 @@ class BodyInitializer(NamedTuple):
         motion = constant_velocity(tracks, members, self.times, self.config.max_speed)
         centre = motion.position.mean(axis=0)
         information = np.linalg.inv(motion.velocity_covariance)
-        twist, covariance = fit_twist(motion.position, motion.velocity, information, centre)
+        # Velocities of a rigid body's points are V = v + ω × r: linear in [ω, v]. Without a prior the depth noise of
+        # few, close points would turn it wildly.
+        J = -points_by_pose(motion.position - centre)
+        JA = np.swapaxes(J, 1, 2) @ information
+        prior = np.repeat([self.models.initial_angular_velocity_sigma**-2, 1e-9], 3)
+        covariance = np.linalg.inv((JA @ J).sum(axis=0) + np.diag(prior))
+        twist = covariance @ (JA @ motion.velocity[:, :, None]).sum(axis=0)[:, 0]
         # The twist is the mean over the window: the present one differs by what a third of its time allows.
         linear, angular = self.models.velocity_variance(-float(self.times.min()) / 3.0)
         return MovingGroup(members, centre, twist, covariance + np.diag([angular] * 3 + [linear] * 3))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
-from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.data import BoolArray, IdArray
 from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
@@ -47,11 +47,6 @@ _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is
 _WEAK = 1e-8  # numerics: variance that is added to a known pose's [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
-
-
-def measured(features: StereoFeatures, rows: NDArray[np.intp]) -> Array:
-    """Measurements (N, 3) = (uL, vL, uR) of features; uR is NaN where there is none."""
-    return np.concatenate([features.uv_left[rows], features.uv_right[rows, :1]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +84,7 @@ def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Bod
 
     A constant velocity is only the first guess for a body that starts to move: poses and points are improved in turn.
     """
-    body = _with_poses_fitted(body, tracks, rows)
+    body = _with_poses_fitted(replace(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
     points, A, _ = in_body_axes(body, tracks, rows)
     return with_extent(replace(body, T=body.history[slot]), _means(points, A))
 
@@ -312,11 +307,6 @@ def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
     return best
 
 
-def is_part_of(whole: Body, theirs: NDArray[np.intp], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> bool:
-    """Whether the members `rows` of the body `own`, near another one, make one rigid body with its members `theirs`."""
-    return moves_with(whole, tracks, rows) and distinctness(whole, theirs, own, rows, tracks) < 1.0
-
-
 def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
     """Whether the members `rows` of another body, near this one, have moved with it all the time.
 
@@ -349,18 +339,6 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     _, _, known = in_body_axes(one, tracks, every)
     still = float(_squares(tracks.p[every], np.where(known[..., None, None], tracks.A[every], 0.0)).sum())
     return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
-
-
-def body_with_part(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
-    """The measured body of which tracks are a part, if it has more seen members than they are; else None.
-
-    `own` is a body made of them alone.
-    """
-    for body in bodies.values():
-        theirs = np.flatnonzero(tracks.seen & (tracks.body == body.id))
-        if body.measured and len(theirs) >= len(rows) and is_part_of(body, theirs, tracks, rows, own):
-            return body
-    return None
 
 
 def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float) -> Array:

@@ -1,7 +1,7 @@
 """What the figures of a run are: the one table that terminal, pictures and comparisons read its ``summary.json`` by.
 
 A row has the figure's name, unit, place in the summary, and which way is better. What is computed, and how, is in
-`slam.evaluation` and `slam.objects.metrics`.
+`slam.evaluation` and `slam.evaluation.objects`.
 """
 
 from __future__ import annotations

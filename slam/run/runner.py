@@ -14,11 +14,11 @@ from slam import registry
 from slam.calibration import load_calibration
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
+from slam.evaluation.objects import ObjectScore, labels_in_images, score_for
 from slam.evaluation.summary import with_truth
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
-from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt

@@ -9,12 +9,12 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult
 from slam.evaluation.consistency import EXACT
+from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend
-from slam.objects.metrics import ObjectScore
 from slam.rig_error import CommonError
 from slam.run.recorded import Recording
 from slam.run.schema import STAGES

@@ -9,7 +9,7 @@ import numpy as np
 from slam.data import Estimate, StereoFeatures
 from slam.models import EstimatorModels, MotionModel
 from slam.object_models import ObjectModels
-from slam.objects.bodies import new_body
+from slam.objects.bodies import hidden, new_body
 from slam.objects.config import ObjectsConfig
 from slam.objects.detector import MovingObjectDetector
 from tests.slam.scene import RIG
@@ -32,3 +32,12 @@ def test_a_body_is_predicted_by_its_own_motion_model() -> None:
     grown = np.diag(detector.bodies[1].covariance - body.covariance)
     np.testing.assert_allclose(grown, dt**3 * np.array([0.5] * 3 + [2.0] * 3) ** 2, rtol=1e-9)
     np.testing.assert_allclose(detector.bodies[1].T[:3, 3], [dt, 0, 3.0])
+
+
+def test_points_behind_a_body_are_hidden_and_no_others():
+    body = new_body(1, np.array([0.0, 0.0, 2.0]), np.zeros(6), np.zeros(3), 0.0, 0.0)
+    body = replace(body, lower=np.full(3, -0.1), upper=np.full(3, 0.1))
+    behind, inside, before, beside = [0.05, 0, 3.0], [0, 0, 2.05], [0, 0, 1.0], [0.5, 0, 3.0]
+    points = np.array([behind, inside, before, beside])
+    assert hidden([body], np.zeros(3), points).tolist() == [True, False, False, False]
+    assert not hidden([], np.zeros(3), points).any()

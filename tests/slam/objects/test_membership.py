@@ -151,7 +151,8 @@ def test_bodies_side_by_side_are_one_only_where_they_move_alike(share: float, on
     more = body_along(path(MOVING), np.arange(4, 12), tracks, id=2)
     theirs, mine = np.arange(4), np.arange(4, 12)
     assert membership.moves_with(more, tracks, theirs)
-    assert membership.is_part_of(more, mine, tracks, theirs, few) == one
+    alike = membership.moves_with(more, tracks, theirs)
+    assert (alike and membership.distinctness(more, mine, few, theirs, tracks) < 1.0) == one
     detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
     detector.tracks, detector.bodies = tracks, {1: few, 2: replace(more, seen=5)}
     detector._outgrow(detector.bodies[2], 8, {1: few})

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import FrameResult, StereoFeatures
+from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
-from slam.objects.points import MIN_POINTS
 
 _SINGULAR = 1e-9  # numerics: smallest eigenvalue of a matrix of correlations that counts
 _OUTLINE = 0.25  # a feature sees as far as this, as a share of its size
@@ -177,7 +177,7 @@ class ObjectScore:
             life.measured.append(thing.estimate.measured)
             if thing.estimate.measured:
                 named.add((thing.id, life.truth))
-        in_view = {b for b in range(1, len(self.bodies) + 1) if (moving & (labels == b)).sum() >= MIN_POINTS}
+        in_view = {b for b in range(1, len(self.bodies) + 1) if (moving & (labels == b)).sum() > MINIMAL_POINTS}
         for body in in_view:
             self.covered.setdefault(body, []).append(any(truth == body for _, truth in named))
         relevant = [truth for _, truth in named if truth == 0 or truth in in_view]

@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from slam.evaluation.objects import ObjectScore, absolute_pose_errors, body_alignment, motion_errors, object_nees
 from slam.geometry.se3 import exp, inverse
 from slam.object_data import MovingObject, ObjectEstimate
-from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment, motion_errors, object_nees
 
 RNG = np.random.default_rng(0)
 TRUE = np.array([exp(np.array([0.02 * k, 0.01 * k, 0, 0.05 * k, 0, 1 + 0.01 * k])) for k in range(20)])
