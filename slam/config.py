@@ -79,6 +79,10 @@ class SystemConfig:
 
     def __post_init__(self) -> None:
         require_not_negative(self)
+        for section in ("frontend", "backend"):
+            taken = [key for key in getattr(self, section) if key in _GIVEN]
+            if taken:
+                raise ConfigurationError(f"{section}.{taken[0]}: the system gives this, so it is no option")
 
     @classmethod
     def for_kind(cls, kind: str, frontend: str | None = "surf", backend: str | None = None) -> SystemConfig:
@@ -128,6 +132,9 @@ class SystemConfig:
         apply_settings(tree, settings)
         return self.from_json(tree)
 
+
+#: What the system itself gives to front ends and back ends that it makes.
+_GIVEN = ("self", "rig", "models")
 
 #: Classes of sections in which settings of earlier versions are constants now.
 _FIXED = {"association": AssociationConfig, "map": MapConfig, "self_calibration": SelfCalibrationConfig}

@@ -101,7 +101,7 @@ def _hidden(package: str) -> str:
     return f"{found} hides slam's own `{package}`: rename it"
 
 
-def create(role: str, name: str, rig: Any, **options: Any) -> Any:
+def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:
     """An instance by name, for a rig, with its options.
 
     Raises:

@@ -19,7 +19,7 @@ from backends.ekf.solve import Problem, UnsolvableError
 from backends.ekf.state import State
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
-from slam.errors import MeasurementError
+from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -99,6 +99,10 @@ class EkfBackend:
         **options: Any,
     ) -> None:
         self.rig, self.models = rig, models
+        if not callable(form):
+            raise ConfigurationError(
+                "form: a function of models and options makes the form of a filter; it is no option"
+            )
         self._form = form(models, options)
         self.config, self._coordinates = self._form.config, self._form.coordinates
         self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]

@@ -28,7 +28,6 @@ the old estimate's direction to the new one's, by the Jacobian of that displacem
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -122,7 +121,7 @@ class InvariantCamera:
         after, A, G = replace(self, pose=T), np.eye(CAMERA), np.eye(CAMERA)
         A[:3, 6:9], A[3:6, 9:] = dt * np.eye(3), dt * R @ se3.so3_left_jacobian(turn)
         G[3:6, 3:6] = A[3:6, 9:] / dt
-        S = after.plain() @ np.eye(CAMERA)
+        S = after.plain()
         return Motion(after, S @ A @ back, S @ G @ motion_noise(models, dt) @ G.T @ S.T)
 
     def at_rest(self) -> Motion:
@@ -134,6 +133,6 @@ class InvariantCamera:
     def settled(self) -> Motion:
         """See `Camera`: nothing is singular; a rotation is made orthonormal again."""
         R = self.pose[:3, :3]
-        if math.isclose(float(np.abs(R @ R.T - np.eye(3)).max()), 0.0, abs_tol=1e-12):
+        if np.abs(R @ R.T - np.eye(3)).max() <= 1e-12:
             return Motion(self)
         return Motion(replace(self, pose=se3.pose(se3.nearest_rotation(R), self.pose[:3, 3])))

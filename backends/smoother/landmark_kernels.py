@@ -1,4 +1,4 @@
-"""Compiled loops of `backends.smoother.uncertainty`: over landmarks and the poses that measured them."""
+"""Compiled loops of `backends.smoother.landmarks`: over landmarks and the poses that measured them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The steps of the smoother: functions from a state to the next. Only `solved` and what calls it needs gtsam."""
+"""The steps of the smoother: functions from a state to the next."""
 
 from __future__ import annotations
 

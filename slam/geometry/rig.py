@@ -304,6 +304,18 @@ class RectifiedRig:
         T[:3, :3] = self.R_left.T
         return T
 
+    @cached_property
+    def scale(self) -> float:
+        """Rectified pixels per original pixel of the left image, on average over it."""
+        if self.original is self.rig:
+            return 1.0
+        u, v = np.meshgrid(*(np.linspace(0.1, 0.9, 9) * size for size in (self.rig.width, self.rig.height)))
+        uv = np.stack([u.ravel(), v.ravel()], axis=1)
+        right, down = np.array([0.5, 0.0]), np.array([0.0, 0.5])
+        du = self.rectify_left(uv + right) - self.rectify_left(uv - right)
+        dv = self.rectify_left(uv + down) - self.rectify_left(uv - down)
+        return float(np.sqrt(np.nanmean(np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]))))
+
     def rectify_left(self, uv: Array) -> Array:
         """Rectified left pixels (N, 2) of original left pixels (N, 2); the same array where the rig is rectified."""
         return self._moved(self.original.left, self.rig.left, self.R_left, uv)

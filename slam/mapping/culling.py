@@ -12,7 +12,11 @@ _BLOCK = 256  # cost: landmarks compared with all others at once
 
 
 def bad_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
-    """Which landmarks (N,) are to be erased: not continuously detected although in view (paper A, IV)."""
+    """Which landmarks (N,) are to be erased: not continuously detected although in view (paper A, IV).
+
+    Those are the ones that were missed too often in a row, are seen in too small a share of the frames, or were never
+    confirmed; and those not seen for longer than a map remembers.
+    """
     lost = landmarks.missed >= config.erase_missed
     tested = landmarks.in_view > config.erase_missed
     rare = tested & (landmarks.seen < config.erase_share * landmarks.in_view)

@@ -64,7 +64,7 @@ class KnownPlace:
 
 
 class Mapper:
-    """Keeps the map of a system; nothing else adds landmarks to a back end or removes them.
+    """Keeps the map of a system; within a step, nothing else adds landmarks to a back end or removes them.
 
     Args:
         rig: the cameras.

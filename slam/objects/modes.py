@@ -19,7 +19,10 @@ from slam.objects.revision import CorrectRows
 
 
 class ObjectDetector(Protocol):
-    """What the system asks of a detector of moving objects, in every step after the back end's update."""
+    """What the system asks of a detector of moving objects, in every step.
+
+    `newly_moving` and `suspects` are asked before the back end's update, `classify` and `update` after it.
+    """
 
     @property
     def suspects(self) -> IdArray:
@@ -68,7 +71,7 @@ class ObjectDetector(Protocol):
         ...
 
     def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
-        """Give the bodies' observations to the back end, and report what it makes of them."""
+        """Estimate the bodies, given the last poses of the back end with their joint covariance, and report them."""
         ...
 
 

@@ -138,6 +138,8 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     speed, depth = float(np.median(speeds[:, 1])), float(np.median(depths))
     if speed <= _FASTEST[driving] and depth >= _NEAREST[driving] and rig.baseline <= _WIDEST[driving]:
         return ""
+    if speed <= _FASTEST[driving] and depth >= _NEAREST[driving]:
+        return f"by the calibration the cameras are {rig.baseline:.3g} m apart; is that in metres? (unit=cm, unit=mm)"
     carrier = "no vehicle does" if driving else "no camera in a hand does (is it a vehicle's: --kind driving?)"
     return (
         f"the camera moved at {_rounded(speed)} m/s and saw things {_rounded(depth)} m away in the median, which "

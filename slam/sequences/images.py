@@ -59,31 +59,44 @@ def decode_image(data: bytes, what: str, size: Size | None = None) -> np.ndarray
         with warnings.catch_warnings(action="ignore"):
             image = Image.open(io.BytesIO(data), formats=_KINDS)
             require_image_size(image.size, size, what)
-            image.verify()  # the checksums of a PNG
-            image = Image.open(io.BytesIO(data), formats=_KINDS)
+            if image.format == "PNG":
+                image.verify()  # all checksums
+                image = Image.open(io.BytesIO(data), formats=_KINDS)
             image.draft("L", image.size)
-            return _grey(image, data, what)
+            unknown = image.format == "PPM" or (image.mode.startswith("RGB") and ";16" in str(image.tile))
+            image.load()
     except Image.UnidentifiedImageError:
         raise SequenceError(f"{what}: not a readable image") from None
     except Image.DecompressionBombError:
         raise SequenceError(f"{what}: at most {MOST_PIXELS} pixels are read") from None
     except _DAMAGED as error:
         raise SequenceError(f"{what}: the image is cut off or damaged: {one_line(str(error))}") from error
+    # Pillow has no colours of 16 bits, and scales the grey values of PGM.
+    return _by_opencv(data, image.size, what) if unknown else _grey(image, what)
 
 
-def _grey(image: Any, data: bytes, what: str) -> np.ndarray:
-    """The pixels (H, W) of an opened image, decoded now."""
+def _grey(image: Any, what: str) -> np.ndarray:
+    """The pixels (H, W) of a loaded image."""
     import cv2
 
-    if image.mode == "F":
-        raise SequenceError(f"{what}: pixels are float32, not 8 or 16 bit")
-    if image.mode == "RGB" and ";16" in str(image.tile):  # Pillow has no colours of 16 bits
-        return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH))
     if image.mode == "L":
         return np.asarray(image)
-    if image.mode.startswith("I"):
-        return np.asarray(image).astype(np.uint16)
+    if image.mode.startswith(("I", "F")):
+        pixels = np.asarray(image)
+        if image.mode == "F" or pixels.min() < 0 or pixels.max() > np.iinfo(np.uint16).max:
+            raise SequenceError(f"{what}: pixels are {pixels.dtype}, not 8 or 16 bit")
+        return pixels.astype(np.uint16)
     return np.asarray(cv2.cvtColor(np.asarray(image.convert("RGB")), cv2.COLOR_RGB2GRAY))
+
+
+def _by_opencv(data: bytes, size: Size, what: str) -> np.ndarray:
+    """The pixels (H, W) of an image that is whole."""
+    import cv2
+
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None or pixels.shape != size[::-1] or pixels.dtype not in (np.uint8, np.uint16):
+        raise SequenceError(f"{what}: cannot be decoded")
+    return np.asarray(pixels)
 
 
 def require_image_size(found: Size, expected: Size | None, what: str) -> None:

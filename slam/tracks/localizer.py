@@ -96,6 +96,7 @@ class Localizer:
         self.rig = rig
         self.config = config
         self.pixel_sigma = models.pixel_sigma
+        self._rectified_sigma = models.pixel_sigma * rig.rectified.scale
         self._models = models
         self._lost_after = lost_after
 
@@ -305,7 +306,7 @@ class Localizer:
         """The pose on which matches agree, found in rectified pixels: lenses would be the larger part of its cost."""
         r, rows = self.rig.rectified, matches.features
         measured = measurement_rows(r.rectify_left(features.uv_left[rows]), r.rectify_right(features.uv_right[rows]))
-        threshold = self.config.consistency_sigmas * self.pixel_sigma
+        threshold = self.config.consistency_sigmas * self._rectified_sigma
         if wide and len(matches) < self.config.minimum_consistent:
             return PoseConsensus(guess, np.zeros(len(matches), bool))
         hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses

@@ -1,4 +1,4 @@
-"""The chi-square gate on innovations, one for all back ends."""
+"""The chi-square gate on innovations, and what follows from its limits."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class RectifiedStereo:
             left.v0,
             rectified_rig.rig.baseline,
             right.u0 - left.u0,
-            _scale(rectified_rig),
+            rectified_rig.scale,
         )
 
     def measure(self, observations: Observations) -> Array:
@@ -87,19 +87,6 @@ class RectifiedStereo:
         """Points (N, 3) in the left camera's coordinates; NaN where the disparity is not positive or missing."""
         points = triangulate_rectified(self.intrinsics, np.ascontiguousarray(z[:, :2]), np.ascontiguousarray(z[:, 2:]))
         return np.asarray(points @ self.rectified_rig.R_left)
-
-
-def _scale(rectified_rig: RectifiedRig) -> float:
-    """Mean stretch of the left image by rectification."""
-    rig = rectified_rig.original
-    if rig.is_rectified:
-        return 1.0
-    u, v = np.meshgrid(np.linspace(0.1, 0.9, 9) * rig.width, np.linspace(0.1, 0.9, 9) * rig.height)
-    uv = np.stack([u.ravel(), v.ravel()], axis=1)
-    right, down = np.array([0.5, 0.0]), np.array([0.0, 0.5])
-    du = rectified_rig.rectify_left(uv + right) - rectified_rig.rectify_left(uv - right)
-    dv = rectified_rig.rectify_left(uv + down) - rectified_rig.rectify_left(uv - down)
-    return float(np.sqrt(np.nanmean(np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,8 @@ def test_json_and_back(kind):
         ("models.pixel_sigma=-1", "pixel_sigma must be positive"),
         ("models.pixel_sigma=NaN", "pixel_sigma must be positive and finite"),
         ("map.grid=[1]", "map.grid"),
+        ("backend.rig=3", "backend.rig: the system gives this"),
+        ("frontend.models=1", "frontend.models: the system gives this"),
         ("map=3", "is a section"),
         ("map.separation=NaN", "separation must be finite"),
         ("association.d_match=[NaN, 0.2]", "d_match must be finite"),

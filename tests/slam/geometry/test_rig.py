@@ -129,3 +129,12 @@ def test_impossible_rigs(change, message):
     values = {"left": LEFT, "right": RIGHT, "R": np.eye(3), "b": [-0.11, 0, 0], **change}
     with pytest.raises(CalibrationError, match=message):
         StereoRig(**values)
+
+
+def test_the_scale_of_rectified_pixels():
+    """Noise of original pixels is as many rectified ones as lengths are stretched."""
+    left, right = (PinholeCamera(f, f, 160.0, 120.0, 320, 240) for f in (300.0, 200.0))
+    rig = StereoRig(left, right, np.eye(3), np.array([-0.1, 0.0, 0.0]))
+    assert not rig.is_rectified
+    assert rig.rectified.scale == pytest.approx(rig.rectified.rig.left.fu / 300.0)
+    assert StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.1, 320, 240).rectified.scale == 1.0

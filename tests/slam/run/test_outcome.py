@@ -134,6 +134,13 @@ def test_a_baseline_in_another_unit_is_known_by_speed_and_distance(step, depth, 
     assert scale_doubt(replace(run, depths=[np.nan] * 30), rig, driving) == ""
 
 
+def test_a_wide_baseline_alone_is_said_without_blaming_the_motion():
+    poses = [exp(np.array([0, 0, 0, 0, 0, 0.02 * k])) for k in range(30)]
+    run = RunRecord(stamps=(0.1 * np.arange(30)).tolist(), poses=poses, measured=[True] * 30, depths=[3.0] * 30)
+    said = scale_doubt(run, StereoRig.rectified_pair(300.0, 160.0, 120.0, 12.0, 320, 240))
+    assert said.startswith("by the calibration the cameras are 12 m apart")
+
+
 def test_a_vehicle_that_goes_sideways_is_doubted():
     """A truck before a standing car took the camera along."""
 

@@ -53,6 +53,7 @@ def test_no_more_than_asked_for_is_made_beforehand():
 
 def test_an_exception_comes_where_its_item_would():
     before = threads()
+
     def items():
         yield 1
         raise ValueError("broken")

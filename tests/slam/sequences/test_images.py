@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import PIL.ImageFile
 import pytest
 
 from slam.errors import SequenceError
-from slam.sequences.images import MOST_PIXELS, read_image
+from slam.sequences.images import MOST_PIXELS, decode_image, read_image
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
@@ -147,3 +149,22 @@ def test_a_damaged_image_prints_nothing(tmp_path, capfd):
     with pytest.raises(SequenceError, match=r"b\.png"):
         read_image(tmp_path / "b.png")
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("form", [".png", ".tiff", ".ppm"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_sixteen_bits_stay_sixteen_bits(form, channels):
+    if form == ".ppm" and channels == 4:
+        form = ".png"
+    pixels = np.full((6, 5, channels), 40_000, np.uint16)
+    form = ".pgm" if (form, channels) == (".ppm", 1) else form
+    found = decode_image(cv2.imencode(form, pixels)[1].tobytes(), "x")
+    assert found.dtype == np.uint16 and np.abs(found.astype(int) - 40_000).max() <= 1
+
+
+def test_grey_values_are_as_stored():
+    np.testing.assert_array_equal(decode_image(b"P5\n4 2\n100\n" + bytes(range(8)), "x").ravel(), np.arange(8))
+    large = io.BytesIO()
+    PIL.Image.fromarray(np.array([[70_000, -5, 100_000]], np.int32)).save(large, "TIFF")
+    with pytest.raises(SequenceError, match="int32, not 8 or 16 bit"):
+        decode_image(large.getvalue(), "x")
