@@ -267,12 +267,17 @@ class Session:
         )  # fmt: skip
         return state, prediction
 
-    def left_behind(self, before: State, step: Step) -> IdArray:
+    def left_behind(self, before: State, begun: State, step: Step) -> IdArray:
         """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began.
 
         What the rig's uncertainty does to those is forgotten.
+
+        Args:
+            before: after the last frame.
+            begun: the state in which the step began; without landmarks where a new map did.
+            step: of this frame.
         """
-        if before.landmarks is None or step.report.reason != NEW_MAP:
+        if before.landmarks is None or begun.landmarks is not None:
             return step.erased
         self.rig_error.uncertainty.keep(step.landmarks.ids)
         return np.concatenate([np.setdiff1d(before.landmarks.ids, step.landmarks.ids), step.erased])
