@@ -117,9 +117,9 @@ def _say(text: str, style: str | None = None) -> None:
 def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
     """A table of finished runs, a column each."""
     table = Table(title=summaries[0]["sequence"], title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("", no_wrap=True)
+    table.add_column("")
     for summary in summaries:
-        table.add_column(summary["backend"], justify="right")
+        table.add_column(summary["backend"], justify="right", no_wrap=True)
     for label, values in rows(summaries):
         table.add_row(escape(label), *values)
     _console.print(table)
