@@ -49,7 +49,9 @@ def run_one(name: str, folder: Path, backend: str, out: Path, frames: int | None
     target = folder_of(name, backend, out)
     lifetimes = Lifetimes()
     config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-    summary = run(sequence, RunOptions(backend, "surf", config, target, 0, frames), lifetimes.add)
+    summary = run(
+        sequence, RunOptions(backend, "surf", config, target, 0, frames, origin={"kind": sequence.kind}), lifetimes.add
+    )
     return {**summary, "lifetime": lifetimes.figures()["lifetime_frames"]}
 
 

@@ -342,14 +342,14 @@ def warm_up_command(quiet: of.QuietOption = False) -> None:
         print(f"kernels compiled in {seconds:.0f} s" if seconds else "all kernels were compiled already")
 
 
-@app.command("demo", short_help="Try both back ends on a built-in scene.")
+@app.command("demo", short_help="Try three back ends on a built-in scene.")
 def demo_command(
     out: of.OutOption = Path("slam_demo"),
     frames: Annotated[int, typer.Option(metavar="N", min=10, help="Number of frames.")] = 150,
     overwrite: of.OverwriteOption = False,
     quiet: of.QuietOption = False,
 ) -> None:
-    """Run both back ends on a built-in scene, compare them, and draw pictures."""
+    """Run three back ends on a built-in scene, compare them, and draw pictures."""
     from slam.commands.demo import demo
 
     demo(out, frames, quiet, overwrite)

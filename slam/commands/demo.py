@@ -1,4 +1,4 @@
-"""``slam demo``: the built-in bookshelf aisle with a moving box through both back ends, in a table and pictures."""
+"""``slam demo``: the built-in bookshelf aisle with a moving box through three back ends, in a table and pictures."""
 
 from __future__ import annotations
 

@@ -82,14 +82,23 @@ def _absolute(own: Trajectory, true: Trajectory) -> dict[str, float]:
     return {"ATE RMSE [m]": ate.rmse, "ATE max [m]": ate.max}
 
 
-def _from_start(own: Trajectory, true: Trajectory, mounting: float) -> dict[str, float]:
-    # Turned by the first pose, not by the aligned path: a straight path leaves the turn about itself open.
+def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array:
+    """Errors (N, 3) of the rotations since the start [rad], without what a constant turn of the truth's sensor explains.
+
+    Args:
+        own, true: poses of the same frames; turned by the first one, as a straight path leaves the turn about itself
+            open.
+        mounting: standard deviation of each axis of that turn beforehand [rad]; 0 for none.
+    """
     since_start = (inverse(path.poses[0]) @ path.poses for path in (own, true))
     R, R_true = (poses[:, :3, :3] for poses in since_start)
     R_left = np.swapaxes(R, 1, 2)
     errors = so3_log(R_left @ R_true)
-    if mounting:
-        errors = _remounted(errors, R_left, mounting)
+    return _remounted(errors, R_left, mounting) if mounting else errors
+
+
+def _from_start(own: Trajectory, true: Trajectory, mounting: float) -> dict[str, float]:
+    errors = rotation_errors(own, true, mounting)
     return {"rotation RMSE from start [deg]": float(np.degrees(np.sqrt(np.mean(np.sum(errors**2, axis=1)))))}
 
 

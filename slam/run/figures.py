@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slam.evaluation.metrics import align, associate
-from slam.geometry.se3 import Array, rotation_angle
+from slam.evaluation.summary import rotation_errors
+from slam.geometry.se3 import Array, hat, so3_exp
 from slam.geometry.trajectory import Trajectory
 from slam.run.run_data import RunData
 
@@ -21,6 +22,7 @@ _CORRECTED, _CLOSED, _REFUSED = "#4527a0", "0.1", "#d81b60"  # what loops do
 _BODIES = ("#00838f", "#6a1b9a", "#5d4037", "#ad1457")
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _SIGMAS = 2.0  # size of ellipses
+_TURNED = np.radians(1.0)  # how far the axes of a recorded truth are turned against the camera's, about
 
 
 def draw_map(axis: Axes, run: RunData, colour: str) -> None:
@@ -107,15 +109,31 @@ def widths(count: int) -> Array:
 def place_of_truth(run: RunData, truth: Trajectory) -> Array:
     """Pose (4, 4) of the true path's world in the run's, in which both paths begin at the same position.
 
-    It is turned by the first pose where the truth is exact. A recorded one is turned so that the whole paths fit: an
-    error of its first orientation by some tenths of a degree would look like an error of the path that grows with the
-    distance.
+    It is turned by the first pose. A recorded one is turned a little further, so that the whole paths fit: an error of
+    its first orientation by some tenths of a degree would look like an error of the path that grows with the distance.
+    Where no little turn makes them fit, the truth's orientations are in other axes, and the paths alone count.
     """
     own, true = associate(run.online, truth, 0.02, interpolated=True)
-    T = np.eye(4)
-    T[:3, :3] = own.poses[0, :3, :3] @ true.poses[0, :3, :3].T if run.truth_is_exact else align(true, own).R
+    T, turn = np.eye(4), own.poses[0, :3, :3] @ true.poses[0, :3, :3].T
+    if not run.truth_is_exact:
+        turn = _fitted(own.positions - own.positions[0], true.positions - true.positions[0], turn, align(true, own).R)
+    T[:3, :3] = turn
     T[:3, 3] = own.positions[0] - T[:3, :3] @ true.positions[0]
     return T
+
+
+def _fitted(own: Array, true: Array, turn: Array, by_paths: Array) -> Array:
+    """A rotation (3, 3) close to `turn` by which places since the start (N, 3) fit; `by_paths` where none does.
+
+    What the paths do not tell, such as a turn about a straight path, stays as it was.
+    """
+    turned = true @ turn.T
+    J = -hat(turned).reshape(-1, 3)
+    gaps = own - turned
+    prior = float(np.mean(gaps**2)) / _TURNED**2
+    fitted = so3_exp(np.linalg.solve(J.T @ J + max(prior, 1e-12) * np.eye(3), J.T @ gaps.ravel())) @ turn
+    left, least = (float(((own - true @ R.T) ** 2).sum()) for R in (fitted, by_paths))
+    return fitted if left <= 2 * least or left <= float(np.sum(own**2)) * _TURNED**2 else by_paths
 
 
 def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
@@ -130,8 +148,8 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
     own, true = associate(run.online, run.truth, 0.02, interpolated=True)
     T = place_of_truth(run, run.truth)
     expected = true.positions @ T[:3, :3].T + T[:3, 3]
-    turned = np.swapaxes(T[:3, :3] @ true.poses[:, :3, :3], 1, 2) @ own.poses[:, :3, :3]
-    errors = np.column_stack([own.positions - expected, np.degrees(rotation_angle(turned))])
+    turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)
+    errors = np.column_stack([own.positions - expected, np.degrees(turned)])
     return own.stamps - run.online.stamps[0], errors, run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
 
 

@@ -1,4 +1,4 @@
-"""What both back ends do if most observations contradict the prediction, which then must be wrong itself."""
+"""What back ends do if most observations contradict the prediction, which then must be wrong itself."""
 
 from __future__ import annotations
 

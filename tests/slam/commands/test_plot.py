@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from slam.commands.plot import plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
+from slam.geometry.trajectory import Trajectory
 from slam.run.figures import pose_errors
 from slam.run.options import RunOptions
 from slam.run.plots import KINDS
@@ -65,3 +67,16 @@ def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
     summary = run_.summary["accuracy"]["online"]
     assert np.sqrt(np.mean(error[:, 3] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
     assert (error[1:, 3] < 5 * sigma[1:, 3]).all() and (sigma[1:, 3] > 0).all()
+
+
+def test_a_recorded_truth_of_a_straight_path_is_not_turned_about_it(runs):
+    """Places in a line do not tell a turn about that line."""
+    run_ = RunData.read(runs / "a", "a")
+    straight = np.tile(np.eye(4), (len(run_.online), 1, 1))
+    straight[:, 2, 3] = np.arange(len(straight))
+    off = straight.copy()
+    off[:, :2, 3] += 1e-3 * np.random.default_rng(0).standard_normal((len(off), 2))
+    made = (Trajectory(run_.online.stamps, poses) for poses in (off, straight))
+    _, error, _ = pose_errors(replace(run_, online=next(made), truth=next(made), truth_is_exact=False))
+    assert np.abs(error[:, 3]).max() < 0.01
+    assert np.abs(error[:, :3]).max() < 0.01
