@@ -49,9 +49,8 @@ def run_one(name: str, folder: Path, backend: str, out: Path, frames: int | None
     target = folder_of(name, backend, out)
     lifetimes = Lifetimes()
     config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-    summary = run(
-        sequence, RunOptions(backend, "surf", config, target, 0, frames, origin={"kind": sequence.kind}), lifetimes.add
-    )
+    options = RunOptions(backend, "surf", config, target, 0, frames, origin={"kind": sequence.kind})
+    summary = run(sequence, options, lifetimes.add)
     return {**summary, "lifetime": lifetimes.figures()["lifetime_frames"]}
 
 

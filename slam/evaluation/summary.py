@@ -83,11 +83,12 @@ def _absolute(own: Trajectory, true: Trajectory) -> dict[str, float]:
 
 
 def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array:
-    """Errors (N, 3) of the rotations since the start [rad], without what a constant turn of the truth's sensor explains.
+    """Errors (N, 3) of rotations since the start [rad], without what a constant turn of the truth's sensor explains.
 
     Args:
-        own, true: poses of the same frames; turned by the first one, as a straight path leaves the turn about itself
-            open.
+        own: the estimated poses. Both paths are turned by their first pose, as a straight path leaves a turn about
+            itself open.
+        true: the true poses of the same frames.
         mounting: standard deviation of each axis of that turn beforehand [rad]; 0 for none.
     """
     since_start = (inverse(path.poses[0]) @ path.poses for path in (own, true))

@@ -115,9 +115,10 @@ def place_of_truth(run: RunData, truth: Trajectory) -> Array:
     """
     own, true = associate(run.online, truth, 0.02, interpolated=True)
     T, turn = np.eye(4), own.poses[0, :3, :3] @ true.poses[0, :3, :3].T
-    if not run.truth_is_exact:
-        turn = _fitted(own.positions - own.positions[0], true.positions - true.positions[0], turn, align(true, own).R)
     T[:3, :3] = turn
+    if not run.truth_is_exact:
+        places = (path.positions - path.positions[0] for path in (own, true))
+        T[:3, :3] = _fitted(*places, turn, align(true, own).R)
     T[:3, 3] = own.positions[0] - T[:3, :3] @ true.positions[0]
     return T
 
