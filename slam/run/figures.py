@@ -117,8 +117,8 @@ def place_of_truth(run: RunData, truth: Trajectory) -> Array:
     T, turn = np.eye(4), own.poses[0, :3, :3] @ true.poses[0, :3, :3].T
     T[:3, :3] = turn
     if not run.truth_is_exact:
-        places = (path.positions - path.positions[0] for path in (own, true))
-        T[:3, :3] = _fitted(*places, turn, align(true, own).R)
+        places, true_places = (path.positions - path.positions[0] for path in (own, true))
+        T[:3, :3] = _fitted(places, true_places, turn, align(true, own).R)
     T[:3, 3] = own.positions[0] - T[:3, :3] @ true.positions[0]
     return T
 
