@@ -37,7 +37,7 @@ SEQUENCES = {
     "EuRoC V1_01, 20 keyframes": "euroc/V1_01_keyframes_a",
 }
 HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", "NEES over 1 m", "NEES over 10 m",
-          "landmark lifetime, median [frames]", "ms per frame")  # fmt: skip
+          "landmark lifetime, median [frames]")  # fmt: skip
 
 
 def folder_of(name: str, backend: str, out: Path) -> Path:
@@ -62,8 +62,7 @@ def row(name: str, summary: dict[str, Any]) -> list[str]:
     for length in (1, 10):
         nees = summary["consistency"].get(f"NEES over {length} m")
         texts.append("–" if nees is None else f"{nees:.1f}")
-    times = (f"{summary['lifetime']:.0f}", f"{summary['milliseconds']['median_total']:.0f}")
-    return [name, summary["backend"], tracked, *texts, *times]
+    return [name, summary["backend"], tracked, *texts, f"{summary['lifetime']:.0f}"]
 
 
 def draw(names: dict[str, Path], out: Path) -> None:
