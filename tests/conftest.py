@@ -17,6 +17,9 @@ from hypothesis import HealthCheck, settings
 # Before NumPy is loaded: its threads would wait in turn for the cores on which the tests run side by side.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# OpenCV reads this once, at the first video of a process, which a test may write before the program reads one.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
 # The same examples in every run, and no limit on the time of one: the first compiles the kernels that it needs.
 settings.register_profile("repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("repeatable")
