@@ -198,8 +198,8 @@ def from_estimate(body: Body, belief: BodyBelief, min_speed: float) -> Body:
 def continued(body: Body, known: Body) -> Body:
     """A new body that turns out to be a known one: it takes over that one's id and probability of existence.
 
-    The estimate of it begins anew, and so does the proof that it moves. Its body frame stays as predicted, but for a shift from the part seen
-    before to the part seen now.
+    The estimate of it begins anew, and so does the proof that it moves. Its body frame stays as predicted, but for a
+    shift from the part seen before to the part seen now.
     """
     shift = np.eye(4)
     shift[:3, 3] = body.middle - known.middle
