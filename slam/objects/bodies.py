@@ -198,7 +198,7 @@ def from_estimate(body: Body, belief: BodyBelief, min_speed: float) -> Body:
 def continued(body: Body, known: Body) -> Body:
     """A new body that turns out to be a known one: it takes over that one's id and probability of existence.
 
-    The estimate of it begins anew, and so does the proof that it moves. Its body frame stays as predicted, but for a
+    The estimate of it begins anew, and so does the evidence that it moves. Its body frame stays as predicted, but for a
     shift from the part seen before to the part seen now.
     """
     shift = np.eye(4)
@@ -206,7 +206,7 @@ def continued(body: Body, known: Body) -> Body:
     T_body_estimate = inverse(body.T) @ shift @ known.T @ known.T_body_estimate
     return replace(
         body, id=known.id, T_body_estimate=T_body_estimate,
-        moved=known.moved, existence=known.existence, age=known.age,
+        proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
         reported=known.reported, reported_unmeasured=known.reported_unmeasured,
         measured_at=known.measured_at, belief=None, refused=0,
     )  # fmt: skip
