@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slam.data import IdArray
 from slam.geometry.se3 import Array
+from slam.worlds.geometry import unit
 from slam.worlds.world import World
 
 _VISIT = 60.0  # landmarks that change do so after as long a time [s]
@@ -131,8 +132,3 @@ def appearance(world: World, values: Mapping[str, Any]) -> Appearance:
 def _pace(drift: float) -> float:
     """Pace of the waves [rad/rad] whose sum changes a descriptor by `drift` per radian, while that is little."""
     return float(drift * np.sqrt((_COMMON**2 + 1) / _DRIFTING))
-
-
-def unit(rows: Array) -> Array:
-    """Rows scaled to unit length."""
-    return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]

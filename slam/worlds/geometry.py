@@ -5,7 +5,7 @@ World axes follow paper B's experiments: x right, y forward (away from the first
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -14,14 +14,13 @@ import numpy as np
 
 from slam.data import BoolArray, IdArray
 from slam.geometry.se3 import Array, transform
+from slam.worlds.surfaces import Material
+
+RIGHT, LEFT, FORWARD, BACK, UP, DOWN = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 
 
 class Texture(Protocol):
-    """What is painted on a rectangle: its layout is known without painting it.
-
-    Attributes:
-        width, height: size [m].
-    """
+    """What is painted on a rectangle, `width` by `height` [m]; its layout is known without painting it."""
 
     @property
     def width(self) -> float: ...  # noqa: D102
@@ -33,32 +32,21 @@ class Texture(Protocol):
         """Points (M, 3) where something stands out: x, y from the top-left corner, and its size [m]."""
         ...
 
+    def paint(self, density: float) -> np.ndarray:
+        """The picture, BGR uint8 (round(height · density), round(width · density), 3), texels per metre."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class Rectangle:
-    """A textured rectangle, seen from its front only.
+    """A textured rectangle, seen from its front only."""
 
-    Attributes:
-        origin: its texture's top-left corner (the outer edge of the first texel) in the body frame (3,) [m].
-        along: its upper edge (3,) [m], the way texture rows run.
-        down: its left edge (3,) [m], the way texture columns run.
-        texture: what is painted on it.
-        body: 0 for the still world, else the object that it is part of.
-        occludes: whether it may hide other rectangles of the world (walls of a convex room cannot).
-    """
-
-    origin: Array
-    along: Array
-    down: Array
+    origin: Array  # its texture's top-left corner (the outer edge of the first texel) in the body frame (3,) [m]
+    along: Array  # its upper edge (3,) [m], the way texture rows run
+    down: Array  # its left edge (3,) [m], the way texture columns run
     texture: Texture
-    body: int = 0
-    occludes: bool = False
-
-    def points(self, xy: Array) -> Array:
-        """Points (N, 3) in the body frame of texture places (N, 2) [m] from the top-left corner."""
-        unit_along = self.along / np.linalg.norm(self.along)
-        unit_down = self.down / np.linalg.norm(self.down)
-        return self.origin + xy[:, :1] * unit_along + xy[:, 1:2] * unit_down
+    body: int = 0  # 0 for the still world, else the object that it is part of
+    occludes: bool = False  # whether it may hide other rectangles of the world (walls of a convex room cannot)
 
     @property
     def normal(self) -> Array:
@@ -66,118 +54,116 @@ class Rectangle:
         n = np.cross(self.down, self.along)
         return n / np.linalg.norm(n)
 
+    def parts(self) -> list[Rectangle]:
+        """Parts beside each other, if its texture has any (`parts()`, from the left); else itself."""
+        parts: list[Texture] = getattr(self.texture, "parts", list)()
+        if not parts:
+            return [self]
+        left = np.cumsum([0.0, *(p.width for p in parts)]) / self.texture.width
+        return [
+            replace(self, origin=self.origin + a * self.along, along=(b - a) * self.along, texture=p)
+            for a, b, p in zip(left, left[1:], parts)
+        ]
+
+
+def unit(rows: Array) -> Array:
+    """Rows (N, D) scaled to unit length."""
+    return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]
+
 
 def rectangle(
-    texture: Texture, origin: Iterable[float], along: Iterable[float], down: Iterable[float],
+    texture: Texture, origin: Sequence[float] | Array, along: Sequence[float] | Array, down: Sequence[float] | Array,
     body: int = 0, occludes: bool = False,
 ) -> Rectangle:  # fmt: skip
     """A rectangle of its texture's size; `along` and `down` need only be directions, at right angles."""
-    a, d = np.array(list(along), float), np.array(list(down), float)
+    a, d = np.array(along, float), np.array(down, float)
     a *= texture.width / np.linalg.norm(a)
     d *= texture.height / np.linalg.norm(d)
-    return Rectangle(np.array(list(origin), float), a, d, texture, body, occludes)
+    return Rectangle(np.array(origin, float), a, d, texture, body, occludes)
 
 
-def in_parts(whole: Rectangle) -> list[Rectangle]:
-    """A rectangle's parts beside each other, if its texture has any (`parts()`, from the left); else itself."""
-    parts: list[Texture] = getattr(whole.texture, "parts", list)()
-    if not parts:
-        return [whole]
-    left = np.cumsum([0.0, *(p.width for p in parts)]) / whole.texture.width
-    return [
-        replace(whole, origin=whole.origin + a * whole.along, along=(b - a) * whole.along, texture=p)
-        for a, b, p in zip(left, left[1:], parts)
-    ]
+#: Faces of a box: the corner where the texture begins (shares of its edges), the ways of the texture's rows and
+#: columns, and the axes along which it is wide and high.
+FACES = {
+    "front": ((0, 0, 1), RIGHT, DOWN, (0, 2)),
+    "back": ((1, 1, 1), LEFT, DOWN, (0, 2)),
+    "left": ((0, 1, 1), BACK, DOWN, (1, 2)),
+    "right": ((1, 0, 1), FORWARD, DOWN, (1, 2)),
+    "top": ((0, 1, 1), RIGHT, BACK, (0, 1)),
+    "bottom": ((0, 0, 0), RIGHT, FORWARD, (0, 1)),
+}
 
 
 def cuboid(
-    faces: Mapping[str, Texture], size: Iterable[float], corner: Iterable[float] = (0, 0, 0),
+    faces: Mapping[str, Texture], size: Sequence[float] | Array, corner: Sequence[float] | Array = (0, 0, 0),
     body: int = 0, T_body_box: Array | None = None,
 ) -> list[Rectangle]:  # fmt: skip
-    """The outer faces of a box with edges `size` (3,) along x, y, z from its lowest corner.
+    """The outer faces of a box.
 
     Args:
         faces: textures by face name: front (−y), back (+y), left (−x), right (+x), top (+z), bottom (−z).
-        size: lengths [m] along the box's x, y and z axes.
+        size: lengths (3,) [m] along the box's x, y and z axes.
         corner: its corner with the lowest coordinates, in box axes.
         body: the object that it is part of.
         T_body_box: pose (4, 4) of the box axes in the body frame; identity if None.
     """
-    x, y, z = np.array(list(size), float)
-    layout = {
-        "front": ((0, 0, z), (1, 0, 0), (0, 0, -1)),
-        "back": ((x, y, z), (-1, 0, 0), (0, 0, -1)),
-        "left": ((0, y, z), (0, -1, 0), (0, 0, -1)),
-        "right": ((x, 0, z), (0, 1, 0), (0, 0, -1)),
-        "top": ((0, y, z), (1, 0, 0), (0, -1, 0)),
-        "bottom": ((0, 0, 0), (1, 0, 0), (0, 1, 0)),
-    }
-    T = np.eye(4) if T_body_box is None else T_body_box
-    lowest = np.array(list(corner), float)
-    out = []
+    T, out = np.eye(4) if T_body_box is None else T_body_box, []
     for name, texture in faces.items():
-        origin, along, down = (np.array(v, float) for v in layout[name])
-        start = transform(T, (origin + lowest)[None])[0]
+        share, along, down, _ = FACES[name]
+        start = transform(T, (np.multiply(share, size) + corner)[None])[0]
         out.append(rectangle(texture, start, T[:3, :3] @ along, T[:3, :3] @ down, body, True))
     return out
 
 
+def crate(
+    size: Sequence[float] | Array, looks: Material, corner: Sequence[float] | Array = (0, 0, 0), body: int = 0,
+    T_body_box: Array | None = None, sides: Iterable[str] = FACES,
+) -> list[Rectangle]:  # fmt: skip
+    """The `sides` of a box, each a piece of its own like `looks`; thin ones are left out. See `cuboid`."""
+    faces = {}
+    for i, side in enumerate(sides):
+        wide, high = (size[axis] for axis in FACES[side][3])
+        if min(wide, high) > 0.01:
+            faces[side] = replace(looks, width=wide, height=high, seed=looks.seed + i)
+    return cuboid(faces, size, corner, body, T_body_box)
+
+
 class Parts(NamedTuple):
-    """What a scene describes of its world.
+    """What a scene describes of its world."""
 
-    Attributes:
-        stamps, poses: of the left camera (N,) [s], (N, 4, 4).
-        rectangles: every surface.
-        objects: poses of the moving objects (B, N, 4, 4), or None.
-    """
-
-    stamps: Array
-    poses: Array
-    rectangles: list[Rectangle]
-    objects: Array | None = None
+    stamps: Array  # (N,) [s]
+    poses: Array  # of the left camera (N, 4, 4)
+    rectangles: list[Rectangle]  # every surface
+    objects: Array | None = None  # poses of the moving objects (B, N, 4, 4)
 
 
 @dataclass(frozen=True, eq=False)
 class RectangleArrays:
-    """Many rectangles as arrays, a row each, in one frame.
+    """Many rectangles as arrays, a row each, in one frame; see `Rectangle`."""
 
-    Attributes:
-        origin, along, down, normal: see `Rectangle` (Q, 3).
-        body: see `Rectangle` (Q,).
-    """
-
-    origin: Array
+    origin: Array  # (Q, 3)
     along: Array
     down: Array
     normal: Array
-    body: IdArray
+    body: IdArray  # (Q,)
 
     @classmethod
     def of(cls, rectangles: Iterable[Rectangle]) -> RectangleArrays:
         """Stack rectangles, each in its own body frame."""
         rows = list(rectangles)
-        origin, along, down, normal = (
-            np.array([getattr(r, name) for r in rows], float).reshape(-1, 3)
-            for name in ("origin", "along", "down", "normal")
-        )
-        return cls(origin, along, down, normal, np.array([r.body for r in rows], np.int64))
+        vectors = [np.array([getattr(r, f.name) for r in rows], float).reshape(-1, 3) for f in fields(cls)[:4]]
+        return cls(*vectors, np.array([r.body for r in rows], np.int64))
 
     def placed(self, T_world_body: Array) -> RectangleArrays:
         """In world coordinates, for body poses (B + 1, 4, 4) whose row 0 is the identity."""
-        moving = np.flatnonzero(self.body)
-        if not len(moving):
-            return self
-        T = T_world_body[self.body[moving]]
-        turned = [column.copy() for column in (self.origin, self.along, self.down, self.normal)]
-        for column in turned:
-            column[moving] = (T[:, :3, :3] @ column[moving, :, None])[..., 0]
-        origin, along, down, normal = turned
-        origin[moving] += T[:, :3, 3]
-        return RectangleArrays(origin, along, down, normal, self.body)
+        columns = [turned(v, self.body, T_world_body) for v in (self.origin, self.along, self.down, self.normal)]
+        if columns[0] is not self.origin:
+            columns[0] += T_world_body[self.body, :3, 3]
+        return RectangleArrays(*columns, self.body)
 
     def select(self, rows: np.ndarray) -> RectangleArrays:
         """These rows."""
-        return RectangleArrays(self.origin[rows], self.along[rows], self.down[rows], self.normal[rows], self.body[rows])
+        return RectangleArrays(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def __len__(self) -> int:
         return len(self.body)
@@ -192,13 +178,15 @@ class RectangleArrays:
         """Half diagonals (Q,)."""
         return np.linalg.norm(self.along + self.down, axis=1) / 2
 
-    @cached_property
-    def inverse_edges(self) -> tuple[Array, Array]:
-        """``along / |along|²`` and ``down / |down|²`` (Q, 3): their products with an offset run from 0 to 1 inside."""
-        return (
-            self.along / (self.along**2).sum(axis=1, keepdims=True),
-            self.down / (self.down**2).sum(axis=1, keepdims=True),
-        )
+
+def turned(vectors: Array, bodies: IdArray, T_world_body: Array) -> Array:
+    """Vectors (N, 3) in the frames of bodies (N,), in world axes; those of the still world (body 0) stay exactly."""
+    moving = np.flatnonzero(bodies)
+    if not len(moving):
+        return vectors
+    out = vectors.copy()
+    out[moving] = (T_world_body[bodies[moving], :3, :3] @ vectors[moving, :, None])[..., 0]
+    return out
 
 
 def hidden(centre: Array, points: Array, occluders: RectangleArrays) -> BoolArray:
@@ -209,11 +197,11 @@ def hidden(centre: Array, points: Array, occluders: RectangleArrays) -> BoolArra
         return np.zeros(len(points), bool)
     chosen = occluders.select(rows)
     offset = chosen.origin - centre
-    along, down = chosen.inverse_edges
+    along, down = (edge / (edge**2).sum(axis=1, keepdims=True) for edge in (chosen.along, chosen.down))
     height = (chosen.normal * offset).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = height / (rays @ chosen.normal.T)  # the ray meets the plane at centre + t · ray (P, Q)
-        u = t * (rays @ along.T) - (offset * along).sum(axis=1)
+        u = t * (rays @ along.T) - (offset * along).sum(axis=1)  # shares of the edges: 0 to 1 inside
         v = t * (rays @ down.T) - (offset * down).sum(axis=1)
         inside = (np.abs(u - 0.5) < 0.5) & (np.abs(v - 0.5) < 0.5)
         return (inside & (np.abs(t - 0.5) < 0.499)).any(axis=1)
@@ -224,38 +212,29 @@ def _between(centre: Array, rays: Array, occluders: RectangleArrays) -> np.ndarr
     if not len(rays):
         return np.zeros(0, int)
     offset = occluders.middle - centre
-    distance = np.sqrt(np.einsum("ij,ij->i", offset, offset)) + 1e-12
-    length = np.sqrt(np.einsum("ij,ij->i", rays, rays))
-    unit = rays / length[:, None]
-    axis = unit.mean(axis=0)
+    distance = np.linalg.norm(offset, axis=1) + 1e-12
+    length = np.linalg.norm(rays, axis=1)
+    directions = rays / length[:, None]
+    axis = directions.mean(axis=0)
     axis /= np.linalg.norm(axis)
-    widest = np.arccos(np.clip((unit @ axis).min(), -1, 1))
+    widest = np.arccos(np.clip((directions @ axis).min(), -1, 1))
     angle = np.arccos(np.clip((offset @ axis) / distance, -1, 1))
     angle -= np.arcsin(np.minimum(occluders.radius / distance, 1.0))
-    facing = np.einsum("ij,ij->i", occluders.normal, offset) < -1e-9
+    facing = (occluders.normal * offset).sum(axis=1) < -1e-9
     near = distance - occluders.radius < length.max()
     return np.flatnonzero(facing & near & ((angle < widest) | (distance < occluders.radius)))
 
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """The landmarks of a world, a row each; the row is the id.
+    """The landmarks of a world, a row each; the row is the id."""
 
-    Attributes:
-        positions: in the frame of the object that they sit on, which is the world for object 0 (P, 3) [m].
-        normals: outward unit normals of their surfaces, in the same frame (P, 3).
-        surface: index of the rectangle that they lie on (P,).
-        object: id of the object, 0 for the still world (P,).
-        size: diameter of what is painted there (P,) [m].
-        looks: which landmark it looks like, usually itself (P,).
-    """
-
-    positions: Array
-    normals: Array
-    surface: IdArray
-    object: IdArray
-    size: Array = field(repr=False)
-    looks: IdArray = field(repr=False)
+    positions: Array  # in the frame of the object that they sit on, which is the world for object 0 (P, 3) [m]
+    normals: Array  # outward unit normals of their surfaces, in the same frame (P, 3)
+    surface: IdArray  # index of the rectangle that they lie on (P,)
+    object: IdArray  # id of the object, 0 for the still world (P,)
+    size: Array = field(repr=False)  # diameter of what is painted there (P,) [m]
+    looks: IdArray = field(repr=False)  # which landmark it looks like, usually itself (P,)
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -266,12 +245,7 @@ class Landmarks:
 
     def world_positions(self, T_world_body: Array) -> Array:
         """Positions (P, 3) in the world, for body poses (B + 1, 4, 4) whose row 0 is the identity."""
-        out = self.positions.copy()
-        moving = np.flatnonzero(self.object)
-        if len(moving):
-            T = T_world_body[self.object[moving]]
-            out[moving] = (T[:, :3, :3] @ out[moving, :, None])[..., 0] + T[:, :3, 3]
-        return out
+        return turned(self.positions, self.object, T_world_body) + T_world_body[self.object, :3, 3]
 
 
 def place_landmarks(
@@ -283,20 +257,18 @@ def place_landmarks(
     texture comes again, and they look like those of the first time.
     """
     chosen: dict[Texture, tuple[Array, int]] = {}
-    columns: list[list[np.ndarray]] = [[], [], [], [], [], []]
-    count = 0
+    rows, count = [], 0
     for index, r in enumerate(rectangles):
         if not alike or r.texture not in chosen:
             chosen[r.texture] = _chosen_marks(r.texture, density, rng), count
         marks, first = chosen[r.texture]
         n = len(marks)
-        normals, looks = np.tile(r.normal, (n, 1)), np.arange(first, first + n)
-        rows = (r.points(marks[:, :2]), normals, np.full(n, index), np.full(n, r.body), marks[:, 2], looks)
-        for column, part in zip(columns, rows):
-            column.append(part)
+        along, down = (edge / np.linalg.norm(edge) for edge in (r.along, r.down))
+        places = r.origin + marks[:, :1] * along + marks[:, 1:2] * down
+        looks = np.arange(first, first + n)
+        rows.append((places, np.tile(r.normal, (n, 1)), np.full(n, index), np.full(n, r.body), marks[:, 2], looks))
         count += n
-    positions, normals, surface, body, size, looks = (np.concatenate(c) for c in columns)
-    return Landmarks(positions, normals, surface.astype(np.int64), body.astype(np.int64), size, looks.astype(np.int64))
+    return Landmarks(*(np.concatenate(column) for column in zip(*rows)))
 
 
 def _chosen_marks(texture: Texture, density: float, rng: np.random.Generator) -> Array:

@@ -2,35 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import Parts, Rectangle, cuboid, rectangle
+from slam.worlds.books import Shelves
+from slam.worlds.geometry import BACK, DOWN, FACES, FORWARD, LEFT, RIGHT, Parts, Rectangle, crate, cuboid, rectangle
 from slam.worlds.paths import camera_poses, carried, clock, placed, sway, through, watching, yaw_pitch_roll
-from slam.worlds.surfaces import Material
-
-RIGHT, LEFT, FORWARD, BACK, UP, DOWN = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-
-
-#: The axes along which the sides of a box are wide and high.
-SIDES = {"front": (0, 2), "back": (0, 2), "left": (1, 2), "right": (1, 2), "top": (0, 1), "bottom": (0, 1)}
-
-
-def crate(
-    size: Sequence[float] | Array, looks: Material, corner: Iterable[float] = (0, 0, 0), body: int = 0,
-    T_body_box: Array | None = None, sides: Iterable[str] = SIDES,
-) -> list[Rectangle]:  # fmt: skip
-    """The `sides` of a box, each a piece of its own like `looks`; thin ones are left out. See `cuboid`."""
-    faces = {}
-    for i, (side, wide, high) in enumerate((side, size[SIDES[side][0]], size[SIDES[side][1]]) for side in sides):
-        if min(wide, high) > 0.01:
-            faces[side] = replace(looks, width=wide, height=high, seed=looks.seed + i)
-    return cuboid(faces, size, corner, body, T_body_box)
-
+from slam.worlds.surfaces import Material, Signs
 
 def carton(size: Array, lowest: Array, body: int, seed: int) -> list[Rectangle]:
     """All six sides of a printed carton with edges `size` (3,) [m] from its `lowest` corner (3,) in body axes."""
@@ -90,8 +72,8 @@ def _aisle_walls(layout: int) -> list[Rectangle]:
     length, depth, behind = END_X - START_X, SHELF_Y - OTHER_Y, SHELF_Y + 0.2
     above, back = CEILING - HEIGHT, OTHER_Y - 0.2
 
-    def shelves(wide: float, number: int) -> Material:
-        return Material(wide, HEIGHT, "shelves", 100 * layout + number)
+    def shelves(wide: float, number: int) -> Shelves:
+        return Shelves(wide, HEIGHT, 100 * layout + number)
 
     end = Material(depth + 0.4, CEILING, "door_wall", layout + 1, 8)
     wall = Material(BARE[1] - BARE[0] + 1.0, CEILING, "plaster", layout + 2, 0.6)
@@ -307,7 +289,7 @@ def _obstacles(layout: int) -> list[Rectangle]:
         size = rng.uniform(0.18, 0.32, 3)
         faces = {}
         for side in ("front", "left", "right", "top"):
-            a, b = SIDES[side]
+            a, b = FACES[side][3]
             faces[side] = Material(size[a], size[b], "carton", 1000 * layout + 10 * i + a, 200, (0.015, 0.04))
         T = pose(yaw_pitch_roll(rng.uniform(-0.6, 0.6), 0, 0), np.array([x, y, 0.0]))
         out += cuboid(faces, size, T_body_box=T)
@@ -323,7 +305,7 @@ def startup(values: Mapping[str, Any]) -> Parts:
     layout, floor = values["layout"], -0.45  # the robot is half a metre tall
     offsets, angles = carried(stamps, np.random.default_rng([layout, 47]), gait=1.1, amount=values["tremor"])
     rectangles = [
-        rectangle(Material(0.8, 0.6, "signs", layout), (-0.4, 0, 0.3), RIGHT, DOWN),
+        rectangle(Signs(0.8, 0.6, layout), (-0.4, 0, 0.3), RIGHT, DOWN),
         rectangle(Material(6.0, 2.5, "plaster", layout), (-3.0, 0.02, floor + 2.5), RIGHT, DOWN),
         rectangle(Material(6.0, 2.0, "carpet", layout, 6), (-3.0, 0.02, floor), RIGHT, BACK),
     ]

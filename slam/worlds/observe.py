@@ -11,8 +11,8 @@ import numpy as np
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.worlds.appearance import Appearance, unit
-from slam.worlds.geometry import hidden
+from slam.worlds.appearance import Appearance
+from slam.worlds.geometry import hidden, turned, unit
 from slam.worlds.world import World
 
 #: A surface seen at a smaller angle than this (cosine from its normal) shows no feature.
@@ -93,7 +93,7 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     points = (positions - T[:3, 3]) @ T[:3, :3]
     rows = _candidates(world, points)
     offsets = positions[rows] - T[:3, 3]
-    normals = _turned(landmarks.normals[rows], landmarks.object[rows], bodies)
+    normals = turned(landmarks.normals[rows], landmarks.object[rows], bodies)
     facing = -(normals * offsets).sum(axis=1) > FACING * np.linalg.norm(offsets, axis=1)
     rows = rows[facing]
     uv_left, uv_right = world.rig.project(points[rows])
@@ -110,13 +110,6 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     return VisibleLandmarks(near[rows], points[rows], uv_left, uv_right, np.isfinite(uv_right[:, 0]), size)
 
 
-def _turned(normals: Array, objects: IdArray, bodies: Array) -> Array:
-    """Directions (N, 3) on objects in world axes."""
-    if not objects.any():
-        return normals
-    return np.asarray((bodies[objects][:, :3, :3] @ normals[:, :, None])[..., 0])
-
-
 def _views(world: World, frame: int, seen: VisibleLandmarks, source: IdArray) -> Array:
     """Unit vectors (N, 3) to the camera along, down and out of the landmarks' surfaces; zero for what is nothing.
 
@@ -130,7 +123,7 @@ def _views(world: World, frame: int, seen: VisibleLandmarks, source: IdArray) ->
     to_camera = -seen.points[source[true]] @ world.T_world_left[frame, :3, :3].T
     arrays = world.arrays
     axes = (arrays.along[surface], arrays.down[surface], arrays.normal[surface])
-    columns = [(unit(_turned(axis, objects, bodies)) * to_camera).sum(axis=1) for axis in axes]
+    columns = [(unit(turned(axis, objects, bodies)) * to_camera).sum(axis=1) for axis in axes]
     views[true] = unit(np.stack(columns, axis=1))
     return views
 

@@ -16,7 +16,6 @@ from slam.data import StereoFrame
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, exp, inverse, log
 from slam.worlds.faults import Faults, in_hand
-from slam.worlds.painting import paint
 from slam.worlds.placing import View
 from slam.worlds.raster import Ripmap, draw
 from slam.worlds.world import World
@@ -89,7 +88,7 @@ class Recorder:
         painted = self._world.painted
         found: Ripmap | None = painted.pop(key, None)
         if found is None:
-            picture = paint(texture, self._world.texels)
+            picture = texture.paint(self._world.texels)
             found = Ripmap(picture if self._values["colour"] else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
             if len(painted) >= _PAINTED:
                 del painted[next(iter(painted))]

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import Parts, Rectangle, cuboid, rectangle
-from slam.worlds.indoors import crate
+from slam.worlds.geometry import Parts, Rectangle, crate, cuboid, rectangle
 from slam.worlds.paths import camera_poses, clock, placed, smooth_step, sway, yaw_pitch_roll
-from slam.worlds.surfaces import Material, facade
+from slam.worlds.surfaces import Facade, Material
 
 
 def car(T: Array, seed: int, body: int = 0) -> list[Rectangle]:
@@ -123,7 +122,7 @@ def _houses(layout: int) -> list[Rectangle]:
             width = float(min(rng.uniform(9, 18), length - at))
             width = length - at if length - at - width < 5 else width
             height = float(rng.uniform(7, 12))
-            house = facade(width, height, int(rng.integers(1 << 30)))
+            house = Facade(width, height, int(rng.integers(1 << 30)))
             corner = start + at * direction
             out.append(rectangle(house, (*corner, height), (*direction, 0), (0, 0, -1), occludes=True))
             at += width

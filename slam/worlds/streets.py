@@ -18,7 +18,7 @@ from slam.worlds.drives import EYE, SAME_ROAD, STEP, Road, around_blocks, level,
 from slam.worlds.geometry import Parts, Rectangle, rectangle
 from slam.worlds.paths import yaw_pitch_roll
 from slam.worlds.roadside import cabinet, car, trunk
-from slam.worlds.surfaces import Material, facade
+from slam.worlds.surfaces import Facade, Material
 
 ASIDE = 9.0  #: from a road's middle to the house fronts [m]
 STRETCH = 48.0  #: streets are built in stretches of this length [m], so that one can be like another
@@ -141,7 +141,7 @@ class Streets:
                 width = float(plan.widths[house])  # as it is wherever the same house stands
             spread = float((self._high - self._low)[before].max())
             height = float(plan.heights[house]) + (float(np.ceil(spread)) if spread > 0.5 else 0.0)
-            front = facade(round(width, 2), height, plan.seed + house + 4 * part)
+            front = Facade(round(width, 2), height, plan.seed + house + 4 * part)
             start, end = ends if side > 0 else ends[::-1]
             top = float(self._low[before].min()) - self._foundation + height
             yield rectangle(front, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
@@ -184,7 +184,7 @@ class Streets:
             if np.abs(self._road.way[rows] - self._road.way[row]).max() > 3 * ASIDE:
                 continue
             plan = self._plan(int(self._stretch[row]), 1)
-            front = facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
+            front = Facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
             start = middle - to_left * ASIDE * left
             top = float(self._low[row]) - self._foundation + front.height
             out.append(rectangle(front, (*start, top), (*(to_left * left), 0), (0, 0, -1), occludes=True))

@@ -11,7 +11,7 @@ import numpy as np
 from slam.data import IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays, in_parts
+from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays
 
 
 def _to_corner(rig: StereoRig) -> float:
@@ -75,7 +75,7 @@ class World:
     @cached_property
     def drawn(self) -> tuple[Rectangle, ...]:
         """The rectangles as they are drawn: some in parts, so that only what comes into view is painted."""
-        return tuple(piece for r in self.rectangles for piece in in_parts(r))
+        return tuple(piece for r in self.rectangles for piece in r.parts())
 
     @cached_property
     def drawn_arrays(self) -> RectangleArrays:
