@@ -23,30 +23,18 @@ _DRIFTING = 0.6  # share of the variance of descriptors that changes with the di
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """What tells landmarks apart.
+    """What tells landmarks apart."""
 
-    Attributes:
-        descriptors: what does not change with the direction of view (P, D) float32; unit vectors without drift.
-        laplacian: sign (P,) int8.
-        response: strength (P,).
-        phase: where in its changes with the direction of view each one is, a whole number (P,).
-        errors: a pool of errors of descriptors (E, D) float32, of which every feature gets one.
-        common, spread: mean of all descriptors, and standard deviations of each one's own part (D,).
-        waves: a pool of what descriptors change by with the direction of view (E, 3, D) float32; none without drift.
-        directions: along which the direction of view matters for each of the three, and how much (E, 3, 3) [rad/rad].
-        change: share of landmarks that look different when the camera comes back.
-    """
-
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    response: Array
-    phase: IdArray
-    errors: NDArray[np.float32]
-    common: Array
-    spread: Array
-    waves: NDArray[np.float32]
-    directions: Array
-    change: float
+    descriptors: NDArray[np.float32]  # what does not change with the direction of view (P, D); unit without drift
+    laplacian: NDArray[np.int8]  # sign (P,)
+    response: Array  # strength (P,)
+    phase: IdArray  # where in its changes with the direction of view each one is, a whole number (P,)
+    errors: NDArray[np.float32]  # a pool of errors of descriptors (E, D), of which every feature gets one
+    common: Array  # mean of all descriptors (D,)
+    spread: Array  # standard deviations of each one's own part (D,)
+    waves: NDArray[np.float32]  # a pool of changes with the direction of view (E, 3, D); none without drift
+    directions: Array  # along which that matters for each of the three, and how much (E, 3, 3) [rad/rad]
+    change: float  # share of landmarks that look different when the camera comes back
 
     @property
     def drifting(self) -> bool:
@@ -120,15 +108,12 @@ def appearance(world: World, values: Mapping[str, Any]) -> Appearance:
     response = np.exp(rng.normal(6.5, 1.0, count))
     waves, directions = np.zeros((0, 3, size)), np.zeros((0, 3, 3))
     if drifts:
-        directions = _pace(values["descriptor_drift"]) * rng.standard_normal((_POOL, 3, 3))
+        # The pace of the waves [rad/rad] whose sum changes a descriptor by the drift per radian, while that is little.
+        pace = values["descriptor_drift"] * np.sqrt((_COMMON**2 + 1) / _DRIFTING)
+        directions = float(pace) * rng.standard_normal((_POOL, 3, 3))
         waves = rng.standard_normal((_POOL, 3, size)) * (spread * np.sqrt(_DRIFTING * 2 / 3))
     looks = world.landmarks.looks
     return Appearance(
         descriptors[looks].astype(np.float32), laplacian[looks], response[looks], phase[looks],
         errors.astype(np.float32), common, spread, waves.astype(np.float32), directions, values["change"],
     )  # fmt: skip
-
-
-def _pace(drift: float) -> float:
-    """Pace of the waves [rad/rad] whose sum changes a descriptor by `drift` per radian, while that is little."""
-    return float(drift * np.sqrt((_COMMON**2 + 1) / _DRIFTING))

@@ -114,19 +114,12 @@ def level(path: Trajectory) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """The roads that a path runs along, sampled along the path; what is driven again counts once.
+    """The roads that a path runs along, sampled along the path; what is driven again counts once."""
 
-    Attributes:
-        xy: middle of the road (N, 2) [m], level.
-        left: unit vectors to its left (N, 2).
-        way: distance along the path (N,) [m], from below 0 to beyond its end.
-        drives: all of the path, also what is driven again (M, 3) [m], level.
-    """
-
-    xy: Array
-    left: Array
-    way: Array
-    drives: Array
+    xy: Array  # middle of the road (N, 2) [m], level
+    left: Array  # unit vectors to its left (N, 2)
+    way: Array  # distance along the path (N,) [m], from below 0 to beyond its end
+    drives: Array  # all of the path, also what is driven again (M, 3) [m], level
 
     @classmethod
     def along(cls, positions: Array) -> Road:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,32 +13,17 @@ from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.worlds.observe import SimulatedFeatures
+from slam.worlds.options import FAULTS
 
-_CHOSEN = ("drop", "dropright", "black", "bright", "blur", "burst", "hand")
+_CHOSEN = [option.name for option in FAULTS if option.name != "jump"]
 
 
 @dataclass(frozen=True, eq=False)
 class Faults:
-    """Faults of every frame of the undisturbed recording.
+    """Faults of every frame of the undisturbed recording."""
 
-    Attributes:
-        drop, dropright, black, bright, blur, burst, hand: which frames suffer (N,); see the options of these names.
-        delay: what the clock has jumped ahead by (N,) [s].
-    """
-
-    drop: BoolArray
-    dropright: BoolArray
-    black: BoolArray
-    bright: BoolArray
-    blur: BoolArray
-    burst: BoolArray
-    hand: BoolArray
-    delay: Array
-
-    @cached_property
-    def any(self) -> BoolArray:
-        """Frames that suffer from anything but being dropped or delayed (N,)."""
-        return self.dropright | self.black | self.bright | self.blur | self.burst | self.hand
+    frames: Mapping[str, BoolArray]  # which frames suffer (N,), by the option's name
+    delay: Array  # what the clock has jumped ahead by (N,) [s]
 
     @classmethod
     def of(cls, values: Mapping[str, Any], frames: int, seed: int) -> Faults:
@@ -48,13 +32,17 @@ class Faults:
         Raises:
             ConfigurationError: a text cannot be read, or every frame is dropped.
         """
-        chosen = {}
-        for number, name in enumerate(_CHOSEN):
-            rng = np.random.default_rng([seed, 7, number])
-            chosen[name] = _frames(name, values[name], frames, rng)
+        chosen = {
+            name: _frames(name, values[name], frames, np.random.default_rng([seed, 7, number]))
+            for number, name in enumerate(_CHOSEN)
+        }
         if chosen["drop"].all():
             raise ConfigurationError("drop: no frame is left")
-        return cls(**chosen, delay=_delay(values["jump"], frames))
+        return cls(chosen, _delay(values["jump"], frames))
+
+    def of_frame(self, frame: int) -> set[str]:
+        """What a frame suffers from."""
+        return {name for name, suffers in self.frames.items() if suffers[frame]}
 
     def spoil(self, frame: int, seen: SimulatedFeatures, rig: StereoRig, rng: np.random.Generator) -> SimulatedFeatures:
         """What is left of a frame's features under its faults.
@@ -62,20 +50,16 @@ class Faults:
         Black and over-exposed frames show nothing, a hand hides a part, blur leaves a third, which are three times as
         noisy; bursts of noise double the noise.
         """
-        if not self.any[frame]:
+        faults = self.of_frame(frame)
+        if not faults:
             return seen
-        keep = np.ones(len(seen.ids), bool)
-        noise = 0.0
-        if self.black[frame] or self.bright[frame]:
-            keep[:] = False
-        if self.hand[frame]:
+        keep = np.full(len(seen.ids), not faults & {"black", "bright"})
+        if "hand" in faults:
             keep &= ~in_hand(seen.features.uv_left, rig.width, rig.height)
-        if self.blur[frame]:
+        if "blur" in faults:
             keep &= rng.random(len(keep)) < 1 / 3
-            noise = 3.0
-        elif self.burst[frame]:
-            noise = 1.7
-        return seen.select(keep, noise * rng.standard_normal((len(keep), 3)), not self.dropright[frame])
+        noise = 3.0 if "blur" in faults else 1.7 if "burst" in faults else 0.0
+        return seen.select(keep, noise * rng.standard_normal((len(keep), 3)), "dropright" not in faults)
 
 
 def in_hand(uv: Array, width: int, height: int) -> BoolArray:
@@ -93,16 +77,14 @@ def _frames(name: str, text: str, frames: int, rng: np.random.Generator) -> Bool
             if colon:
                 out[int(first) : int(last)] = True
             elif "." in part:
-                chance = float(part)
-                if not 0 <= chance <= 1:
+                if not 0 <= float(part) <= 1:
                     raise ConfigurationError(f"{name}: a chance must lie in 0..1, got {part}")
-                out |= rng.random(frames) < chance
+                out |= rng.random(frames) < float(part)
             elif int(part) < frames:
                 out[int(part)] = True
         except ValueError:
-            raise ConfigurationError(
-                f"{name} must be frames (100), ranges (100:110) or a chance (0.02), got {part!r}"
-            ) from None
+            line = f"{name} must be frames (100), ranges (100:110) or a chance (0.02), got {part!r}"
+            raise ConfigurationError(line) from None
     return out
 
 

@@ -27,19 +27,12 @@ _FALSE = -1
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFeatures:
-    """Features with their truth, a row each.
+    """Features with their truth, a row each."""
 
-    Attributes:
-        features: what a front end would say.
-        ids: landmark of each feature (N,), −1 for false features.
-        objects: object of each feature (N,), 0 for the still world, −1 for false features.
-        false_stereo: true features whose right pixel is false (N,).
-    """
-
-    features: StereoFeatures
-    ids: IdArray
-    objects: IdArray
-    false_stereo: BoolArray
+    features: StereoFeatures  # what a front end would say
+    ids: IdArray  # landmark of each feature (N,), −1 for false features
+    objects: IdArray  # object of each feature (N,), 0 for the still world, −1 for false features
+    false_stereo: BoolArray  # true features whose right pixel is false (N,)
 
     def select(self, keep: BoolArray, noise: Array, stereo: bool) -> SimulatedFeatures:
         """Some of the features, with `noise` (N, 3) [px] added to uL, vL and uR; without `stereo` no right pixels."""
@@ -54,23 +47,14 @@ class SimulatedFeatures:
 
 @dataclass(frozen=True, eq=False)
 class VisibleLandmarks:
-    """Landmarks that can be seen in one frame, a row each.
+    """Landmarks that can be seen in one frame, a row each."""
 
-    Attributes:
-        ids: landmarks (M,).
-        points: in left-camera coordinates (M, 3) [m].
-        uv_left: left pixels (M, 2).
-        uv_right: right pixels (M, 2), NaN where the right camera does not see it.
-        in_right: whether it does (M,).
-        size: diameters in the left image (M,) [px].
-    """
-
-    ids: IdArray
-    points: Array
-    uv_left: Array
-    uv_right: Array
-    in_right: BoolArray
-    size: Array
+    ids: IdArray  # landmarks (M,)
+    points: Array  # in left-camera coordinates (M, 3) [m]
+    uv_left: Array  # left pixels (M, 2)
+    uv_right: Array  # right pixels (M, 2), NaN where the right camera does not see it
+    in_right: BoolArray  # whether it does (M,)
+    size: Array  # diameters in the left image (M,) [px]
 
 
 def seen_landmarks(world: World, frame: int) -> VisibleLandmarks:
@@ -87,7 +71,7 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     """Landmarks within reach, inside the left image, on surfaces that face the camera and not hidden."""
     T = world.T_world_left[frame]
     bodies = world.T_world_body(frame)
-    near = world.landmarks_near(frame)
+    near = world.near(world.landmarks.positions, 0.0, world.landmarks.object, frame)
     landmarks = world.landmarks.select(near)
     positions = landmarks.world_positions(bodies)
     points = (positions - T[:3, 3]) @ T[:3, :3]
@@ -100,7 +84,8 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     inside = world.rig.left.in_image(uv_left, _MARGIN)
     rows, uv_left, uv_right = rows[inside], uv_left[inside], uv_right[inside]
     uv_right[~world.rig.right.in_image(uv_right, _MARGIN)] = np.nan
-    occluders = world.occluders_near(frame).placed(bodies)
+    every = world.occluders
+    occluders = every.select(world.near(every.middle, every.radius, every.body, frame)).placed(bodies)
     if len(occluders):
         right_centre = T[:3, 3] - T[:3, :3] @ world.rig.b
         seen = ~hidden(T[:3, 3], positions[rows], occluders)

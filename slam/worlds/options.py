@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import unquote
 
@@ -13,22 +13,14 @@ from slam.naming import suggestion
 
 @dataclass(frozen=True)
 class Option:
-    """One key.
-
-    Attributes:
-        name: the key.
-        default: its value where it is not given; its type is the value's type.
-        text: what it means, with its unit.
-        low, high: range of a number, both ends included.
-        choices: the words allowed, where it is a word.
-    """
+    """One key."""
 
     name: str
-    default: int | float | str
-    text: str
-    low: float = 0.0
+    default: int | float | str  # its value where it is not given; its type is the value's type
+    text: str  # what it means, with its unit
+    low: float = 0.0  # range of a number, both ends included
     high: float = float("inf")
-    choices: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()  # the words allowed, where it is a word
 
     def parse(self, text: str) -> int | float | str:
         """The value that a text means; raises ConfigurationError."""
@@ -50,7 +42,7 @@ class Option:
     def range(self) -> str:
         """The range or the choices, for people."""
         if isinstance(self.default, str):
-            return "|".join(self.choices) if self.choices else "text"
+            return "|".join(self.choices) or "text"
         return f"{self.low:.10g}..{self.high:.10g}"
 
 
@@ -112,11 +104,8 @@ COMMON = (*RECORDING, *OBSERVATION, *IMAGING, *FAULTS)
 
 def option_table(own: Iterable[Option], defaults: Mapping[str, Any]) -> dict[str, Option]:
     """Options of one world by name: its own, and the common ones with its own defaults."""
-    table = {o.name: o for o in own}
-    for o in COMMON:
-        default = type(o.default)(defaults.get(o.name, o.default))
-        table[o.name] = Option(o.name, default, o.text, o.low, o.high, o.choices)
-    return table
+    common = (replace(o, default=type(o.default)(defaults.get(o.name, o.default))) for o in COMMON)
+    return {o.name: o for o in (*own, *common)}
 
 
 def parse_query(world: str, query: str, table: Mapping[str, Option]) -> dict[str, Any]:
@@ -125,19 +114,16 @@ def parse_query(world: str, query: str, table: Mapping[str, Option]) -> dict[str
     Raises:
         ConfigurationError: a key is unknown or stands twice, or a value has a wrong type or lies outside its range.
     """
-    values: dict[str, Any] = {name: o.default for name, o in table.items()}
-    given: set[str] = set()
+    given: dict[str, Any] = {}
     for part in filter(None, query.split("&")):
-        key, _, text = part.partition("=")
-        key, text = unquote(key), unquote(text)
+        key, text = (unquote(word) for word in part.partition("=")[::2])
         if key not in table:
             known = f"{suggestion(key, table)}; known: {', '.join(sorted(table))}"
             raise ConfigurationError(f"world {world!r} has no option {key!r}{known}")
-        if key in given:
-            raise ConfigurationError(f"world {world!r}: option {key!r} is given twice")
-        given.add(key)
         try:
-            values[key] = table[key].parse(text)
+            if key in given:
+                raise ConfigurationError(f"option {key!r} is given twice")
+            given[key] = table[key].parse(text)
         except ConfigurationError as error:
             raise ConfigurationError(f"world {world!r}: {error}") from None
-    return values
+    return {name: o.default for name, o in table.items()} | given

@@ -25,27 +25,16 @@ class View(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Rectangles in a view, nearest first, a row each.
+    """Rectangles in a view, nearest first, a row each."""
 
-    Attributes:
-        source: which rectangle of the world (P,).
-        Q: takes a sample's (x, y, 1) to (s, t, 1) / depth; s, t are shares of the rectangle's edges (P, 3, 3).
-        corners: corners (P, 8, 3) of the part before the camera, as depth · (x, y, 1); they may repeat.
-        nearness: 1 / depth of the farthest and of the nearest of them (P, 2).
-        rows, columns: first that may be covered, and the one after the last (P, 2).
-        start: where the rows of a rectangle begin in `first` and `last` (P + 1,).
-        first, last: first and last sample covered, a row of the view after the other (sum of rows,) int16.
-    """
-
-    source: np.ndarray
-    Q: Array
-    corners: Array
-    nearness: Array
-    rows: np.ndarray
-    columns: np.ndarray
-    start: np.ndarray
-    first: np.ndarray
-    last: np.ndarray
+    source: np.ndarray  # which rectangle of the world (P,)
+    Q: Array  # takes a sample's (x, y, 1) to (s, t, 1) / depth; s, t are shares of its edges (P, 3, 3)
+    nearness: Array  # 1 / depth of the farthest and of the nearest corner of the part before the camera (P, 2)
+    rows: np.ndarray  # first that may be covered, and the one after the last (P, 2)
+    columns: np.ndarray  # the same (P, 2)
+    start: np.ndarray  # where the rows of a rectangle begin in `first` and `last` (P + 1,)
+    first: np.ndarray  # first sample covered, a row of the view after the other (sum of rows,) int16
+    last: np.ndarray  # last sample covered
 
     def __len__(self) -> int:
         return len(self.source)
@@ -80,7 +69,7 @@ def place(rectangles: RectangleArrays, T_world_body: Array, T_world_camera: Arra
     if len(order):
         columns[:, 0] = np.minimum.reduceat(first, start[:-1])
         columns[:, 1] = np.maximum(np.maximum.reduceat(last, start[:-1]) + 1, columns[:, 0])
-    return Placed(source[order], Q, corners[order], nearness[order], rows, columns, start, first, last)
+    return Placed(source[order], Q, nearness[order], rows, columns, start, first, last)
 
 
 def _in_frustum(world: RectangleArrays, R: Array, c: Array, view: View) -> np.ndarray:

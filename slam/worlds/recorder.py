@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from statistics import NormalDist
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,12 +16,13 @@ from slam.data import StereoFrame
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, exp, inverse, log
 from slam.worlds.faults import Faults, in_hand
-from slam.worlds.placing import View
+from slam.worlds.placing import NEAR, View, place
 from slam.worlds.raster import Ripmap, draw
 from slam.worlds.world import World
 
 _PAINTED = 1500  # textures that are kept
 _EXPOSURES = 6  # pictures averaged where the shutter is open for a while
+_SKY = (230, 225, 220)  # where no surface is, BGR
 
 
 class Recorder:
@@ -34,18 +35,13 @@ class Recorder:
     """
 
     def __init__(self, world: World, values: Mapping[str, Any], faults: Faults) -> None:
-        self._world = world
-        self._values = values
-        self._faults = faults
-        self._seed: int = values["seed"]
+        self._world, self._values, self._faults = world, values, faults
 
     def record(self, frame: int, index: int, stamp: float) -> StereoFrame:
         """The images of one frame of the world, as frame `index` of the recording."""
-        rig = self._world.rig
-        left = self._shoot(frame, self._lenses[0], np.eye(4), 2)
-        right = None
-        if not self._faults.dropright[frame]:
-            right = self._shoot(frame, self._lenses[1], inverse(rig.T_right_left), 3)
+        left, right = self._shoot(frame, self._lenses[0], np.eye(4), 2), None
+        if not self._faults.frames["dropright"][frame]:
+            right = self._shoot(frame, self._lenses[1], inverse(self._world.rig.T_right_left), 3)
         return StereoFrame(index, stamp, left, right)
 
     def _shoot(self, frame: int, lens: Lens, T_left_camera: Array, stream: int) -> np.ndarray:
@@ -56,19 +52,15 @@ class Recorder:
             image = np.rint(np.mean(images, axis=0)).astype(np.uint8)
         else:
             image = self._picture(frame, lens, T_left_camera, 0.0)
-        rng = np.random.default_rng([self._seed, frame, stream])
-        return sense(image, self._values, self._shading, self._faults, frame, rng)
+        rng = np.random.default_rng([self._values["seed"], frame, stream])
+        return sense(image, self._values, self._faults.of_frame(frame), rng)
 
     def _picture(self, frame: int, lens: Lens, T_left_camera: Array, ahead: float) -> np.ndarray:
         """One camera's light, `ahead` of the frame's time by a share of a frame."""
         T = _between(self._world.T_world_left, frame, ahead)
         bodies = np.array([np.eye(4), *(_between(Ts, frame, ahead) for Ts in self._world.T_world_object)])
-        channels = 3 if self._values["colour"] else 1
-        samples = draw(
-            self._world.drawn_arrays, self._ripmap, bodies, T @ T_left_camera,
-            lens.view, self._world.sky, channels,
-        )  # fmt: skip
-        return lens.expose(samples)
+        sky = _SKY if self._values["colour"] else (round(float(np.mean(_SKY))),)
+        return lens.expose(draw(self._world.drawn_arrays, self._ripmap, bodies, T @ T_left_camera, lens.view, sky))
 
     @cached_property
     def _lenses(self) -> tuple[Lens, Lens]:
@@ -76,16 +68,10 @@ class Recorder:
         rig = self._world.rig
         return Lens.of(rig.left, self._values["supersample"]), Lens.of(rig.right, self._values["supersample"])
 
-    @cached_property
-    def _shading(self) -> np.ndarray:
-        """Share of the light that reaches each pixel."""
-        return shading(self._values["vignetting"], self._world.rig.width, self._world.rig.height)
-
     def _ripmap(self, rectangle: int) -> Ripmap:
         """The texture of a rectangle drawn, painted when first seen; the last ones are kept with the world."""
-        texture = self._world.drawn[rectangle].texture
+        texture, painted = self._world.drawn[rectangle].texture, self._world.painted
         key = (texture, self._values["colour"])
-        painted = self._world.painted
         found: Ripmap | None = painted.pop(key, None)
         if found is None:
             picture = texture.paint(self._world.texels)
@@ -106,17 +92,11 @@ def _between(poses: Array, frame: int, ahead: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """How one camera's pixels come from an undistorted view.
+    """How one camera's pixels come from an undistorted view."""
 
-    Attributes:
-        view: the undistorted view.
-        places: where each sample of the camera's image lies in the view (H, W, 2); None where it is its own place.
-        supersample: samples per pixel along each axis.
-    """
-
-    view: View
-    places: np.ndarray | None
-    supersample: int
+    view: View  # the undistorted view
+    places: np.ndarray | None  # of the image's samples in the view (H, W, 2) float32; None where they are its own
+    supersample: int  # samples per pixel along each axis
 
     @classmethod
     def of(cls, camera: PinholeCamera, supersample: int) -> Lens:
@@ -132,8 +112,7 @@ class Lens:
         uv = np.stack([x.ravel(), y.ravel()], axis=1) / s - (s - 1) / (2 * s)
         rays = camera.normalise(uv)
         rays = np.where(np.isfinite(rays), rays, 0.0)
-        low, high = rays.min(axis=0), rays.max(axis=0)
-        margin = 2.0
+        low, high, margin = rays.min(axis=0), rays.max(axis=0), 2.0
         K[:2, 2] = margin - low * (K[0, 0], K[1, 1])
         size = np.ceil((high - low) * (K[0, 0], K[1, 1]) + 2 * margin).astype(int) + 1
         places = (rays * (K[0, 0], K[1, 1]) + K[:2, 2]).astype(np.float32).reshape(height, width, 2)
@@ -147,35 +126,60 @@ class Lens:
         return cv2.resize(samples, size, interpolation=cv2.INTER_AREA)
 
 
-def shading(vignetting: float, width: int, height: int) -> np.ndarray:
+class TruthImages(NamedTuple):
+    """Truth of every pixel of the left image."""
+
+    depth: np.ndarray  # distance along the optical axis (H, W) float32 [m]; 0 where nothing is
+    objects: np.ndarray  # object (H, W) int32; 0 for the still world, and where nothing is
+
+
+def truth_images(world: World, frame: int) -> TruthImages:
+    """Depth and objects in one frame's left image, at the pixels' centres, also of a camera with distortion."""
+    lens, bodies = Lens.of(world.rig.left, 1), world.T_world_body(frame)
+    x, y = np.meshgrid(np.arange(world.rig.width), np.arange(world.rig.height), indexing="xy")
+    if lens.places is not None:
+        x, y = np.moveaxis(lens.places.astype(float), 2, 0)
+    nearness, objects = np.zeros(x.shape), np.zeros(x.shape, np.int32)
+    columns, rows = (x.min(axis=0), x.max(axis=0)), (y.min(axis=1), y.max(axis=1))
+    placed = place(world.arrays, bodies, world.T_world_left[frame], lens.view)
+    for i, (s, t, n) in enumerate(placed.Q):
+        part = tuple(np.flatnonzero((high > first - 1) & (low < last + 1)) for (low, high), (first, last) in
+                     ((rows, placed.rows[i]), (columns, placed.columns[i])))  # fmt: skip
+        if not all(map(len, part)):
+            continue
+        window = tuple(slice(inside[0], inside[-1] + 1) for inside in part)
+        across, down, near = (a * x[window] + b * y[window] + c for a, b, c in (s, t, n))
+        shown = (across >= 0) & (across <= near) & (down >= 0) & (down <= near) & (near < 1 / NEAR)
+        shown &= near > nearness[window]
+        nearness[window][shown] = near[shown]
+        objects[window][shown] = world.arrays.body[placed.source[i]]
+    with np.errstate(divide="ignore"):
+        return TruthImages(np.where(nearness > 0, 1 / nearness, 0.0).astype(np.float32), objects)
+
+
+def sense(image: np.ndarray, values: Mapping[str, Any], faults: set[str], rng: np.random.Generator) -> np.ndarray:
+    """The image that the camera gives, uint8, by the values of the options and the frame's faults."""
+    if "hand" in faults:
+        image = _cover(image)
+    if "blur" in faults:
+        image = cv2.GaussianBlur(image, (0, 0), image.shape[1] / 80)
+    elif values["lens"] > 0.05:
+        image = cv2.GaussianBlur(image, (0, 0), values["lens"])
+    gain = 0.0 if "black" in faults else 12.0 if "bright" in faults else 1.0
+    light = _shading(values["vignetting"], image.shape[1], image.shape[0]) * np.float32(gain)
+    out = cv2.multiply(image, light if image.ndim == 2 else cv2.merge([light] * 3), dtype=cv2.CV_32F)
+    noise = values["noise"] * (8.0 if "burst" in faults else 1.0)
+    if noise > 0:
+        cv2.scaleAdd(normal_noise(image.shape, rng), noise, out, dst=out)
+    return cv2.convertScaleAbs(cv2.max(out, 0.0))  # to the nearest grey level
+
+
+@lru_cache(maxsize=4)
+def _shading(vignetting: float, width: int, height: int) -> np.ndarray:
     """Share of the light that reaches each pixel (H, W) float32; `vignetting` is lost in the corners."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     x, y = x / (width - 1) * 2 - 1, y / (height - 1) * 2 - 1
     return (1 - vignetting * (x * x + y * y) / 2).astype(np.float32)
-
-
-def sense(
-    image: np.ndarray,
-    values: Mapping[str, Any],
-    light: np.ndarray,
-    faults: Faults,
-    frame: int,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """The image that the camera gives, uint8, by the values of the options; `light` is the `shading`."""
-    if faults.hand[frame]:
-        image = _cover(image)
-    if faults.blur[frame]:
-        image = cv2.GaussianBlur(image, (0, 0), image.shape[1] / 80)
-    elif values["lens"] > 0.05:
-        image = cv2.GaussianBlur(image, (0, 0), values["lens"])
-    gain = 0.0 if faults.black[frame] else 12.0 if faults.bright[frame] else 1.0
-    light = light * np.float32(gain)
-    out = cv2.multiply(image, light if image.ndim == 2 else cv2.merge([light] * 3), dtype=cv2.CV_32F)
-    noise = values["noise"] * (8.0 if faults.burst[frame] else 1.0)
-    if noise > 0:
-        cv2.scaleAdd(normal_noise(image.shape, rng), noise, out, dst=out)
-    return cv2.convertScaleAbs(cv2.max(out, 0.0))  # to the nearest grey level
 
 
 def normal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
@@ -192,8 +196,7 @@ def normal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray
 @lru_cache(maxsize=1)
 def _quantiles() -> np.ndarray:
     """Middles of 256 equally likely parts of the normal law, with variance ½ (256,) float32."""
-    law = NormalDist()
-    values = np.array([law.inv_cdf((i + 0.5) / 256) for i in range(256)])
+    values = np.array([NormalDist().inv_cdf((i + 0.5) / 256) for i in range(256)])
     return (values / (values.std() * np.sqrt(2))).astype(np.float32)
 
 

@@ -8,19 +8,28 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import Parts, Rectangle, crate, cuboid, rectangle
+from slam.worlds.geometry import BACK, DOWN, RIGHT, Parts, Rectangle, crate, cuboid, rectangle
 from slam.worlds.paths import camera_poses, clock, placed, smooth_step, sway, yaw_pitch_roll
 from slam.worlds.surfaces import Facade, Material
+
+PACE = 8.0  #: driving speed [m/s]
+EYE = 1.65  #: height of the camera above the ground [m]
+TURN_AT, TURN_LENGTH = 104.0, 30.0  #: where the turn to the left begins and how long it is [m along the path]
+EAST, WEST = 7.0, -9.0  #: house fronts right and left of the path [m]
+END = -150.0  #: end of the second street [m]
+_LANE = 3.2  #: to the oncoming lane [m]
+
+#: The two boxes of a car: size, lowest corner [m], and materials of its back, its front and its sides.
+_CAR = (
+    ((1.75, 4.3, 0.75), (-0.875, -2.15, 0.2), ("car_back", "car_front", "car_side")),
+    ((1.5, 2.3, 0.55), (-0.75, -1.35, 0.95), ("cabin_end", "cabin_end", "cabin_side")),
+)
 
 
 def car(T: Array, seed: int, body: int = 0) -> list[Rectangle]:
     """A car of two boxes; its frame: origin on the ground in its middle, y ahead."""
     out = []
-    parts = (
-        ((1.75, 4.3, 0.75), (-0.875, -2.15, 0.2), ("car_back", "car_front", "car_side")),
-        ((1.5, 2.3, 0.55), (-0.75, -1.35, 0.95), ("cabin_end", "cabin_end", "cabin_side")),
-    )
-    for size, corner, (rear, fore, side) in parts:
+    for size, corner, (rear, fore, side) in _CAR:
         x, y, z = size
         sides = {"front": (rear, x, z), "back": (fore, x, z), "left": (side, y, z), "right": (side, y, z)}
         faces = {face: Material(a, b, name, seed, 12, (0.05, 0.25)) for face, (name, a, b) in sides.items()}
@@ -29,36 +38,11 @@ def car(T: Array, seed: int, body: int = 0) -> list[Rectangle]:
     return out
 
 
-def trunk(T: Array, seed: int) -> list[Rectangle]:
-    """The trunk of a tree, a square post; its frame: origin on the ground in its middle."""
-    return _post(T, (0.35, 0.35, 4.0), "wood", seed)
-
-
-def cabinet(T: Array, seed: int) -> list[Rectangle]:
-    """A switch cabinet full of bills; its frame: origin on the ground in its middle."""
-    return _post(T, (1.0, 0.5, 1.4), "poster", seed)
-
-
-def _post(T: Array, size: tuple[float, float, float], material: str, seed: int) -> list[Rectangle]:
-    """A box that stands on the ground."""
+def post(T: Array, size: tuple[float, float, float], material: str, seed: int) -> list[Rectangle]:
+    """A box that stands on the ground; its frame: origin on the ground in its middle."""
     looks = Material(0, 0, material, 10 * seed, 12, (0.05, 0.25))
     corner = (-size[0] / 2, -size[1] / 2, 0)
     return crate(size, looks, corner, T_body_box=T, sides=("front", "back", "left", "right"))
-
-
-PACE = 8.0  #: driving speed [m/s]
-EYE = 1.65  #: height of the camera above the ground [m]
-TURN_AT, TURN_LENGTH = 104.0, 30.0  #: where the turn to the left begins and how long it is [m along the path]
-LEFT, RIGHT = -9.0, 7.0  #: house fronts left and right of the path [m]
-WEST = -150.0  #: end of the second street [m]
-_LANE = 3.2  #: to the oncoming lane [m]
-
-
-def driver(s: Array, stamps: Array, rng: np.random.Generator) -> Array:
-    """Camera poses (N, 4, 4) at distances s (N,) [m] along the way, shaken at times `stamps` [s]."""
-    xy, yaw = path(s)
-    positions = np.column_stack([xy, EYE + 0.01 * sway(stamps, rng, 0.8, 2)])
-    return camera_poses(positions, yaw, 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2))
 
 
 def street(values: Mapping[str, Any]) -> Parts:
@@ -72,9 +56,11 @@ def street(values: Mapping[str, Any]) -> Parts:
     return Parts(stamps, poses, surroundings(layout) + cars, objects)
 
 
-def surroundings(layout: int) -> list[Rectangle]:
-    """What stands still: houses, the ground, parked cars."""
-    return _houses(layout) + _ground(layout) + _parked_cars(layout)
+def driver(s: Array, stamps: Array, rng: np.random.Generator) -> Array:
+    """Camera poses (N, 4, 4) at distances s (N,) [m] along the way, shaken at times `stamps` [s]."""
+    xy, yaw = path(s)
+    positions = np.column_stack([xy, EYE + 0.01 * sway(stamps, rng, 0.8, 2)])
+    return camera_poses(positions, yaw, 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2))
 
 
 def driven(t: Array) -> Array:
@@ -83,76 +69,69 @@ def driven(t: Array) -> Array:
     return PACE * t - slower * duration * (np.tanh((t - middle) / duration) + np.tanh(middle / duration))
 
 
-def path(s: Array, across: float = 0.0) -> tuple[Array, Array]:
+def _heading(s: Array) -> Array:
+    """The way's turn to the left of +y (N,) [rad] at distances s (N,) [m] along it."""
+    return np.pi / 2 * smooth_step((s - TURN_AT) / TURN_LENGTH)
+
+
+def path(s: Array, across: Array | float = 0.0) -> tuple[Array, Array]:
     """Places (N, 2) [m] and headings (N,) [rad] at distances s [m] along the way, `across` [m] to the left of it."""
-    step = 0.02
+    step, heading = 0.02, _heading(s)
     grid = np.arange(-100.0, 420.0, step)
-    yaw = np.pi / 2 * smooth_step((grid - TURN_AT) / TURN_LENGTH)
+    yaw = _heading(grid)
     xy = step * np.cumsum(np.stack([-np.sin(yaw), np.cos(yaw)], axis=1), axis=0)
     xy -= xy[np.searchsorted(grid, 0.0)]
-    heading = np.pi / 2 * smooth_step((s - TURN_AT) / TURN_LENGTH)
     place = np.stack([np.interp(s, grid, xy[:, 0]), np.interp(s, grid, xy[:, 1])], axis=1)
     left = np.stack([-np.cos(heading), -np.sin(heading)], axis=1)
-    return place + across * left, heading
+    return place + np.reshape(across, (-1, 1)) * left, heading
 
 
-def _corner() -> float:
-    """The y at which the second street runs [m]."""
-    return float(path(np.array([TURN_AT + TURN_LENGTH]))[0][0, 1])
-
-
-def _houses(layout: int) -> list[Rectangle]:
-    """House fronts along both streets, and across the end of the second."""
-    y2 = _corner()
+def surroundings(layout: int) -> list[Rectangle]:
+    """What stands still: houses, road and pavement of both streets, parked cars."""
+    y2, width = float(path(np.array([TURN_AT + TURN_LENGTH]))[0][0, 1]), EAST - WEST  # y of the second street
     rows = [  # from, to, along which front's upper edge runs to the right as seen from the street
-        ((LEFT, -30.0), (LEFT, y2 + LEFT)),
-        ((RIGHT, y2 + RIGHT), (RIGHT, -30.0)),
-        ((WEST, y2 + RIGHT), (RIGHT, y2 + RIGHT)),
-        ((LEFT, y2 + LEFT), (WEST, y2 + LEFT)),
-        ((WEST, y2 + LEFT), (WEST, y2 + RIGHT)),
+        ((WEST, -30.0), (WEST, y2 + WEST)),
+        ((EAST, y2 + EAST), (EAST, -30.0)),
+        ((END, y2 + EAST), (EAST, y2 + EAST)),
+        ((WEST, y2 + WEST), (END, y2 + WEST)),
+        ((END, y2 + WEST), (END, y2 + EAST)),
     ]
-    out = []
-    for number, (a, b) in enumerate(rows):
-        rng = np.random.default_rng([layout, 44, number])
-        start, direction = np.array(a), np.array(b) - a
-        length = float(np.linalg.norm(direction))
-        direction = direction / length
-        at = 0.0
-        while at < length - 1e-6:
-            width = float(min(rng.uniform(9, 18), length - at))
-            width = length - at if length - at - width < 5 else width
-            height = float(rng.uniform(7, 12))
-            house = Facade(width, height, int(rng.integers(1 << 30)))
-            corner = start + at * direction
-            out.append(rectangle(house, (*corner, height), (*direction, 0), (0, 0, -1), occludes=True))
-            at += width
+    out = [house for number, row in enumerate(rows) for house in _houses(*row, np.random.default_rng([layout, 44, number]))]
+    first = Material(width, y2 + 30 + EAST, "road", layout, 0.3, (0.05, 0.3))
+    second = Material(-END + WEST, width, "road_across", layout + 1, 0.3, (0.05, 0.3))
+    out += [rectangle(m, (x, y2 + EAST, 0), RIGHT, BACK) for m, x in ((first, WEST), (second, END))]
+    return out + _parked_cars(layout)
+
+
+def _houses(a: tuple[float, float], b: tuple[float, float], rng: np.random.Generator) -> list[Rectangle]:
+    """House fronts from one place to another."""
+    start, direction = np.array(a), np.subtract(b, a)
+    length = float(np.linalg.norm(direction))
+    direction = direction / length
+    at, out = 0.0, []
+    while at < length - 1e-6:
+        width = float(min(rng.uniform(9, 18), length - at))
+        width = length - at if length - at - width < 5 else width
+        height = float(rng.uniform(7, 12))
+        house = Facade(width, height, int(rng.integers(1 << 30)))
+        out.append(rectangle(house, (*(start + at * direction), height), (*direction, 0), DOWN, occludes=True))
+        at += width
     return out
-
-
-def _ground(layout: int) -> list[Rectangle]:
-    """Road and pavement of both streets."""
-    y2, width = _corner(), RIGHT - LEFT
-    first = Material(width, y2 + 30 + RIGHT, "road", layout, 0.3, (0.05, 0.3))
-    second = Material(-WEST + LEFT, width, "road_across", layout + 1, 0.3, (0.05, 0.3))
-    return [rectangle(m, (x, y2 + RIGHT, 0), (1, 0, 0), (0, -1, 0)) for m, x in ((first, LEFT), (second, WEST))]
 
 
 def _parked_cars(layout: int) -> list[Rectangle]:
     """Cars at both kerbs."""
-    rng = np.random.default_rng([layout, 45])
-    out = []
+    rng, out = np.random.default_rng([layout, 45]), []
     for side in (-3.9, 6.6):  # to the right, and to the left beyond the oncoming lane
-        s = -5.0
-        number = 0
+        s, number = -5.0, 0
         while s < 230:
             s += rng.uniform(6, 14)
             number += 1
-            if TURN_AT - 9 < s < TURN_AT + TURN_LENGTH + 9:
-                continue
-            place, heading = path(np.array([s]), side)
-            turn = heading[0] + (np.pi if side > 0 else 0.0) + rng.normal(0, 0.02)
-            T = pose(yaw_pitch_roll(turn, 0, 0), np.array([*place[0], 0.0]))
-            out += car(T, 100 * layout + 1000 * (side > 0) + number)
+            if not TURN_AT - 9 < s < TURN_AT + TURN_LENGTH + 9:
+                place, heading = path(np.array([s]), side)
+                turn = heading[0] + (np.pi if side > 0 else 0.0) + rng.normal(0, 0.02)
+                T = pose(yaw_pitch_roll(turn, 0, 0), np.array([*place[0], 0.0]))
+                out += car(T, 100 * layout + 1000 * (side > 0) + number)
     return out
 
 
@@ -171,7 +150,6 @@ PARTS = 3  #: bodies a person is made of: the trunk (with the bicycle), and two 
 HIP = 0.9  #: height of the hips [m]
 _STRIDE = 0.45  # how far a leg swings to both sides [rad]
 
-
 #: Who moves how: whether on a bicycle, where at the start and to which side of the way [m], how fast along and across
 #: [m/s], and steps (turns of the pedals) a second [Hz].
 PEOPLE = (
@@ -184,30 +162,19 @@ PEOPLE = (
 
 
 def people(values: Mapping[str, Any]) -> Parts:
-    """A slow drive past parked cars, among cyclists and walkers whose legs swing."""
+    """A slow drive past parked cars, among cyclists and walkers whose legs swing about the hips."""
     stamps, t = clock(values, 14.0)
     layout = values["layout"]
     rng = np.random.default_rng([layout, 47])
     poses = driver(5.0 * t + 0.2 * sway(t, rng, 0.03, 0.15), stamps, rng)
-    rectangles, objects = surroundings(layout), np.zeros((0, len(t), 4, 4))
+    rectangles, objects = surroundings(layout), []
     for number, (cycles, ahead, across, along, aside, pace) in enumerate(PEOPLE):
         rectangles += _person(cycles, 9000 + 50 * layout + 10 * number, PARTS * number + 1)
-        place = _ways(t, ahead, across, along, aside)
-        objects = np.concatenate([objects, _limbs(place, np.sin(2 * np.pi * pace * t + number))])
-    return Parts(stamps, poses, rectangles, objects)
-
-
-def _ways(t: Array, ahead: float, across: float, along: float, aside: float) -> Array:
-    """Poses (N, 4, 4) of somebody's feet, y ahead of him; see `PEOPLE`."""
-    place, heading = path(ahead + along * t)
-    left = np.column_stack([-np.cos(heading), -np.sin(heading)])
-    place = place + (across + aside * t)[:, None] * left
-    return placed((*place.T, 0), (heading + np.arctan2(aside, along), 0, 0))
-
-
-def _limbs(T: Array, swing: Array) -> Array:
-    """Poses (3, N, 4, 4) of the trunk and of both legs, which turn about the hips by `swing` (N,) times a stride."""
-    return np.stack([T, *(T @ placed((0 * swing, 0, HIP), (0, 0, side * _STRIDE * swing)) for side in (1.0, -1.0))])
+        place, heading = path(ahead + along * t, across + aside * t)
+        T = placed((*place.T, 0), (heading + np.arctan2(aside, along), 0, 0))
+        swing = _STRIDE * np.sin(2 * np.pi * pace * t + number)
+        objects += [T, *(T @ placed((0 * t, 0, HIP), (0, 0, side * swing)) for side in (1.0, -1.0))]
+    return Parts(stamps, poses, rectangles, np.array(objects))
 
 
 def _person(cycles: bool, seed: int, body: int) -> list[Rectangle]:

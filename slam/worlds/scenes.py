@@ -29,27 +29,16 @@ _TOWN = {
 
 @dataclass(frozen=True)
 class Scene:
-    """A built-in world.
+    """A built-in world."""
 
-    Attributes:
-        text: what it is, in a line.
-        build: makes its parts from the values of its options.
-        reach: nearest and farthest distance of a feature [m].
-        texels: per metre of a surface.
-        kind: of motion, ``"handheld"`` or ``"driving"``.
-        options: that it has alone.
-        defaults: of common options, where they are others than usual.
-        alike: see `slam.worlds.geometry.place_landmarks`.
-    """
-
-    text: str
-    build: Callable[[Mapping[str, Any]], Parts]
-    reach: tuple[float, float]
-    texels: float
-    kind: str = "handheld"
-    options: tuple[Option, ...] = ()
-    defaults: Mapping[str, Any] = field(default_factory=dict)
-    alike: bool = False
+    text: str  # what it is, in a line
+    build: Callable[[Mapping[str, Any]], Parts]  # makes its parts from the values of its options
+    reach: tuple[float, float]  # nearest and farthest distance of a feature [m]
+    texels: float  # per metre of a surface
+    kind: str = "handheld"  # of motion, or ``"driving"``
+    options: tuple[Option, ...] = ()  # that it has alone
+    defaults: Mapping[str, Any] = field(default_factory=dict)  # of common options, where they are others than usual
+    alike: bool = False  # see `slam.worlds.geometry.place_landmarks`
 
 
 def _camera(default: str) -> tuple[Option, ...]:

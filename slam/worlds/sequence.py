@@ -21,11 +21,10 @@ from slam.worlds.appearance import Appearance, appearance
 from slam.worlds.faults import Faults
 from slam.worlds.geometry import Landmarks
 from slam.worlds.observe import SimulatedFeatures, simulate
-from slam.worlds.truth import TruthImages, truth_images
 from slam.worlds.world import World
 
 if TYPE_CHECKING:
-    from slam.worlds.recorder import Recorder
+    from slam.worlds.recorder import Recorder, TruthImages
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +46,12 @@ class WorldSequence:
     Attributes:
         name: text that opens it again, such as ``"aisle?frames=200&seed=3"``.
         format: ``"synthetic"``.
+        kind: of motion, ``"handheld"`` or ``"driving"``.
         world: what is recorded.
         values: the values of all options.
         rig: the stereo rig as the system is told of it; `world.rig` is the true one.
+        stamps: times of the frames (N,) [s].
+        landmarks: of the world; the row is the id.
         ground_truth: pose of the left camera at every frame.
         warnings: always empty; recorded sequences have faults to report here.
         masks: of both cameras (H, W) bool, see `slam.data.StereoFrame`.
@@ -58,37 +60,21 @@ class WorldSequence:
     format = "synthetic"
 
     def __init__(self, name: str, world: World, values: Mapping[str, Any], rig: StereoRig | None = None) -> None:
-        self.name = name
-        self.world = world
+        self.name, self.kind, self.values = name, world.kind, dict(values)
+        self.world, self.landmarks = world, world.landmarks
         self.rig = world.rig if rig is None else rig
-        self.values = dict(values)
         self.warnings: list[str] = []
         self.masks: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
         self.faults = Faults.of(values, len(world), values["seed"])
-        self._kept = np.flatnonzero(~self.faults.drop)
-        self._stamps = (world.stamps + self.faults.delay)[self._kept]
+        self._kept = np.flatnonzero(~self.faults.frames["drop"])
+        self.stamps: Array = (world.stamps + self.faults.delay)[self._kept]
         self._last_truth: tuple[int, TruthImages] | None = None
         self._images: list[StereoFrame] = []
-
-    @property
-    def kind(self) -> str:
-        """Kind of motion, ``"handheld"`` or ``"driving"``."""
-        return self.world.kind
-
-    @property
-    def stamps(self) -> Array:
-        """Times of the frames (N,) [s]."""
-        return self._stamps
-
-    @property
-    def landmarks(self) -> Landmarks:
-        """The landmarks; the row is the id."""
-        return self.world.landmarks
 
     @cached_property
     def ground_truth(self) -> Trajectory:
         """Pose of the left camera at every frame."""
-        return Trajectory(self._stamps, self.world.T_world_left[self._kept])
+        return Trajectory(self.stamps, self.world.T_world_left[self._kept])
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -112,7 +98,7 @@ class WorldSequence:
         """Images of frame k."""
         if self._images:
             return self._images[int(k)]
-        frame = self._recorder.record(self.source(k), int(k), float(self._stamps[int(k)]))
+        frame = self._recorder.record(self.source(k), int(k), float(self.stamps[int(k)]))
         return replace(frame, left_mask=self.masks[0], right_mask=self.masks[1])
 
     def keep_images(self) -> None:
@@ -144,7 +130,7 @@ class WorldSequence:
         """Features of frame k with their truth, without images."""
         source = self.source(k)
         rng = np.random.default_rng([self.values["seed"], source, 1])
-        seen = simulate(self.world, self._looks, self.values, source, float(self._stamps[int(k)]), rng)
+        seen = simulate(self.world, self._looks, self.values, source, float(self.stamps[int(k)]), rng)
         return self.faults.spoil(source, seen, self.rig, rng)
 
     @cached_property
@@ -162,6 +148,8 @@ class WorldSequence:
     def _truth(self, k: int) -> TruthImages:
         """True depth and objects of frame k; the last frame's are kept."""
         if self._last_truth is None or self._last_truth[0] != k:
+            from slam.worlds.recorder import truth_images
+
             self._last_truth = k, truth_images(self.world, self.source(k))
         return self._last_truth[1]
 

@@ -15,9 +15,9 @@ from slam.data import IdArray
 from slam.geometry.se3 import Array, pose
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.drives import EYE, SAME_ROAD, STEP, Road, around_blocks, level, read_path, sampled
-from slam.worlds.geometry import Parts, Rectangle, rectangle
+from slam.worlds.geometry import DOWN, Parts, Rectangle, rectangle
 from slam.worlds.paths import yaw_pitch_roll
-from slam.worlds.roadside import cabinet, car, trunk
+from slam.worlds.roadside import car, post
 from slam.worlds.surfaces import Facade, Material
 
 ASIDE = 9.0  #: from a road's middle to the house fronts [m]
@@ -28,7 +28,7 @@ _BENT = 0.5  # most that the road turns along one front [rad]
 _FOUNDATION = 0.3  # of house fronts below the lowest ground before them [m]
 _EVEN = 0.2  # a town with no greater differences in height is level [m]
 _TREES, _CARS, _CABINETS = 4, 5, 2  # on each side of a stretch
-_CAR_ASIDE, _TREE_ASIDE, _CABINET_ASIDE = 6.2, 7.6, 8.2  # from a road's middle [m]
+_BESIDE = {"trees": 7.6, "cabinets": 8.2, "cars": 6.2}  # from a road's middle [m]
 _CLEAR = 2.6  # nothing stands so near to where the camera drives [m]
 _AROUND = 16  # samples ahead and behind between which a road is straight where something stands at its side
 _TILE = 12.0  # edges of the ground's parts [m]
@@ -51,27 +51,19 @@ def _town(path: Trajectory, values: Mapping[str, Any]) -> Parts:
     R = level(path)  # to level axes
     streets = Streets(Road.along(path.positions @ R.T), values["layout"])
     drive = sampled(path, values)
-    level_parts = streets.houses() + streets.furniture() + streets.ground() + streets.parked_cars()
+    level_parts = [*streets.houses(), *streets.beside("trees", "cabinets"), *streets.ground(), *streets.beside("cars")]
     parts = [replace(r, origin=R.T @ r.origin, along=R.T @ r.along, down=R.T @ r.down) for r in level_parts]
     return Parts(drive.stamps, drive.poses, parts)
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What stands on one side of a stretch.
+    """What stands on one side of a stretch."""
 
-    Attributes:
-        widths, heights: of its houses [m].
-        trees, cars, cabinets: distances along the stretch [m].
-        seed: of their looks.
-    """
-
-    widths: Array
+    widths: Array  # of its houses [m]
     heights: Array
-    trees: Array
-    cars: Array
-    cabinets: Array
-    seed: int
+    beside: Mapping[str, Array]  # distances of trees, cabinets and cars along the stretch [m]
+    seed: int  # of their looks
 
 
 @lru_cache(maxsize=4096)
@@ -82,23 +74,25 @@ def _plan(layout: int, stretch: int, side: int) -> Plan:
     edges = np.concatenate([[0.0], np.round(cuts, 2), [STRETCH]])
     cars, posts = ((np.arange(n) + rng.uniform(0.3, 0.7, n)) * STRETCH / n for n in (_CARS, _TREES + _CABINETS))
     posts = rng.permutation(posts)
-    return Plan(
-        np.diff(edges), np.round(rng.uniform(7, 12, _HOUSES), 2), posts[:_TREES],
-        cars[rng.random(_CARS) < 0.7], posts[_TREES:], int(rng.integers(1 << 24)) * 100,
-    )  # fmt: skip
+    heights = np.round(rng.uniform(7, 12, _HOUSES), 2)
+    beside = {"trees": posts[:_TREES], "cabinets": posts[_TREES:], "cars": cars[rng.random(_CARS) < 0.7]}
+    return Plan(np.diff(edges), heights, beside, int(rng.integers(1 << 24)) * 100)
+
+
+def _stand(what: str, T: Array, seed: int) -> list[Rectangle]:
+    """A tree's trunk, a switch cabinet full of bills, or a car."""
+    if what == "cars":
+        return car(T, seed + 30)
+    if what == "trees":
+        return post(T, (0.35, 0.35, 4.0), "wood", seed + 10)
+    return post(T, (1.0, 0.5, 1.4), "poster", seed + 20)
 
 
 class Streets:
-    """Streets along a road.
-
-    Args:
-        road: the roads.
-        layout: seed of what stands where.
-    """
+    """Streets along a road; `layout` is the seed of what stands where."""
 
     def __init__(self, road: Road, layout: int) -> None:
-        self._road = road
-        self._layout = layout
+        self._road, self._layout = road, layout
         self._tree = cKDTree(road.xy)
         self._drives = cKDTree(road.drives[:, :2])
         near = self._drives.query_ball_point(road.xy, SAME_ROAD + STEP)
@@ -111,11 +105,12 @@ class Streets:
             self._foundation = 0.0
         self._stretch = np.floor((road.way - road.way[0]) / STRETCH).astype(int)
 
-    def houses(self) -> list[Rectangle]:
+    def houses(self) -> Iterator[Rectangle]:
         """House fronts along both sides of every road, and across both ends of the path."""
-        return [
-            front for side in (1, -1) for run in self._runs(side) for front in self._fronts(run, side)
-        ] + self._ends()
+        for side in (1, -1):
+            for run in self._runs(side):
+                yield from self._fronts(run, side)
+        yield from self._ends()
 
     def _runs(self, side: int) -> Iterator[IdArray]:
         """Successive samples of the road with a house front beside them: no road runs there."""
@@ -135,7 +130,9 @@ class Streets:
             before = run[(way >= a) & (way <= b)]
             if not len(before):
                 continue
-            plan, house = self._house((a + b) / 2, side)
+            stretch, along = divmod((a + b) / 2 - self._road.way[0], STRETCH)
+            plan = self._plan(int(stretch), side)
+            house = min(int(np.searchsorted(np.cumsum(plan.widths), along)), _HOUSES - 1)
             width = float(np.linalg.norm(ends[1] - ends[0]))
             if abs(width - plan.widths[house]) < 0.25:
                 width = float(plan.widths[house])  # as it is wherever the same house stands
@@ -144,78 +141,46 @@ class Streets:
             front = Facade(round(width, 2), height, plan.seed + house + 4 * part)
             start, end = ends if side > 0 else ends[::-1]
             top = float(self._low[before].min()) - self._foundation + height
-            yield rectangle(front, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
+            yield rectangle(front, (*start, top), (*(end - start), 0), DOWN, occludes=True)
 
     def _pieces(self, first: float, last: float, side: int) -> Iterator[tuple[float, float, int]]:
         """From where to where each house front reaches [m along the path], and its number where a house is bent."""
-        for a, b in pairwise(self._edges(first, last, side).tolist()):
+        zero, found = self._road.way[0], [first]
+        for stretch in range(int((first - zero) // STRETCH), int((last - zero) // STRETCH) + 1):
+            plan = self._plan(stretch, side)
+            found += (zero + stretch * STRETCH + np.cumsum([0.0, *plan.widths[:-1]])).tolist()
+        inside = [edge for edge in found if first + _NARROWEST < edge < last - _NARROWEST]
+        for a, b in pairwise([first, *inside, last]):
             start, end = (self._road.left[np.abs(self._road.way - w).argmin()] for w in (a, b))
             parts = int(np.ceil(np.arccos(np.clip(start @ end, -1, 1)) / _BENT + 1e-9))
             cuts = np.linspace(a, b, parts + 1).tolist()
             yield from ((c, d, part) for part, (c, d) in enumerate(pairwise(cuts)))
 
-    def _edges(self, first: float, last: float, side: int) -> Array:
-        """Where house fronts begin and end between two distances along the path (N,) [m]."""
-        zero = self._road.way[0]
-        found = [first]
-        for stretch in range(int((first - zero) // STRETCH), int((last - zero) // STRETCH) + 1):
-            plan = self._plan(stretch, side)
-            found += (zero + stretch * STRETCH + np.cumsum([0.0, *plan.widths[:-1]])).tolist()
-        inside = np.array(found)
-        inside = inside[(inside > first + _NARROWEST) & (inside < last - _NARROWEST)]
-        return np.concatenate([[first], inside, [last]])
-
-    def _house(self, way: float, side: int) -> tuple[Plan, int]:
-        """The plan, and which of its houses stands at a distance along the path."""
-        stretch, along = divmod(way - self._road.way[0], STRETCH)
-        plan = self._plan(int(stretch), side)
-        return plan, min(int(np.searchsorted(np.cumsum(plan.widths), along)), _HOUSES - 1)
-
     def _plan(self, stretch: int, side: int) -> Plan:
         """What stands on a side of a stretch."""
         return _plan(self._layout, min(stretch, int(self._stretch[-1])), side)
 
-    def _ends(self) -> list[Rectangle]:
+    def _ends(self) -> Iterator[Rectangle]:
         """House fronts across the road behind the start and beyond the end, unless other roads run there."""
-        out = []
         for row, to_left in ((0, 1), (-1, -1)):
             middle, left = self._road.xy[row], self._road.left[row]
             rows = self._tree.query_ball_point(middle, 2 * ASIDE)
-            if np.abs(self._road.way[rows] - self._road.way[row]).max() > 3 * ASIDE:
-                continue
-            plan = self._plan(int(self._stretch[row]), 1)
-            front = Facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
-            start = middle - to_left * ASIDE * left
-            top = float(self._low[row]) - self._foundation + front.height
-            out.append(rectangle(front, (*start, top), (*(to_left * left), 0), (0, 0, -1), occludes=True))
-        return out
+            if np.abs(self._road.way[rows] - self._road.way[row]).max() <= 3 * ASIDE:
+                plan = self._plan(int(self._stretch[row]), 1)
+                front = Facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
+                start = middle - to_left * ASIDE * left
+                top = float(self._low[row]) - self._foundation + front.height
+                yield rectangle(front, (*start, top), (*(to_left * left), 0), DOWN, occludes=True)
 
-    def furniture(self) -> list[Rectangle]:
-        """Trees and switch cabinets."""
-        out = []
-        for way, side, plan, number in self._places("trees"):
-            T = self._pose(way, side, _TREE_ASIDE)
-            out += [] if T is None else trunk(T, plan.seed + 10 + number)
-        for way, side, plan, number in self._places("cabinets"):
-            T = self._pose(way, side, _CABINET_ASIDE)
-            out += [] if T is None else cabinet(T, plan.seed + 20 + number)
-        return out
-
-    def parked_cars(self) -> list[Rectangle]:
-        """Cars parked at both sides."""
-        out = []
-        for way, side, plan, number in self._places("cars"):
-            T = self._pose(way, side, _CAR_ASIDE)
-            out += [] if T is None else car(T, plan.seed + 30 + number)
-        return out
-
-    def _places(self, what: str) -> Iterator[tuple[float, int, Plan, int]]:
-        """Distance along the path, side, plan and number of everything of one kind."""
-        for stretch in np.unique(self._stretch).tolist():
-            for side in (1, -1):
-                plan = self._plan(stretch, side)
-                for number, along in enumerate(getattr(plan, what).tolist()):
-                    yield self._road.way[0] + stretch * STRETCH + along, side, plan, number
+    def beside(self, *kinds: str) -> Iterator[Rectangle]:
+        """What stands at both sides: trees, switch cabinets or parked cars."""
+        for what in kinds:
+            for stretch in np.unique(self._stretch).tolist():
+                for side in (1, -1):
+                    plan = self._plan(stretch, side)
+                    for number, along in enumerate(plan.beside[what].tolist()):
+                        T = self._pose(self._road.way[0] + stretch * STRETCH + along, side, _BESIDE[what])
+                        yield from () if T is None else _stand(what, T, plan.seed + number)
 
     def _pose(self, way: float, side: int, aside: float) -> Array | None:
         """Pose (4, 4) on the ground at a road's side, y along the traffic there; None where it would be in the way."""
@@ -225,24 +190,27 @@ class Streets:
         left = self._road.left[row]
         along = np.array([left[1], -left[0]])
         xy = self._road.xy[row] + (way - self._road.way[row]) * along + side * aside * left
-        if self._tree.query(xy)[0] < aside - 0.3 or self._drives.query(xy)[0] < _CLEAR or self._bends(row):
+        ahead, behind = min(row + _AROUND, len(self._road.left) - 1), max(row - _AROUND, 0)
+        bends = float(self._road.left[ahead] @ self._road.left[behind]) < 0.97  # by more than 15°
+        if self._tree.query(xy)[0] < aside - 0.3 or self._drives.query(xy)[0] < _CLEAR or bends:
             return None
         heading = float(np.arctan2(-along[0], along[1])) + (np.pi if side > 0 else 0.0)
         return pose(yaw_pitch_roll(heading, 0, 0), np.array([*xy, self._low[row]]))
 
-    def _bends(self, row: int) -> bool:
-        """Whether a road turns by more than 15° around a sample."""
-        ahead, behind = min(row + _AROUND, len(self._road.left) - 1), max(row - _AROUND, 0)
-        return float(self._road.left[ahead] @ self._road.left[behind]) < 0.97
-
-    def ground(self) -> list[Rectangle]:
+    def ground(self) -> Iterator[Rectangle]:
         """Square parts of the ground under all roads, as high and as steep as the roads there."""
         around = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)]) * ASIDE
         cells = np.unique(np.floor((self._road.xy[:, None] + around) / _TILE).reshape(-1, 2).astype(int), axis=0)
         corners = cells[:, None] + np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
         used, which = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
         heights = np.array([self._height(xy) for xy in used * _TILE])[which].reshape(-1, 4)
-        return [self._tile(cell, height, number) for number, (cell, height) in enumerate(zip(cells, heights))]
+        for number, (cell, h) in enumerate(zip(cells, heights)):
+            slope_x, slope_y = (h[1] + h[3] - h[0] - h[2]) / (2 * _TILE), (h[2] + h[3] - h[0] - h[1]) / (2 * _TILE)
+            edge = _TILE + 2 * _LAP * bool(np.ptp(h) > 0)  # it overlaps its neighbours a little
+            xy = (cell + 0.5) * _TILE + np.array([-edge, edge]) / 2
+            texture = Material(edge, edge, "asphalt", 100 * self._layout + number, 0.3, (0.05, 0.3))
+            along, down = np.array([1, 0, slope_x]) * edge, np.array([0, -1, -slope_y]) * edge
+            yield Rectangle(np.array([*xy, h.mean() + (slope_y - slope_x) * edge / 2]), along, down, texture)
 
     def _height(self, xy: Array) -> float:
         """Height of the ground at a place (2,) [m]: the mean of the roads around it, near ones count most."""
@@ -250,14 +218,3 @@ class Streets:
         distance = np.linalg.norm(self._road.xy[rows] - xy, axis=1)
         weight = np.exp(-((distance / _SMOOTHED) ** 2) / 2) + 1e-9
         return float(weight @ self._low[rows] / weight.sum())
-
-    def _tile(self, cell: IdArray, heights: Array, number: int) -> Rectangle:
-        """One part of the ground, from the heights (4,) of its corners; it overlaps its neighbours a little."""
-        slope_x = (heights[1] + heights[3] - heights[0] - heights[2]) / (2 * _TILE)
-        slope_y = (heights[2] + heights[3] - heights[0] - heights[1]) / (2 * _TILE)
-        edge = _TILE + 2 * _LAP * bool(np.ptp(heights) > 0)
-        xy = (cell + 0.5) * _TILE + np.array([-edge, edge]) / 2
-        height = heights.mean() + (slope_y - slope_x) * edge / 2
-        texture = Material(edge, edge, "asphalt", 100 * self._layout + number, 0.3, (0.05, 0.3))
-        along, down = np.array([1, 0, slope_x]) * edge, np.array([0, -1, -slope_y]) * edge
-        return Rectangle(np.array([*xy, height]), along, down, texture)

@@ -14,46 +14,22 @@ from slam.geometry.se3 import Array
 from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays
 
 
-def _to_corner(rig: StereoRig) -> float:
-    """Distance to a point in a corner of the left image, over its depth; generously."""
-    camera = rig.left
-    x, y = max(camera.u0, camera.width - camera.u0) / camera.fu, max(camera.v0, camera.height - camera.v0) / camera.fv
-    return float(1.1 * np.sqrt(1 + x * x + y * y))
-
-
 @dataclass(frozen=True, eq=False)
 class World:
-    """Surfaces, landmarks, a camera path and objects with their motion.
-
-    Attributes:
-        name: its name.
-        kind: kind of motion, ``"handheld"`` or ``"driving"``.
-        rig: the stereo rig.
-        stamps: time of each frame (N,) [s].
-        T_world_left: pose of the left camera at each frame (N, 4, 4).
-        rectangles: every surface.
-        landmarks: points that stand out on them.
-        T_world_object: poses of the objects 1..B at each frame (B, N, 4, 4).
-        reach: nearest and farthest distance at which a landmark can be detected [m].
-        texels: texels per metre at which the surfaces are painted.
-        sky: colour (BGR) where no surface is.
-        painted: textures painted so far, filled by the recorder.
-        seen: landmarks seen in frames so far, filled by the simulator of observations.
-    """
+    """Surfaces, landmarks, a camera path and objects with their motion."""
 
     name: str
-    kind: str
+    kind: str  # of motion, ``"handheld"`` or ``"driving"``
     rig: StereoRig
-    stamps: Array
-    T_world_left: Array
-    rectangles: tuple[Rectangle, ...]
-    landmarks: Landmarks
-    T_world_object: Array
-    reach: tuple[float, float]
-    texels: float
-    sky: tuple[int, int, int] = (230, 225, 220)
-    painted: dict[Any, Any] = field(default_factory=dict, repr=False)
-    seen: dict[int, Any] = field(default_factory=dict, repr=False)
+    stamps: Array  # time of each frame (N,) [s]
+    T_world_left: Array  # pose of the left camera at each frame (N, 4, 4)
+    rectangles: tuple[Rectangle, ...]  # every surface
+    landmarks: Landmarks  # points that stand out on them
+    T_world_object: Array  # poses of the objects 1..B at each frame (B, N, 4, 4)
+    reach: tuple[float, float]  # nearest and farthest distance at which a landmark can be detected [m]
+    texels: float  # per metre, at which the surfaces are painted
+    painted: dict[Any, Any] = field(default_factory=dict, repr=False)  # textures painted so far, by the recorder
+    seen: dict[int, Any] = field(default_factory=dict, repr=False)  # visible landmarks of frames, by the simulator
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -87,17 +63,11 @@ class World:
         """The rectangles that may hide others."""
         return self.arrays.select(np.flatnonzero([r.occludes for r in self.rectangles]))
 
-    def landmarks_near(self, frame: int) -> IdArray:
-        """Ids of the landmarks that may be within reach in a frame, and of all that move."""
-        return self._within_sight(self.landmarks.positions, 0.0, self.landmarks.object, frame)
-
-    def occluders_near(self, frame: int) -> RectangleArrays:
-        """The rectangles that may hide landmarks within reach in a frame."""
-        every = self.occluders
-        return every.select(self._within_sight(every.middle, every.radius, every.body, frame))
-
-    def _within_sight(self, points: Array, radius: Array | float, body: IdArray, frame: int) -> IdArray:
-        """Indices of points (P, 3) that may be within reach in a frame, and of all that move."""
+    def near(self, points: Array, radius: Array | float, body: IdArray, frame: int) -> IdArray:
+        """Indices of balls (P, 3) that may be within reach and in view in a frame, and of all that move."""
+        camera = self.rig.left
+        x, y = max(camera.u0, camera.width - camera.u0), max(camera.v0, camera.height - camera.v0)
+        corner = 1.1 * np.sqrt(1 + (x / camera.fu) ** 2 + (y / camera.fv) ** 2)  # distance over depth, generously
         offset = points - self.T_world_left[frame, :3, 3]
         square = np.einsum("ij,ij->i", offset, offset)
-        return np.flatnonzero((square < (self.reach[1] * _to_corner(self.rig) + radius) ** 2) | (body > 0))
+        return np.flatnonzero((square < (self.reach[1] * corner + radius) ** 2) | (body > 0))

@@ -11,6 +11,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.worlds import WorldSequence, open_world
 from slam.worlds.paths import camera_poses
 from slam.worlds.streets import ASIDE
+from slam.worlds.surfaces import Facade
 
 LAP = 450  # frames of a round in `loop`
 SMALL = "width=310&height=94"
@@ -60,7 +61,7 @@ def test_no_house_stands_on_a_road_and_every_house_faces_it():
     for query in ("town", "town?layout=3"):
         sequence = open_world(query)
         path = cKDTree(sequence.ground_truth.positions[:, :2])
-        houses = [r for r in sequence.world.rectangles if r.texture.material == "facade"]
+        houses = [r for r in sequence.world.rectangles if isinstance(r.texture, Facade)]
         assert len(houses) > 60
         for house in houses:
             along = np.linspace(0, 1, 20)[:, None] * house.along
