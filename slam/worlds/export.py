@@ -25,7 +25,6 @@ DEPTH_STEPS = {"handheld": 2000, "driving": 256}
 
 #: Folder in which a recording is written.
 FOLDER = "mav0"
-_IMAGES = ("cam0", "cam1", "depth0", "objects0")
 
 OBJECT_COLUMNS = (
     "stamp", "id", "x", "y", "z", "roll", "pitch", "yaw",
@@ -56,7 +55,8 @@ def write_euroc(
     if os.path.lexists(root):
         raise SequenceError(f"{root}: exists already; choose another folder")
     try:
-        _write(sequence, root, range(first, last), progress, truth_images)
+        _write_tables(sequence, root, range(first, last))
+        _write_images(sequence, root, range(first, last), progress, truth_images)
     except OSError as error:
         raise SequenceError(f"{root}: cannot be written: {error.strerror or error}") from error
     return root
@@ -70,87 +70,71 @@ def require_world(sequence: object) -> WorldSequence:
     return sequence
 
 
-def _write(
-    sequence: WorldSequence, root: Path, frames: range, progress: Callable[[int], None] | None, truth_images: bool
-) -> None:
-    """Calibrations and tables first, so that a folder cut short is still readable; then the images."""
-    rig, rate = sequence.rig, sequence.values["rate"]
-    steps = DEPTH_STEPS[sequence.kind]
-    _write_yaml(root / "cam0" / "sensor.yaml", _camera_node(rig.left, np.eye(4), rate))
-    _write_yaml(root / "cam1" / "sensor.yaml", _camera_node(rig.right, inverse(rig.T_right_left), rate))
-    _write_yaml(root / "depth0" / "sensor.yaml", {"sensor_type": "depth", "steps_per_metre": steps})
-    truth = sequence.ground_truth
-    body = root / "state_groundtruth_estimate0"
-    body.mkdir()
-    Trajectory(truth.stamps[list(frames)], truth.poses[list(frames)]).write_euroc(body / "data.csv")
+def _write_tables(sequence: WorldSequence, root: Path, frames: range) -> None:
+    """Calibrations and tables, before the images, so that a folder cut short is still readable."""
+    import yaml
+
+    rig, rate, truth = sequence.rig, float(sequence.values["rate"]), sequence.ground_truth
+    for folder, node in (
+        ("cam0", _camera_node(rig.left, np.eye(4), rate)),
+        ("cam1", _camera_node(rig.right, inverse(rig.T_right_left), rate)),
+        ("depth0", {"sensor_type": "depth", "steps_per_metre": DEPTH_STEPS[sequence.kind]}),
+    ):
+        (root / folder).mkdir(parents=True)
+        (root / folder / "sensor.yaml").write_text(yaml.safe_dump(node, sort_keys=False), encoding="utf-8")
+    (root / "state_groundtruth_estimate0").mkdir()
+    path = Trajectory(truth.stamps[list(frames)], truth.poses[list(frames)])
+    path.write_euroc(root / "state_groundtruth_estimate0" / "data.csv")
     _write_table(root / "objects.csv", OBJECT_COLUMNS, _object_rows(sequence, frames))
     _write_table(root / "landmarks.csv", ("id", "x", "y", "z", "object", "size"), _landmark_rows(sequence, frames[0]))
     (root / "world.txt").write_text(f"synthetic:{sequence.name}\n", encoding="utf-8")
+
+
+def _write_images(
+    sequence: WorldSequence, root: Path, frames: range, progress: Callable[[int], None] | None, truth_images: bool
+) -> None:
+    """Images with their lists, which grow with them."""
+    names, steps = ("cam0", "cam1", "depth0", "objects0")[: 4 if truth_images else 2], DEPTH_STEPS[sequence.kind]
     with ExitStack() as stack:
-        lists = [_ImageList(root / name, stack) for name in _IMAGES[: 4 if truth_images else 2]]
+        tables = []
+        for name in names:
+            (root / name / "data").mkdir(parents=True)
+            tables.append(stack.enter_context((root / name / "data.csv").open("w", encoding="ascii")))
+            tables[-1].write("#timestamp [ns],filename\n")
         for done, k in enumerate(frames, start=1):
             frame = sequence.frame(k)
-            images = [frame.left, frame.right]
+            images, nanoseconds = [frame.left, frame.right], round(frame.stamp * 1e9)
             if truth_images:
                 depth = np.rint(sequence.depth(k) * steps)
-                images += [
-                    np.where(depth < 65536, depth, 0).astype(np.uint16),
-                    sequence.object_ids(k).astype(np.uint16),
-                ]
-            for folder, image in zip(lists, images):
+                images += [np.where(depth < 65536, depth, 0).astype(np.uint16), sequence.object_ids(k).astype(np.uint16)]
+            for name, table, image in zip(names, tables, images):
                 if image is not None:
-                    folder.add(round(frame.stamp * 1e9), image)
+                    write_png(root / name / "data" / f"{nanoseconds}.png", image)
+                    table.write(f"{nanoseconds},{nanoseconds}.png\n")
+                    table.flush()
             if progress is not None:
                 progress(done)
 
 
-class _ImageList:
-    """A folder of images and its ``data.csv``, a row written with each image."""
-
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        self._data = folder / "data"
-        self._data.mkdir(parents=True)
-        self._table = stack.enter_context((folder / "data.csv").open("w", encoding="ascii"))
-        self._table.write("#timestamp [ns],filename\n")
-
-    def add(self, nanoseconds: int, image: np.ndarray) -> None:
-        """Write an image and its row."""
-        name = f"{nanoseconds}.png"
-        write_png(self._data / name, image)
-        self._table.write(f"{nanoseconds},{name}\n")
-        self._table.flush()
-
-
 def _camera_node(camera: PinholeCamera, T_body_camera: Array, rate: float) -> dict[str, Any]:
     """A camera as EuRoC's ``sensor.yaml`` has it."""
-    models = {"none": "radial-tangential", "radtan": "radial-tangential", "equidistant": "equidistant"}
     return {
         "sensor_type": "camera",
         "comment": "rendered",
-        "T_BS": {"cols": 4, "rows": 4, "data": [float(x) for x in T_body_camera.ravel()]},
-        "rate_hz": float(rate),
+        "T_BS": {"cols": 4, "rows": 4, "data": T_body_camera.ravel().tolist()},
+        "rate_hz": rate,
         "resolution": [camera.width, camera.height],
         "camera_model": "pinhole",
         "intrinsics": [float(x) for x in (camera.fu, camera.fv, camera.u0, camera.v0)],
-        "distortion_model": models[camera.model],
+        "distortion_model": "equidistant" if camera.model == "equidistant" else "radial-tangential",
         "distortion_coefficients": [float(x) for x in camera.distortion or (0.0, 0.0, 0.0, 0.0)],
     }
-
-
-def _write_yaml(path: Path, node: dict[str, Any]) -> None:
-    """Write a mapping as YAML."""
-    import yaml
-
-    path.parent.mkdir(parents=True)
-    path.write_text(yaml.safe_dump(node, sort_keys=False), encoding="utf-8")
 
 
 def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
     """Write a CSV file."""
     with path.open("w", encoding="ascii", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
+        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
 
 
 def _object_rows(sequence: WorldSequence, frames: range) -> Iterable[list[str]]:

@@ -75,7 +75,10 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     landmarks = world.landmarks.select(near)
     positions = landmarks.world_positions(bodies)
     points = (positions - T[:3, 3]) @ T[:3, :3]
-    rows = _candidates(world, points)
+    (nearest, farthest), camera, (x, y, z) = world.reach, world.rig.left, points.T
+    widest = 1.3 * max(camera.u0, camera.width - camera.u0) / camera.fu
+    highest = 1.3 * max(camera.v0, camera.height - camera.v0) / camera.fv
+    rows = np.flatnonzero((z > nearest) & (z < farthest) & (np.abs(x) < widest * z) & (np.abs(y) < highest * z))
     offsets = positions[rows] - T[:3, 3]
     normals = turned(landmarks.normals[rows], landmarks.object[rows], bodies)
     facing = -(normals * offsets).sum(axis=1) > FACING * np.linalg.norm(offsets, axis=1)
@@ -113,16 +116,6 @@ def _views(world: World, frame: int, seen: VisibleLandmarks, source: IdArray) ->
     return views
 
 
-def _candidates(world: World, points: Array) -> IdArray:
-    """Landmarks within reach and roughly in the angle of view, by points (P, 3) in left-camera coordinates."""
-    near, far = world.reach
-    camera = world.rig.left
-    x, y, z = points[:, 0], points[:, 1], points[:, 2]
-    widest = 1.3 * max(camera.u0, camera.width - camera.u0) / camera.fu
-    highest = 1.3 * max(camera.v0, camera.height - camera.v0) / camera.fv
-    return np.flatnonzero((z > near) & (z < far) & (np.abs(x) < widest * z) & (np.abs(y) < highest * z))
-
-
 def simulate(
     world: World, appearance: Appearance, values: Mapping[str, Any], frame: int, stamp: float, rng: np.random.Generator
 ) -> SimulatedFeatures:
@@ -131,7 +124,7 @@ def simulate(
     The noise is isotropic on uL, vL and uR; vR follows from the epipolar geometry of the three, so that the noisy
     rays meet. A feature that noise takes out of the left image is not detected.
     """
-    seen = seen_landmarks(world, frame)
+    rig, seen = world.rig, seen_landmarks(world, frame)
     chance = rng.random((len(seen.ids), 3))
     rows = np.flatnonzero(chance[:, 0] < values["detect"])
     matched = seen.in_right[rows] & (chance[rows, 1] < values["stereo"])
@@ -139,23 +132,23 @@ def simulate(
     uv_left = seen.uv_left[rows] + noise[:, :2]
     uv_right = np.full_like(uv_left, np.nan)
     uv_right[matched] = _on_epipolar_line(
-        world.rig, seen.points[rows[matched]], uv_left[matched], seen.uv_right[rows[matched]], noise[matched]
+        rig, seen.points[rows[matched]], uv_left[matched], seen.uv_right[rows[matched]], noise[matched]
     )
     false_stereo = matched & (chance[rows, 2] < values["outliers"] / 2)
-    if false_stereo.any():
-        _falsify(uv_left, uv_right, np.flatnonzero(false_stereo), rng)
-    extra = round(len(rows) * values["outliers"] / (1 - values["outliers"]))
-    false_left, false_right = _false_pixels(world.rig, extra, rng)
-    passing_left, passing_right = _clutter(
-        world.rig, seen, round(len(rows) * values["clutter"] / (1 - values["clutter"])), rng
-    )
-    uv_left = np.concatenate([uv_left, false_left, passing_left])
-    uv_right = np.concatenate([uv_right, false_right, passing_right])
-    uv_right[~_inside(world.rig, uv_right)] = np.nan
+    if false_stereo.any():  # somewhere near the left pixel's line
+        uv_right[false_stereo, 0] = rng.uniform(0, np.maximum(uv_left[false_stereo, 0], 1.0))
+        uv_right[false_stereo, 1] += rng.normal(0, 0.5, false_stereo.sum())
+    others = [
+        _false_pixels(rig, round(len(rows) * values["outliers"] / (1 - values["outliers"])), rng),
+        _clutter(rig, seen, round(len(rows) * values["clutter"] / (1 - values["clutter"])), rng),
+    ]
+    uv_left, uv_right = (np.concatenate([own, *(o[i] for o in others)]) for i, own in enumerate((uv_left, uv_right)))
+    uv_right[~_inside(rig, uv_right)] = np.nan
     order = rng.permutation(len(uv_left))
-    order = order[_inside(world.rig, uv_left[order])]
-    source = np.concatenate([rows, np.full(extra + len(passing_left), _FALSE)])[order]
-    false_stereo = np.concatenate([false_stereo, np.zeros(extra + len(passing_left), bool)])[order]
+    order = order[_inside(rig, uv_left[order])]
+    false = len(uv_left) - len(rows)
+    source = np.concatenate([rows, np.full(false, _FALSE)])[order]
+    false_stereo = np.concatenate([false_stereo, np.zeros(false, bool)])[order]
     return _features(world, appearance, frame, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
 
 
@@ -172,12 +165,11 @@ def _features(
     views = _views(world, frame, seen, source) if appearance.drifting else None
     descriptors = appearance.describe(landmark, views, float(world.stamps[frame]), rng)
     descriptors[false] = appearance.of_nothing(len(false), rng)
-    descriptors /= np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))[:, None]
     objects = world.landmarks.object[landmark]
     objects[false] = _FALSE
     features = StereoFeatures(
         stamp, uv_left, uv_right, size, np.zeros(len(ids)), appearance.response[landmark],
-        appearance.laplacian[landmark], descriptors,
+        appearance.laplacian[landmark], unit(descriptors),
     )  # fmt: skip
     return SimulatedFeatures(features, ids, objects, false_stereo)
 
@@ -195,12 +187,6 @@ def _on_epipolar_line(rig: StereoRig, points: Array, uv_left: Array, uv_right: A
         points = points + np.linalg.solve(J, (target - z)[:, :, None])[..., 0]
     row = rig.right.project((points + rig.b) @ rig.R.T)[:, 1]
     return np.column_stack([target[:, 2], np.where(np.isfinite(row), row, uv_left[:, 1])])
-
-
-def _falsify(uv_left: Array, uv_right: Array, rows: np.ndarray, rng: np.random.Generator) -> None:
-    """Give rows a false right pixel, near the left pixel's line, in place."""
-    uv_right[rows, 0] = rng.uniform(0, np.maximum(uv_left[rows, 0], 1.0))
-    uv_right[rows, 1] += rng.normal(0, 0.5, len(rows))
 
 
 def _false_pixels(rig: StereoRig, count: int, rng: np.random.Generator) -> tuple[Array, Array]:

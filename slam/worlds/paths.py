@@ -61,23 +61,11 @@ def carried(t: Array, rng: np.random.Generator, gait: float = 1.8, amount: float
     """
     phase = rng.uniform(0, 2 * np.pi)
     step = 2 * np.pi * gait * t + phase
-    offsets = np.stack(
-        [
-            0.018 * np.sin(step / 2) + 0.003 * sway(t, rng, 1.5, 4),
-            0.006 * np.sin(step + 1) + 0.002 * sway(t, rng, 1.5, 4),
-            0.012 * np.sin(step) + 0.003 * sway(t, rng, 1.5, 4),
-        ],
-        axis=1,
-    )
-    angles = np.stack(
-        [
-            0.012 * np.sin(step / 2 + 0.6) + 0.004 * sway(t, rng, 1, 5),
-            0.006 * np.sin(step + 0.3) + 0.004 * sway(t, rng, 1, 5),
-            0.008 * np.sin(step / 2 + 2) + 0.003 * sway(t, rng, 1, 5),
-        ],
-        axis=1,
-    )
-    return amount * offsets, amount * angles
+    gaits = ((0.018, 0.5, 0, 0.003), (0.006, 1, 1, 0.002), (0.012, 1, 0, 0.003))  # size, steps, phase, shaking
+    turns = ((0.012, 0.5, 0.6, 0.004), (0.006, 1, 0.3, 0.004), (0.008, 0.5, 2, 0.003))
+    offsets = [a * np.sin(f * step + p) + b * sway(t, rng, 1.5, 4) for a, f, p, b in gaits]
+    angles = [a * np.sin(f * step + p) + b * sway(t, rng, 1, 5) for a, f, p, b in turns]
+    return amount * np.stack(offsets, axis=1), amount * np.stack(angles, axis=1)
 
 
 def clock(values: Mapping[str, Any], duration: float) -> tuple[Array, Array]:
