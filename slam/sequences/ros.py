@@ -5,8 +5,7 @@ They are read by the package rosbags (``pip install 'surf-stereo-slam[ros]'``), 
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import ExitStack, closing
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -23,11 +22,11 @@ from slam.sequences.calibration import naming
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given, flag
 from slam.sequences.images import Size, halved
-from slam.sequences.ros_bag import Bag, naming_recording, open_bag
+from slam.sequences.ros_bag import Bag, Message, naming_recording, open_bag
 from slam.sequences.ros_topics import Topics, choose_topics, rig_from_camera_infos
 from slam.sequences.source import Listing, hardware_tolerance, in_order, in_seconds, pair_listings, require_size
 
-#: Options besides ``kind``.
+#: Options besides those of all formats.
 OPTIONS = frozenset({"left_info", "right_info"})
 
 #: Endings of files, in lower case.
@@ -61,7 +60,7 @@ def open_folder(path: Path, options: Given) -> RecordedSequence:
     with FaultLog(warnings) as faults:
         with open_bag(path) as bag:
             topics = choose_topics(bag, options)
-            messages = [_listing(bag, topic, faults) for topic in dict.fromkeys((topics.left, topics.right))]
+            messages = [_stamps(bag, topic, faults) for topic in dict.fromkeys((topics.left, topics.right))]
             size = _first_size(bag, topics.left)
         left, *right = _in_time(messages, faults)
         partners: list[str | None] = [None] * len(left)
@@ -71,9 +70,8 @@ def open_folder(path: Path, options: Given) -> RecordedSequence:
             left, partners = pair_listings(left, right[0], tolerance, faults)
         left, partners, stamps = in_seconds(left, partners, faults)
         rig = _rig(path, topics, size if right else halved(size, topics.left), options)
-    rows = np.array([int(name) for name in left.names])
-    right_rows = np.array([-1 if name is None else int(name) for name in partners])
-    source = RosPairs(stamps, path, messages[0], messages[-1], rows, right_rows, size)
+    rows = [(int(a), -1 if b is None else int(b))[: len(messages)] for a, b in zip(left.names, partners)]
+    source = RosPairs(stamps, path, messages, np.array(rows), size)
     return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 
@@ -84,71 +82,58 @@ class Messages(NamedTuple):
     stamps: IntArray
     recorded: IntArray
 
-    def seek(self, row: int) -> tuple[int | None, int]:
-        """The time from which on to read for a row, and the first row that comes then; None for the beginning."""
-        if (np.diff(self.recorded) < 0).any():
-            return None, 0
-        return int(self.recorded[row]), int(np.searchsorted(self.recorded, self.recorded[row]))
-
 
 @dataclass(frozen=True, eq=False)
 class RosPairs:
-    """A frame source: two topics of a recording, already paired.
+    """A frame source: two topics of a recording, already paired, or one with images side by side."""
 
-    Attributes:
-        stamps: times (N,) [s], strictly increasing.
-        path: of the recording.
-        left, right: the messages of the topics; the same of images that are side by side in one.
-        left_rows: which of them are the frames (N,).
-        right_rows: the same for the right images, -1 where there is none (N,).
-        size: width and height that every message's image must have.
-    """
-
-    stamps: Array
-    path: Path
-    left: Messages
-    right: Messages
-    left_rows: IntArray
-    right_rows: IntArray
-    size: Size
+    stamps: Array  # times (N,) [s], strictly increasing
+    path: Path  # of the recording
+    topics: list[Messages]  # of the left and the right images; one of images that are side by side
+    rows: IntArray  # which messages of each topic are the frames, -1 for none (N, 1 or 2)
+    size: Size  # width and height that every message's image must have
 
     @property
     def halves(self) -> bool:
         """Both images are in one topic."""
-        return self.right is self.left
+        return len(self.topics) == 1
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode the images of frames `start` to `stop`; an error in place of one that is damaged."""
-        right_rows = self.right_rows[start:stop]
-        with ExitStack() as stack:
-            bags = [stack.enter_context(open_bag(self.path)) for _ in range(2)]  # each goes its own way through it
-            left = stack.enter_context(closing(self._images(bags[0], self.left, self.left_rows[start:stop])))
-            right = stack.enter_context(closing(self._images(bags[1], self.right, right_rows[right_rows >= 0])))
-            for image, right_row in zip(left, right_rows.tolist()):
-                yield image, next(right, None) if right_row >= 0 else None
+        frames = [
+            [(m.topic, row) for m, row in zip(self.topics, rows) if row >= 0] for rows in self.rows[start:stop].tolist()
+        ]
+        wanted = {place for frame in frames for place in frame}
+        ahead: dict[tuple[str, int], Message] = {}  # read before their turn, where messages are out of order
+        since, counts = self._seek(wanted)
+        with open_bag(self.path) as bag:
+            messages = bag.messages(counts, since)
+            for frame in frames:
+                while not all(place in ahead for place in frame):
+                    message = next(messages, None)
+                    if message is None:
+                        return
+                    place = message.topic, counts[message.topic]
+                    counts[message.topic] += 1
+                    if place in wanted:
+                        ahead[place] = message
+                images = [self._image(bag, ahead.pop(place), place) for place in frame]
+                yield images[0], images[1] if len(images) > 1 else None
 
-    def _images(
-        self, bag: Bag, messages: Messages, rows: IntArray
-    ) -> Generator[np.ndarray | SequenceError, None, None]:
-        """The images of these rows of a topic; an error in place of one that is damaged."""
-        if not len(rows):
-            return
-        wanted = rows.tolist()
-        ahead: dict[int, tuple[str, bytes]] = {}  # read before their turn, where messages are out of order
-        expected, due = set(wanted), 0
-        since, first = messages.seek(min(wanted))
-        for number, (_, kind, raw) in enumerate(bag.messages([messages.topic], since), start=first):
-            if number in expected:
-                ahead[number] = kind, raw
-            while due < len(wanted) and wanted[due] in ahead:
-                kind, raw = ahead.pop(wanted[due])
-                try:
-                    yield bag.image(raw, kind, f"{messages.topic}, message {wanted[due]}", self.size)
-                except SequenceError as error:
-                    yield error
-                due += 1
-            if due == len(wanted):
-                return
+    def _seek(self, wanted: set[tuple[str, int]]) -> tuple[int | None, Counter[str]]:
+        """The time from which on to read for some messages, and each topic's first row that comes then."""
+        counts = Counter({m.topic: 0 for m in self.topics})
+        if any((np.diff(m.recorded) < 0).any() for m in self.topics):
+            return None, counts
+        recorded = {m.topic: m.recorded for m in self.topics}
+        since = min(int(recorded[topic][row]) for topic, row in wanted)
+        return since, Counter({topic: int(np.searchsorted(times, since)) for topic, times in recorded.items()})
+
+    def _image(self, bag: Bag, message: Message, place: tuple[str, int]) -> np.ndarray | SequenceError:
+        try:
+            return bag.image(message, f"{place[0]}, message {place[1]}", self.size)
+        except SequenceError as error:
+            return error
 
 
 def _in_time(topics: list[Messages], faults: FaultLog) -> list[Listing]:
@@ -158,55 +143,51 @@ def _in_time(topics: list[Messages], faults: FaultLog) -> list[Listing]:
     the left topic for both.
     """
     listings, shifts = [], list[int]()
-    for messages in topics:
-        stamps, found, start = messages.stamps.copy(), list[int](), 1
+    for topic, stamps, recorded in topics:
+        stamps, found, start = stamps.copy(), list[int](), 1
         while (row := _set_back(stamps, start)) is not None:
-            step = int(messages.recorded[row] - messages.recorded[row - 1])
-            found.append(step - int(stamps[row] - stamps[row - 1]))
+            found.append(int(recorded[row] - recorded[row - 1] - stamps[row] + stamps[row - 1]))
             shift = shifts[len(found) - 1] if len(found) <= len(shifts) else found[-1]
             stamps[row:] += shift
-            line = f"{messages.topic}: the clock was set back by {1e-9 * shift:.3f} s at message {row}"
+            line = f"{topic}: the clock was set back by {1e-9 * shift:.3f} s at message {row}"
             faults.report("clock", f"{line}; time goes on by the clock of the recording")
             start = row + 1
         shifts = shifts or found
         late = np.maximum.accumulate(stamps) - stamps
         rows = np.flatnonzero(late <= _LATEST)
         rows = rows[np.argsort(stamps[rows], kind="stable")]
-        disordered = int(((late > 0) & (late <= _LATEST)).sum())
+        disordered, wrong = int(((late > 0) & (late <= _LATEST)).sum()), len(stamps) - len(rows)
         if disordered:
-            faults.report("order", f"{messages.topic}: {disordered} messages are out of order; sorted by their stamps")
-        if len(rows) < len(stamps):
-            faults.report(
-                "stamps", f"{messages.topic}: {len(stamps) - len(rows)} of {len(stamps)} stamps run backwards; left out"
-            )
-        listing = Listing(Path(messages.topic), stamps[rows], [str(row) for row in rows.tolist()], True)
-        listings.append(in_order(listing, messages.topic, faults))
+            faults.report("order", f"{topic}: {disordered} messages are out of order; sorted by their stamps")
+        if wrong:
+            faults.report("stamps", f"{topic}: {wrong} of {len(stamps)} stamps run backwards; left out")
+        listing = Listing(Path(topic), stamps[rows], [str(row) for row in rows.tolist()], True)
+        listings.append(in_order(listing, topic, faults))
     return listings
 
 
 def _set_back(stamps: IntArray, start: int) -> int | None:
     """The first row, from `start` on, from which on a clock is behind what it was, and stays so; None for none."""
     late = stamps < np.maximum.accumulate(stamps)
-    begins = np.flatnonzero(late & ~np.concatenate([[False], late[:-1]]))
-    ends = np.flatnonzero(late & ~np.concatenate([late[1:], [False]])) + 1
-    for first, end in zip(begins.tolist(), ends.tolist()):
+    edges = np.flatnonzero(np.diff(late, prepend=False, append=False)).reshape(-1, 2)
+    for first, end in edges.tolist():
         behind, length = stamps[first - 1] - stamps[first], end - first
         # Late messages fill a gap; after a clock was set back there are messages of the same times twice.
         twice = int(((stamps[:first] >= stamps[first]) & (stamps[:first] <= stamps[end - 1])).sum())
         again = length > 1 and 2 * twice >= length
         if first >= start and (again or length > _LATE or (end == len(stamps) and behind > _LATEST)):
-            return first
+            return int(first)
     return None
 
 
-def _listing(bag: Bag, topic: str, faults: FaultLog) -> Messages:
+def _stamps(bag: Bag, topic: str, faults: FaultLog) -> Messages:
     """Stamps of all messages of a topic; where their headers hold none, when they were recorded."""
     stamps, recorded = [], []
-    for time, kind, raw in bag.messages([topic]):
-        message = bag.message(raw, kind)
+    for message in bag.messages([topic]):
+        stamp = bag.read(message)
         with naming_recording(bag.path):
-            stamps.append(int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec))
-        recorded.append(time)
+            stamps.append(int(stamp.header.stamp.sec) * 10**9 + int(stamp.header.stamp.nanosec))
+        recorded.append(message.time)
     if not stamps:
         raise SequenceError(f"{bag.path}: topic {topic} has no messages")
     if not any(stamps):
@@ -218,9 +199,9 @@ def _listing(bag: Bag, topic: str, faults: FaultLog) -> Messages:
 def _first_size(bag: Bag, topic: str) -> Size:
     """Width and height of the first image of a topic that can be read."""
     reason = "no messages"
-    for _, kind, raw in bag.messages([topic]):
+    for message in bag.messages([topic]):
         try:
-            image = bag.image(raw, kind, topic)
+            image = bag.image(message, topic)
         except SequenceError as error:
             reason = str(error)
             continue
@@ -233,10 +214,9 @@ def _rig(path: Path, topics: Topics, size: Size, options: Given) -> StereoRig:
     if "calibration" in options:
         paths = rigs.calibration_files(path if path.is_dir() else path.parent, options)
         return rigs.read_rig(paths, size, options)
-    assert topics.left_info is not None and topics.right_info is not None
     where = Path(topics.info_names)
     rectified = flag(options, "rectified") if "rectified" in options else topics.rectified
     with naming(where):
-        rig = rig_from_camera_infos(topics.left_info, topics.right_info, rectified, rigs.metres_per_unit(options))
+        rig = rig_from_camera_infos(topics.infos, rectified, rigs.metres_per_unit(options))
     require_size(size, rig, where)
     return rig

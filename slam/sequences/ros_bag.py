@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,19 +33,15 @@ _ENCODINGS: dict[str, tuple[int, int, str]] = {
     "yuyv": (8, 2, "COLOR_YUV2GRAY_YUY2"),
 }
 for _bits in (8, 16):
-    for _order, _channels in (("bgr", 3), ("rgb", 3), ("bgra", 4), ("rgba", 4)):
-        _ENCODINGS[f"{_order}{_bits}"] = (_bits, _channels, f"COLOR_{_order.upper()}2GRAY")
+    for _order in ("bgr", "rgb", "bgra", "rgba"):
+        _ENCODINGS[f"{_order}{_bits}"] = (_bits, len(_order), f"COLOR_{_order.upper()}2GRAY")
     for _order, _name in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
         _ENCODINGS[f"bayer_{_order}{_bits}"] = (_bits, 1, f"COLOR_Bayer{_name}2GRAY")
 
 
 @contextmanager
 def naming_recording(path: Path) -> Iterator[None]:
-    """Whatever goes wrong with a damaged recording as one error with its name.
-
-    Raises:
-        SequenceError: something did.
-    """
+    """Whatever goes wrong with a damaged recording as one SequenceError with its name."""
     try:
         yield
     except SlamError:
@@ -56,9 +52,7 @@ def naming_recording(path: Path) -> Iterator[None]:
 
 
 def grey_image(message: Any, kind: str, what: str, size: Size | None = None) -> np.ndarray:
-    """The image (H, W) of a message in grey, 8 or 16 bits as sent.
-
-    Sizes are checked before anything is decoded.
+    """The image (H, W) of a message in grey, 8 or 16 bits as sent; sizes are checked before anything is decoded.
 
     Args:
         message: as rosbags reads it.
@@ -94,6 +88,15 @@ def grey_image(message: Any, kind: str, what: str, size: Size | None = None) -> 
         raise SequenceError(f"{what}: cannot be decoded") from error
 
 
+class Message(NamedTuple):
+    """A message as it is recorded."""
+
+    topic: str
+    kind: str  # its type
+    time: int  # of recording [ns]
+    data: bytes
+
+
 class Bag:
     """An open recording, whatever its kind; every fault of it is a `SequenceError` with its name."""
 
@@ -101,8 +104,8 @@ class Bag:
         self.path, self._reader = path, reader
         self.kinds: dict[str, str] = {connection.topic: connection.msgtype for connection in reader.connections}
 
-    def messages(self, topics: list[str], since: int | None = None) -> Generator[tuple[int, str, bytes], None, None]:
-        """Time of recording [ns], type and bytes of all messages of some topics, from a time on."""
+    def messages(self, topics: Iterable[str], since: int | None = None) -> Generator[Message, None, None]:
+        """All messages of some topics, from a time [ns] on, in the order of recording."""
         connections = [c for c in self._reader.connections if c.topic in topics]
         messages = iter(self._reader.messages(connections, start=since)) if connections else iter(())
         while True:
@@ -110,39 +113,34 @@ class Bag:
                 found = next(messages, None)
             if found is None:
                 return
-            yield int(found[1]), found[0].msgtype, found[2]
+            yield Message(found[0].topic, found[0].msgtype, int(found[1]), found[2])
 
-    def message(self, raw: bytes, kind: str) -> Any:
-        """A message of its bytes."""
+    def read(self, message: Message) -> Any:
+        """A message as an object."""
         with naming_recording(self.path):
-            return self._reader.deserialize(raw, kind)
+            return self._reader.deserialize(message.data, message.kind)
 
-    def image(self, raw: bytes, kind: str, what: str, size: Size | None = None) -> np.ndarray:
-        """The image (H, W) of a message's bytes, see `grey_image`."""
+    def image(self, message: Message, what: str, size: Size | None = None) -> np.ndarray:
+        """The image (H, W) of a message, see `grey_image`."""
         with naming_recording(self.path):
-            return grey_image(self._reader.deserialize(raw, kind), kind, what, size)
+            return grey_image(self.read(message), message.kind, what, size)
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic; None where there is none."""
+        """The first message of a topic as an object; None where there is none."""
         with closing(self.messages([topic])) as messages:
             found = next(messages, None)
-        return None if found is None else self.message(found[2], found[1])
+        return None if found is None else self.read(found)
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a recording, and close it in the end.
-
-    Raises:
-        SequenceError: rosbags is not installed, or the recording cannot be read.
-    """
+    """Open a recording, and close it in the end; SequenceError where it cannot be read, or rosbags is missing."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise SequenceError(
-            f"{path}: ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
-        ) from None
+        line = "ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
+        raise SequenceError(f"{path}: {line}") from None
     with ExitStack() as stack:
         with naming_recording(path):
             if path.name.lower().endswith(".zstd"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,44 +18,40 @@ from slam.sequences.names import SIDES
 from slam.sequences.ros_bag import COMPRESSED, DEPTH, RAW, Bag, naming_recording
 
 _INFO = "sensor_msgs/msg/CameraInfo"
+_IMAGES = (RAW, COMPRESSED)
 _SAME_PLACE = 1e-6  # [m] from a pair's left camera
 _LISTED = 12  # topics named in a message
 
 
 @dataclass(frozen=True, eq=False)
 class CameraInfo:
-    """A CameraInfo message of ROS 1 or 2.
+    """A CameraInfo message of ROS 1 or 2."""
 
-    Attributes:
-        size: width and height [px].
-        model: name of the distortion model.
-        K: camera matrix (3, 3) of the raw image.
-        D: its distortion coefficients.
-        R: rotation (3, 3) from raw to rectified camera axes.
-        P: projection (3, 4) of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair.
-    """
-
-    size: tuple[int, int]
-    model: str
-    K: Array
-    D: Array
-    R: Array
-    P: Array
+    size: tuple[int, int]  # width and height [px]
+    model: str  # name of the distortion model
+    K: Array  # camera matrix (3, 3) of the raw image
+    D: Array  # its distortion coefficients
+    R: Array  # rotation (3, 3) from raw to rectified camera axes
+    P: Array  # projection (3, 4) of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair
 
     @classmethod
-    def of(cls, message: Any) -> CameraInfo:
-        """A message as it was read; ROS 1 writes its matrices in capitals.
+    def read(cls, recording: Bag, topic: str) -> CameraInfo:
+        """The first message of a topic, of ROS 1, which writes matrices in capitals, or 2.
 
         Raises:
-            CalibrationError: it holds what no calibration holds, or only a part of the image is given.
+            CalibrationError: there is none, it holds what no calibration holds, or only a part of the image is given.
         """
-        shapes = {"K": (3, 3), "D": None, "R": (3, 3), "P": (3, 4)}
-        matrices = {n: array(getattr(message, n, getattr(message, n.lower(), None)), n, s) for n, s in shapes.items()}
-        size = int(message.width), int(message.height)
-        roi = int(message.roi.width), int(message.roi.height)
-        if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):
-            raise CalibrationError("binning and regions of interest are not supported")
-        return cls(size, str(message.distortion_model), **matrices)
+        message = recording.first(topic)
+        if message is None:
+            raise CalibrationError(f"{recording.path}: topic {topic} has no messages")
+        with naming_recording(recording.path), naming(Path(topic)):
+            shapes = {"K": (3, 3), "D": None, "R": (3, 3), "P": (3, 4)}
+            matrices = {n: array(getattr(message, n, getattr(message, n.lower(), None)), n, s) for n, s in shapes.items()}
+            size = int(message.width), int(message.height)
+            roi = int(message.roi.width), int(message.roi.height)
+            if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):
+                raise CalibrationError("binning and regions of interest are not supported")
+            return cls(size, str(message.distortion_model), **matrices)
 
     @property
     def baseline_term(self) -> float:
@@ -63,40 +59,30 @@ class CameraInfo:
         return float(-self.P[0, 3] / self.P[0, 0]) if self.P[0, 0] > 0 else float("nan")
 
 
-def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool, unit: float = 1.0) -> StereoRig:
+def rig_from_camera_infos(infos: Sequence[CameraInfo], rectified: bool, unit: float = 1.0) -> StereoRig:
     """The rig of the rectified or of the raw images; the baseline in ``P`` is in units of so many metres.
 
     Raises:
         CalibrationError: a camera is not calibrated, or not as one of a pair; or the rig is impossible.
     """
-    for side, info in (("left", left), ("right", right)):
+    for side, info in zip(("left", "right"), infos):
         if not (info.P[0, 0] > 0 and info.K[0, 0] > 0):
             raise CalibrationError(f"the {side} camera is not calibrated: K or P is zero")
-    if left.size != right.size:
+    if infos[0].size != infos[1].size:
         raise CalibrationError("the images of the two cameras differ in size")
     names = "cameramatrix", "distcoeffs", "rectificationmatrix", "projectionmatrix", "distortionmodel", "size"
-    files = [
-        {name: (name, value) for name, value in zip(names, (i.K, i.D, i.R, i.P, i.model, i.size))}
-        for i in (left, right)
-    ]
-    return rig_of(Entries(files), left.size, unit, rectified, False)
+    files = [dict(zip(names, zip(names, (i.K, i.D, i.R, i.P, i.model, i.size)))) for i in infos]
+    return rig_of(Entries(files), infos[0].size, unit, rectified, False)
 
 
 @dataclass(frozen=True, eq=False)
 class Topics:
-    """The topics of a stereo rig.
+    """The topics of a stereo rig."""
 
-    Attributes:
-        left, right: of the images; the same where they are side by side.
-        left_info, right_info: the cameras' calibrations; None where a file is named in their place.
-        info_names: the topics of these.
-    """
-
-    left: str
+    left: str  # of the images; the same where they are side by side
     right: str
-    left_info: CameraInfo | None = None
-    right_info: CameraInfo | None = None
-    info_names: str = ""
+    infos: tuple[CameraInfo, ...] = ()  # the cameras' calibrations; none where a file is named in their place
+    info_names: str = ""  # the topics of these
 
     @property
     def rectified(self) -> bool:
@@ -116,82 +102,21 @@ def choose_topics(recording: Bag, options: Mapping[str, str]) -> Topics:
         ConfigurationError: one of the two images is named and the other is not.
     """
     if layout_of(options) is not None:
-        return _both_in_one(recording, options)
+        images = [topic for topic in _of_kind(recording, _IMAGES) if not _is_depth(recording, topic)]
+        if "left" not in options and len(images) != 1:
+            there = f"{len(images)} topics of images, where layout=sbs needs one"
+            raise SequenceError(f"{recording.path}: {there}: add left=/… of {_listed(images)}")
+        topic = _named(recording, options["left"], _IMAGES) if "left" in options else images[0]
+        return _with_infos(recording, (topic, topic), options)
     if ("left" in options) != ("right" in options):
         raise ConfigurationError("name both topics: left=/…&right=/…")
     if "left" in options:
-        left, right = (_named(recording, options[side], (RAW, COMPRESSED)) for side in ("left", "right"))
-        return Topics(left, right) if "calibration" in options else _with_infos(recording, left, right, options)
-    if "calibration" in options:
-        return _one([Topics(*pair) for pair in _pairs_by_name(recording)], recording)
-    return _one(list(_pairs_by_messages(recording)), recording)
-
-
-def _both_in_one(recording: Bag, options: Mapping[str, str]) -> Topics:
-    """The topic whose images hold both cameras side by side: the one that is named, or the only one."""
-    images = [topic for topic in _of_kind(recording, (RAW, COMPRESSED)) if not _is_depth(recording, topic)]
-    if "left" not in options and len(images) != 1:
-        there = f"{len(images)} topics of images, where layout=sbs needs one"
-        raise SequenceError(f"{recording.path}: {there}: add left=/… of {_listed(images)}")
-    topic = _named(recording, options["left"], (RAW, COMPRESSED)) if "left" in options else images[0]
-    return Topics(topic, topic) if "calibration" in options else _with_infos(recording, topic, topic, options)
-
-
-def _with_infos(recording: Bag, left: str, right: str, options: Mapping[str, str]) -> Topics:
-    """Named images with their cameras' messages, named or in the same name space."""
-    names = []
-    for side, topic in (("left", left), ("right", right)):
-        usual = f"{_space(topic)}/camera_info"
-        if f"{side}_info" in options:
-            names.append(_named(recording, options[f"{side}_info"], (_INFO,)))
-        elif recording.kinds.get(usual) == _INFO:
-            names.append(usual)
-        else:
-            known = _listed(_of_kind(recording, (_INFO,)))
-            raise CalibrationError(
-                f"{recording.path}: no {usual} for {topic}: add {side}_info=/… (there are {known}) or calibration=FILE"
-            )
-    infos = [_info(recording, name) for name in names]
-    return Topics(left, right, infos[0], infos[1], " and ".join(names))
-
-
-def _pairs_by_messages(recording: Bag) -> Iterator[Topics]:
-    """All pairs of cameras that say that they are one."""
-    cameras = []
-    for name in _of_kind(recording, (_INFO,)):
-        images = [t for t in _of_kind(recording, (RAW, COMPRESSED)) if _space(t) == _space(name)]
-        images = sorted((t for t in images if not _is_depth(recording, t)), key=_preference(recording))
-        if images and recording.first(name) is not None:
-            cameras.append((images[0], name, _info(recording, name)))
-    for left, left_name, a in cameras:
-        for right, right_name, b in cameras:
-            same = a.size == b.size and a.P[0, 0] == b.P[0, 0]
-            if same and abs(a.baseline_term) < _SAME_PLACE and b.baseline_term > _SAME_PLACE:
-                yield Topics(left, right, a, b, f"{left_name} and {right_name}")
-
-
-def _pairs_by_name(recording: Bag) -> list[tuple[str, str]]:
-    """Pairs of topics of images that differ in one of the usual names for left and right, one of each two cameras."""
-    images = sorted(_of_kind(recording, (RAW, COMPRESSED)), key=_preference(recording))
-    found: dict[tuple[str, str], tuple[str, str]] = {}
-    for topic in images:
-        for names in SIDES:
-            other = topic.replace(*names)
-            if other != topic and other in images and not _is_depth(recording, topic):
-                spaces = _space(topic), _space(other)
-                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), (topic, other))
-    return list(found.values())
-
-
-def _one(pairs: list[Topics], recording: Bag) -> Topics:
-    """The only pair.
-
-    Raises:
-        SequenceError: there is none, or there are several.
-    """
+        named = _named(recording, options["left"], _IMAGES), _named(recording, options["right"], _IMAGES)
+        return _with_infos(recording, named, options)
+    pairs = list(_pairs_by_name(recording) if "calibration" in options else _pairs_by_messages(recording))
     if len(pairs) == 1:
         return pairs[0]
-    images = _of_kind(recording, (RAW, COMPRESSED))
+    images = _of_kind(recording, _IMAGES)
     if pairs:
         found = "; ".join(f"left={pair.left}&right={pair.right}" for pair in pairs[:3])
         raise SequenceError(f"{recording.path}: several stereo pairs, choose one: {found}")
@@ -203,6 +128,50 @@ def _one(pairs: list[Topics], recording: Bag) -> Topics:
     )
 
 
+def _with_infos(recording: Bag, images: tuple[str, str], options: Mapping[str, str]) -> Topics:
+    """Images with their cameras' messages, named or in the same name space, unless a calibration is named."""
+    names = []
+    for side, topic in zip(("left", "right"), () if "calibration" in options else images):
+        usual = f"{_space(topic)}/camera_info"
+        if f"{side}_info" in options:
+            names.append(_named(recording, options[f"{side}_info"], (_INFO,)))
+        elif recording.kinds.get(usual) == _INFO:
+            names.append(usual)
+        else:
+            known = _listed(_of_kind(recording, (_INFO,)))
+            raise CalibrationError(
+                f"{recording.path}: no {usual} for {topic}: add {side}_info=/… (there are {known}) or calibration=FILE"
+            )
+    return Topics(*images, tuple(CameraInfo.read(recording, name) for name in names), " and ".join(names))
+
+
+def _pairs_by_messages(recording: Bag) -> Iterator[Topics]:
+    """All pairs of cameras that say that they are one."""
+    cameras = []
+    for name in _of_kind(recording, (_INFO,)):
+        images = [t for t in _preferred(recording) if _space(t) == _space(name) and not _is_depth(recording, t)]
+        if images and recording.first(name) is not None:
+            cameras.append((images[0], name, CameraInfo.read(recording, name)))
+    for left, left_name, a in cameras:
+        for right, right_name, b in cameras:
+            same = a.size == b.size and a.P[0, 0] == b.P[0, 0]
+            if same and abs(a.baseline_term) < _SAME_PLACE and b.baseline_term > _SAME_PLACE:
+                yield Topics(left, right, (a, b), f"{left_name} and {right_name}")
+
+
+def _pairs_by_name(recording: Bag) -> list[Topics]:
+    """Pairs of topics of images that differ in one of the usual names for left and right, one of each two cameras."""
+    images = _preferred(recording)
+    found: dict[tuple[str, str], Topics] = {}
+    for topic in images:
+        for names in SIDES:
+            other = topic.replace(*names)
+            if other != topic and other in images and not _is_depth(recording, topic):
+                spaces = _space(topic), _space(other)
+                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), Topics(topic, other))
+    return list(found.values())
+
+
 def _named(recording: Bag, topic: str, kinds: tuple[str, ...]) -> str:
     """A topic that must be there, and of one of these types."""
     known = _of_kind(recording, kinds)
@@ -211,14 +180,6 @@ def _named(recording: Bag, topic: str, kinds: tuple[str, ...]) -> str:
         hint = suggestion(topic, known)
         raise SequenceError(f"{recording.path}: topic {topic}: {there}{hint}; there are {_listed(known)}")
     return topic
-
-
-def _info(recording: Bag, topic: str) -> CameraInfo:
-    message = recording.first(topic)
-    if message is None:
-        raise CalibrationError(f"{recording.path}: topic {topic} has no messages")
-    with naming_recording(recording.path), naming(Path(topic)):
-        return CameraInfo.of(message)
 
 
 def _of_kind(recording: Bag, kinds: tuple[str, ...]) -> list[str]:
@@ -234,14 +195,14 @@ def _is_depth(recording: Bag, topic: str) -> bool:
         return message.encoding in DEPTH
 
 
-def _preference(recording: Bag) -> Any:
-    """The order in which a camera's topics are chosen: rectified, raw before compressed, grey before colour."""
+def _preferred(recording: Bag) -> list[str]:
+    """Topics of images in the order in which they are chosen: rectified, raw before compressed, grey before colour."""
 
-    def key(topic: str) -> tuple[bool, bool, bool, str]:
+    def key(topic: str) -> Any:
         name = _base(topic).rpartition("/")[2]
-        return "rect" not in name, recording.kinds[topic] == COMPRESSED, "color" in name, topic
+        return "rect" not in name, recording.kinds[topic] == COMPRESSED, "color" in name
 
-    return key
+    return sorted(_of_kind(recording, _IMAGES), key=key)
 
 
 def _base(topic: str) -> str:
