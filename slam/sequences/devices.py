@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -29,31 +29,13 @@ def quiet_libraries() -> Iterator[None]:
         logging.setLogLevel(before)
 
 
-class Device(Protocol):
-    """What a camera is asked for; ``cv2.VideoCapture`` is one."""
-
-    def grab(self) -> bool:
-        """Take the next image as soon as there is one; False where none comes."""
-        ...
-
-    def retrieve(self) -> tuple[bool, Any]:
-        """Whether there is a grabbed image, and the image (H, W) or (H, W, 3)."""
-        ...
-
-    def release(self) -> None:
-        """Close the camera."""
-        ...
-
-
-def open_device(address: str, width: int | None = None, height: int | None = None, fps: float | None = None) -> Device:
-    """Open a camera.
+def open_device(address: str, width: int | None = None, height: int | None = None, fps: float | None = None) -> Any:
+    """Open a camera as a ``cv2.VideoCapture``.
 
     Args:
         address: a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address
             of a network.
-        width: asked of the camera [px]; None for its own choice.
-        height: the same.
-        fps: the same [1/s].
+        width, height, fps: asked of the camera [px], [1/s]; None for its own choice.
 
     Raises:
         SequenceError: it cannot be opened, or is a file.
@@ -83,7 +65,7 @@ def open_device(address: str, width: int | None = None, height: int | None = Non
     return capture
 
 
-def read_image(device: Device) -> np.ndarray | None:
+def read_image(device: Any) -> np.ndarray | None:
     """The grabbed image in grey (H, W), as stored in 8 or 16 bits; None where there is none."""
     import cv2
 

@@ -25,7 +25,6 @@ from slam.sequences.source import (
     pair_up,
     present,
     read_times,
-    times_file,
 )
 from slam.sequences.tables import numbers, read_rows, shorten, stamp_and_name
 from slam.sequences.truth import LARGEST, require_truth
@@ -55,8 +54,7 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
     warnings: list[str] = []
     with FaultLog(warnings) as faults:
         left, right = _listings(root, faults)
-        path = times_file(folder, options)
-        _, source = pair_up(left, right, options, faults, read_times(path, faults))
+        _, source = pair_up(left, right, options, faults, read_times(folder, options, faults))
         own, missing = _calibration(root), f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing"
         missing += " (nor is there a Kalibr camchain.yaml): add calibration=FILE"
         named = "calibration" in options or not own

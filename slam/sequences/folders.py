@@ -14,7 +14,7 @@ from slam.sequences.given import Given, layout_of
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.names import SIDES, of_sides
 from slam.sequences.rigs import calibration_files, read_rig
-from slam.sequences.source import ImagePairs, by_names, image_names, pair_up, read_times, times_file
+from slam.sequences.source import ImagePairs, by_names, image_names, pair_up, read_times
 from slam.sequences.videos import VIDEO_SUFFIXES, VideoPairs, open_videos
 
 _NAMES = (*SIDES, ("image_left", "image_right"))
@@ -53,9 +53,8 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
         if left.names is None:
             source = open_videos(left.path, None if right is None else right.path, options.rate(), faults)
         else:
-            path = times_file(home, options, *(home / name for name in _TIMES))
             listings = by_names([s.path for s in sides], [s.names or [] for s in sides], faults)
-            times = read_times(path, faults)
+            times = read_times(home, options, faults, *(home / name for name in _TIMES))
             _, source = pair_up(listings[0], listings[1] if right else None, options, faults, times)
         rig = read_rig(calibration_files(home, options), source.size, options)
     return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, source, warnings=warnings)

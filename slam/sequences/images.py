@@ -13,6 +13,7 @@ import numpy as np
 
 from slam.errors import SequenceError, one_line
 from slam.files import read_bytes
+from slam.geometry.rig import StereoRig
 
 Size = tuple[int, int]
 
@@ -109,6 +110,11 @@ def require_image_size(found: Size, expected: Size | None, what: str) -> None:
         raise SequenceError(f"{what}: image is {size_text(found)}, not {size_text(expected)}")
     if min(found) < 1 or found[0] * found[1] > MOST_PIXELS:
         raise SequenceError(f"{what}: image is {size_text(found)}: at most {MOST_PIXELS} pixels are read")
+
+
+def recorded_size(rig: StereoRig) -> Size:
+    """Width and height of a rig's images as they are recorded, before they are turned."""
+    return (rig.height, rig.width) if rig.turns % 2 else (rig.width, rig.height)
 
 
 def require_same_size(left: tuple[int, ...], right: tuple[int, ...], *names: object) -> None:

@@ -20,7 +20,7 @@ from slam.sequences.given import Given
 from slam.sequences.images import Size, size_text
 from slam.sequences.kitti_truth import Frames, drive_truth, read_gps, read_poses
 from slam.sequences.rigs import calibration_files, read_rig
-from slam.sequences.source import numbered, pair_up, read_times, times_file
+from slam.sequences.source import numbered, pair_up, read_times
 from slam.sequences.tables import date_time, read_rows
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 2 cm, 0.03° in roll and pitch, and 0.1°
@@ -87,9 +87,8 @@ def _open(folder: Path, where: Layout, options: Given) -> RecordedSequence:
     warnings: list[str] = []
     with FaultLog(warnings) as faults:
         listings = [numbered(side, faults) for side in (where.left, where.right)]
-        path = times_file(folder, options, where.times)
-        dated = path is not None and where.drive is not None and "times" not in options
-        origin, times = _dates(path, faults) if path and dated else (None, read_times(path, faults))
+        dated = where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options)
+        origin, times = _dates(where.times, faults) if dated else (None, read_times(folder, options, faults, where.times))
         left, source = pair_up(listings[0], listings[1], options, faults, times, by_number=True)
         assert source.size is not None
         rig, T_left_reference = _rig(folder, where, source.size, options)

@@ -120,22 +120,19 @@ class LiveFrames:
                     origin = now - frame.stamp if origin is None else origin
                     late = max(0.0, now - (origin + frame.stamp))
                     origin, self.clock_waited = origin + late, self.clock_waited + late
-                    self._wait_until(origin + frame.stamp)
-                if self._closed or self._until.is_set():
+                    while (rest := origin + frame.stamp - time.monotonic()) > 0 and not self._ending():
+                        time.sleep(min(rest, _LOOK))
+                if self._ending():
                     break
-                self._put(frame)
+                with self._changed:
+                    self.dropped += self._newest is not None
+                    self._newest, self._since = frame, time.monotonic()
+                    self._changed.notify_all()
         finally:
             close = getattr(frames, "close", None)
             if close is not None:
                 close()  # a camera is released in the thread that reads it
 
-    def _wait_until(self, due: float) -> None:
-        """Wait for a time of the clock, or for the end."""
-        while (rest := due - time.monotonic()) > 0 and not (self._closed or self._until.is_set()):
-            time.sleep(min(rest, _LOOK))
-
-    def _put(self, frame: StereoFrame) -> None:
-        with self._changed:
-            self.dropped += self._newest is not None
-            self._newest, self._since = frame, time.monotonic()
-            self._changed.notify_all()
+    def _ending(self) -> bool:
+        """Whether nobody takes frames any more."""
+        return self._closed or self._until.is_set()

@@ -16,7 +16,9 @@ from slam.geometry.stamps import IntArray, increasing, pair, trim
 from slam.sequences.base import Images
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import WIDEST_TOLERANCE, Given
-from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, require_same_size, size_text
+from slam.sequences.images import (
+    IMAGE_SUFFIXES, Size, halves, read_image, recorded_size, require_same_size, size_text,
+)  # fmt: skip
 from slam.sequences.names import MOST_FRAMES, keys_of, natural, same_order, stem
 from slam.sequences.tables import read_rows, seconds
 
@@ -29,19 +31,12 @@ RATE = 10.0
 
 @dataclass(frozen=True)
 class Listing:
-    """The images of one camera, in order of time.
-
-    Attributes:
-        folder: where they are.
-        keys: what pairs them with the other camera's (N,), strictly increasing: stamps [ns] or frame numbers.
-        names: their file names, N of them.
-        stamped: the keys are stamps.
-    """
+    """The images of one camera, in order of time."""
 
     folder: Path
-    keys: IntArray
-    names: list[str]
-    stamped: bool = False
+    keys: IntArray  # what pairs them with the other camera's (N,), increasing: stamps [ns] or frame numbers
+    names: list[str]  # their file names, N of them
+    stamped: bool = False  # the keys are stamps
 
     def __len__(self) -> int:
         return len(self.names)
@@ -54,23 +49,15 @@ class Listing:
 
 @dataclass(frozen=True, eq=False)
 class ImagePairs:
-    """A frame source: two folders of image files, already paired.
+    """A frame source: two folders of image files, already paired."""
 
-    Attributes:
-        stamps: times (N,) [s], strictly increasing.
-        left_folder, left: where the left images are, and their file names (N).
-        right_folder, right: the same for the right ones; None where there is no right image.
-        size: width and height that every image must have; None while it is not known yet.
-        halves: both images are in the left file, side by side; there are no others.
-    """
-
-    stamps: Array
+    stamps: Array  # times (N,) [s], strictly increasing
     left_folder: Path
-    left: list[str]
+    left: list[str]  # file names (N)
     right_folder: Path
-    right: list[str | None]
-    size: Size | None = None
-    halves: bool = False
+    right: list[str | None]  # None where there is no right image
+    size: Size | None = None  # width and height that every image must have; None while it is not known yet
+    halves: bool = False  # both images are in the left file, side by side; there are no others
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode the images of frames `start` to `stop`; an error in place of one that is unreadable."""
@@ -86,11 +73,7 @@ class ImagePairs:
             return error
 
     def first_size(self) -> Size:
-        """Width and height of the first pair of images that can be read.
-
-        Raises:
-            SequenceError: no pair can be read, or the two images of the first one differ in size.
-        """
+        """Width and height of the first pair that can be read; SequenceError for none, or where the two differ."""
         reason = "no frame has two images"
         for left_name, right_name in zip(self.left, self.right):
             if right_name is None:
@@ -108,22 +91,14 @@ class ImagePairs:
 
 
 def require_size(size: Size, rig: StereoRig, calibration: Path) -> None:
-    """Raise where images, as recorded, are not of the calibration's size.
-
-    Raises:
-        SequenceError: they are not.
-    """
-    expected = (rig.height, rig.width) if rig.turns % 2 else (rig.width, rig.height)
+    """Raise SequenceError where images, as recorded, are not of the calibration's size."""
+    expected = recorded_size(rig)
     if size != expected:
         raise SequenceError(f"images are {size_text(size)}, but {calibration} is for {size_text(expected)}")
 
 
 def image_names(folder: Path) -> list[str]:
-    """Names of the image files in a folder, sorted as people count.
-
-    Raises:
-        SequenceError: there is no such folder, or it is a file.
-    """
+    """Names of the image files in a folder, sorted as people count; SequenceError where it is none."""
     try:
         with os.scandir(folder) as entries:
             names = [e.name for e in entries if not e.name.startswith(".")]
@@ -136,11 +111,7 @@ def image_names(folder: Path) -> list[str]:
 
 
 def numbered(folder: Path, faults: FaultLog) -> Listing:
-    """The images of a folder whose names are numbers (``000017.png``); gaps are reported, other files ignored.
-
-    Raises:
-        SequenceError: see `image_names`; or no image has a number for a name.
-    """
+    """The images of a folder whose names are numbers (``000017.png``); gaps are reported, other files ignored."""
     by_number: dict[int, str] = {}
     for name in image_names(folder):
         number = number_of(name)
@@ -159,10 +130,7 @@ def numbered(folder: Path, faults: FaultLog) -> Listing:
 def number_of(name: str) -> int | None:
     """The number that is the name of a file without its ending, in 64 bits; None where it is none."""
     text = stem(name)
-    if not (text.isascii() and text.isdecimal()):
-        return None
-    number = int(text)
-    return number if number < 2**63 else None
+    return int(text) if text.isascii() and text.isdecimal() and int(text) < 2**63 else None
 
 
 def by_names(folders: list[Path], names: list[list[str]], faults: FaultLog) -> list[Listing]:
@@ -177,9 +145,8 @@ def by_names(folders: list[Path], names: list[list[str]], faults: FaultLog) -> l
             counts = " and ".join(f"{folder} has {len(own)} images" for folder, own in zip(folders, names))
             raise SequenceError(f"{counts}: neither stamps nor numbers in their names say which go together")
         names = [sorted(own, key=natural) for own in names]
-        found = [np.arange(len(own)) for own in names], False, ""
-        if len(names) > 1 and not same_order(names):
-            found = *found[:2], "neither stamps nor numbers in the names say which images go together: their order does"
+        guess = "neither stamps nor numbers in the names say which images go together: their order does"
+        found = [np.arange(len(own)) for own in names], False, "" if same_order(names) else guess
     keys, stamped, guess = found
     if guess:
         faults.assume(f"{folders[0]}: {guess}")
@@ -191,15 +158,15 @@ def by_names(folders: list[Path], names: list[list[str]], faults: FaultLog) -> l
     return listings
 
 
-def times_file(folder: Path, options: Given, *usual: Path) -> Path | None:
-    """The file of times, by option or by convention; None where ``fps`` is given in its place."""
+def read_times(folder: Path, options: Given, faults: FaultLog, *usual: Path) -> tuple[Path, Array] | None:
+    """The file of times, by option or by convention, and the times in it by row [s], NaN for unreadable ones.
+
+    None where there is no file, or ``fps`` is given in its place.
+    """
     if "times" in options:
-        return folder / expanded(options["times"])
-    return None if "fps" in options else next((path for path in usual if path.is_file()), None)
-
-
-def read_times(path: Path | None, faults: FaultLog) -> tuple[Path, Array] | None:
-    """A file and the times in it by row [s], NaN for unreadable ones; None where there is no file."""
+        path: Path | None = folder / expanded(options["times"])
+    else:
+        path = None if "fps" in options else next((path for path in usual if path.is_file()), None)
     if path is None:
         return None
     return path, np.array([np.nan if row is None else row for row in read_rows(path, seconds, faults)])
@@ -234,16 +201,15 @@ def pair_up(
     rate = None if times else options.rate()
     kept, partners = left, list[str | None](left.names)
     if right is not None:
-        told = bool(times or rate)
         wanted = options.tolerance() if left.stamped else 0
-        tolerance = hardware_tolerance(left, told) if wanted is None else wanted
+        tolerance = hardware_tolerance(left, bool(times or rate)) if wanted is None else wanted
         kept, partners = pair_listings(left, right, tolerance, faults)
     position = np.searchsorted(left.keys, kept.keys)
     if times is not None:
         path, rows = times
         if not by_number and len(rows) != len(left):
             faults.report("stamps", f"{path} has {len(rows)} rows, {left.folder} has {len(left)} images")
-        keep, stamps = stamped(kept.keys if by_number else position, rows, path, faults)
+        keep, stamps = _stamped(kept.keys if by_number else position, rows, path, faults)
         kept, partners = kept.select(keep), [partners[i] for i in keep]
     elif left.stamped and rate is None:
         kept, partners, stamps = in_seconds(kept, partners, faults)
@@ -269,11 +235,7 @@ def in_seconds(
 
 
 def in_order(listing: Listing, what: str, faults: FaultLog) -> Listing:
-    """The rows of a listing whose keys increase; rows that stand twice or run backwards are reported.
-
-    Raises:
-        SequenceError: most rows are out of order.
-    """
+    """The rows whose keys increase; others, that stand twice or run backwards, are reported, or an error if most."""
     rows = increasing(listing.keys)
     dropped = np.setdiff1d(np.arange(len(listing)), rows)
     if len(dropped):
@@ -286,11 +248,7 @@ def in_order(listing: Listing, what: str, faults: FaultLog) -> Listing:
 
 
 def present(listing: Listing, what: str, faults: FaultLog) -> Listing:
-    """The listed images that exist; another ending (``.jpg`` for ``.png``) is accepted. The rest is reported.
-
-    Raises:
-        SequenceError: none exists; or see `image_names`.
-    """
+    """The listed images that exist; another ending (``.jpg`` for ``.png``) is accepted. The rest is reported."""
     known = {name: name for name in image_names(listing.folder)}
     by_stem = {stem(name): name for name in known}
     names = [known.get(n) or by_stem.get(stem(n), "") for n in listing.names]
@@ -311,28 +269,23 @@ def hardware_tolerance(listing: Listing, told: bool = False) -> int:
     return int(0.98 * half if told else min(TOLERANCE, half))
 
 
-def stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:
-    """Rows and stamps of the frames that have a time; `times` (T,) is by frame number, NaN where it has none.
-
-    Raises:
-        SequenceError: no frame, or hardly one, has a time of its own.
-    """
+def _stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:
+    """Rows and stamps of the frames that have a time, which most must; `times` (T,) is by frame number, NaN for none."""
     inside = numbers < len(times)
     stamps = np.where(inside, times[np.minimum(numbers, len(times) - 1)], np.nan)
     good = np.flatnonzero(np.isfinite(stamps))
     keep = good[increasing(stamps[good])] if len(good) else good
     untimed, unordered = len(numbers) - len(good), len(good) - len(keep)
     if 2 * len(keep) < len(numbers):
-        raise SequenceError(
-            f"{path}: of {len(numbers)} images {untimed} have no time and {unordered} one that does not increase"
-        )
-    surplus = len(times) - int(numbers[-1]) - 1
-    if surplus > 0:
-        faults.report("stamps", f"{path}: the last {surplus} rows have no image")
-    if untimed:
-        faults.report("stamps", f"{path}: {untimed} images have no time; left out")
-    if unordered:
-        faults.report("stamps", f"{path}: {unordered} times stand twice or run backwards; images left out")
+        what = f"{untimed} have no time and {unordered} one that does not increase"
+        raise SequenceError(f"{path}: of {len(numbers)} images {what}")
+    for count, what in (
+        (len(times) - int(numbers[-1]) - 1, "the last {} rows have no image"),
+        (untimed, "{} images have no time; left out"),
+        (unordered, "{} times stand twice or run backwards; images left out"),
+    ):
+        if count > 0:
+            faults.report("stamps", f"{path}: {what.format(count)}")
     return keep, stamps[keep]
 
 
@@ -349,30 +302,27 @@ def pair_listings(left: Listing, right: Listing, tolerance: int, faults: FaultLo
     rows = trim(partner)
     if rows.stop == 0:
         raise SequenceError(_no_pair(left, right, tolerance))
-    head, tail = rows.start, len(left) - rows.stop
+    head, tail, unused = rows.start, len(left) - rows.stop, len(right) - int((partner >= 0).sum())
     if head or tail:
         line = f"{left.folder}: {head} images before the first pair and {tail} after the last are left out"
         faults.report("pairs", line)
-    alone = int((partner[rows] < 0).sum())
-    if alone:
-        first = left.names[int(np.flatnonzero(partner[rows] < 0)[0]) + rows.start]
-        line = f"{left.folder}: {alone} images have no partner in {right.folder} (first: {first})"
+    alone = np.flatnonzero(partner[rows] < 0)
+    if len(alone):
+        first = left.names[int(alone[0]) + rows.start]
+        line = f"{left.folder}: {len(alone)} images have no partner in {right.folder} (first: {first})"
         faults.report("pairs", f"{line}; given without a right image")
-    unused = len(right) - int((partner >= 0).sum())
     if unused:
         faults.report("pairs", f"{right.folder}: {unused} images have no partner in {left.folder}; left out")
-    names = [right.names[i] if i >= 0 else None for i in partner[rows]]
-    return left.select(rows), names
+    return left.select(rows), [right.names[i] if i >= 0 else None for i in partner[rows]]
 
 
 def _no_pair(left: Listing, right: Listing, tolerance: int) -> str:
     """Why nothing pairs, with how far the nearest two images are apart."""
     after = np.searchsorted(right.keys, left.keys).clip(0, len(right) - 1)
-    before = (after - 1).clip(0)
-    gaps = np.minimum(np.abs(right.keys[after] - left.keys), np.abs(right.keys[before] - left.keys))
+    gap = np.minimum(*(np.abs(right.keys[rows] - left.keys) for rows in (after, (after - 1).clip(0)))).min()
     line = f"no image of {left.folder} has a partner in {right.folder}: the nearest two are "
     if not left.stamped:
-        return f"{line}{gaps.min()} frames apart"
-    line += f"{1e-6 * gaps.min():.6g} ms apart, {1e-6 * tolerance:.6g} ms are allowed"
-    enough = gaps.min() <= WIDEST_TOLERANCE * 1e9
+        return f"{line}{gap} frames apart"
+    line += f"{1e-6 * gap:.6g} ms apart, {1e-6 * tolerance:.6g} ms are allowed"
+    enough = gap <= WIDEST_TOLERANCE * 1e9
     return f"{line}; see tolerance=… [s]" if enough else f"{line}: the clocks of the cameras differ"

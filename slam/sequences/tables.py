@@ -19,9 +19,8 @@ T = TypeVar("T")
 MOST_NANOSECONDS = 2**63 - 1
 
 _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
-
 _EARLIEST, _LATEST = 1e8, 1e10  # of a likely time since 1970 [s]: 1973 to 2286
-
+_UNITS = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
 _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
 
 
@@ -35,10 +34,9 @@ def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T
         SequenceError: the file cannot be read or holds no row, or more than half of its rows are refused (the
             message names the first of them).
     """
-    text = read_text(path)
     rows: list[T | None] = []
     refused: list[str] = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         content = line.strip()
         if not content or content.startswith("#"):
             continue
@@ -65,26 +63,9 @@ def seconds(text: str) -> float:
     if not np.isfinite(value):
         raise ValueError(f"{shorten(text)} is not a finite time")
     if abs(value) > _MOST_SECONDS:
-        raise ValueError(f"{shorten(text)} is no possible time in seconds{_other_unit(abs(value))}")
-    return value
-
-
-def _other_unit(value: float) -> str:
-    """A hint where a number is a likely time since 1970 in a smaller unit; else empty."""
-    for unit, size in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
-        if _EARLIEST <= value / size <= _LATEST:
-            return f" (is it in {unit}?): give it in seconds"
-    return ""
-
-
-def nanoseconds(text: str) -> int:
-    """A whole number of nanoseconds."""
-    try:
-        value = int(text)
-    except ValueError:
-        raise ValueError(f"{shorten(text)} is not a time in whole nanoseconds") from None
-    if not 0 <= value <= MOST_NANOSECONDS:
-        raise ValueError(f"{shorten(text)} is no possible time in nanoseconds")
+        unit = next((unit for unit, size in _UNITS if _EARLIEST <= abs(value) / size <= _LATEST), None)
+        hint = f" (is it in {unit}?): give it in seconds" if unit else ""
+        raise ValueError(f"{shorten(text)} is no possible time in seconds{hint}")
     return value
 
 
@@ -112,10 +93,14 @@ def numbers(text: str, count: int, what: str, separator: str | None = None, exac
 
 def stamp_and_name(text: str) -> tuple[int, str]:
     """A row of EuRoC's ``data.csv``: nanoseconds and file name; the name defaults to the stamp."""
-    first, _, rest = text.partition(",")
-    stamp = nanoseconds(first.strip())
-    name = rest.split(",")[0].strip()
-    return stamp, name or f"{first.strip()}.png"
+    stamp, name = (cell.strip() for cell in f"{text},".split(",")[:2])
+    try:
+        value = int(stamp)
+    except ValueError:
+        raise ValueError(f"{shorten(stamp)} is not a time in whole nanoseconds") from None
+    if not 0 <= value <= MOST_NANOSECONDS:
+        raise ValueError(f"{shorten(stamp)} is no possible time in nanoseconds")
+    return value, name or f"{stamp}.png"
 
 
 def shorten(text: str, length: int = 40) -> str:

@@ -27,18 +27,12 @@ _MOST_FRAMES = 10_000_000  # of a video, four days of it: what a header says may
 
 @dataclass(frozen=True, eq=False)
 class VideoPairs:
-    """A frame source: two videos.
+    """A frame source: two videos."""
 
-    Attributes:
-        stamps: times (N,) [s]: frame number by frame rate.
-        left, right: the files; right is None where the left one has both images side by side.
-        size: width and height of the frames.
-    """
-
-    stamps: Array
+    stamps: Array  # times (N,) [s]: frame number by frame rate
     left: Path
-    right: Path | None
-    size: Size
+    right: Path | None  # None where the left one has both images side by side
+    size: Size  # width and height of the frames
 
     @property
     def halves(self) -> bool:
@@ -92,11 +86,7 @@ def open_videos(left: Path, right: Path | None, rate: float | None, faults: Faul
 
 @contextmanager
 def open_video(path: Path) -> Iterator[Any]:
-    """A ``cv2.VideoCapture``, released in the end.
-
-    Raises:
-        SequenceError: the file is no readable video.
-    """
+    """A ``cv2.VideoCapture``, released in the end; SequenceError where the file is no readable video."""
     import cv2
 
     require_content(path)  # a pipe would be waited for
