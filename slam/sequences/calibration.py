@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from slam.errors import CalibrationError
+from slam.files import read_text
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.sequences.yaml_files import read_calibration
 
+#: What making an array of numbers raises where the values are none: text, ragged lists, numbers of 400 digits.
+NO_NUMBERS = (ValueError, TypeError, OverflowError)
 
-def rig_from_transform(left: PinholeCamera, right: PinholeCamera, T_right_left: Array) -> StereoRig:
-    """The rig with ``b = Rᵀ t``, since ``h_right = R (h_left + b)`` (paper A, Eq. 6)."""
-    R, t = T_right_left[:3, :3], T_right_left[:3, 3]
-    return StereoRig.side_by_side(left, right, R, R.T @ t)
+_MOST = 1e9  # numbers of a calibration are smaller than this; larger ones overflow in what is made of them
+_LIMIT = 4 * 2**20  # most bytes of a file: OpenCV's sample programs keep all corners of all images in it
 
 
 @contextmanager
@@ -31,11 +31,11 @@ def naming(path: Path) -> Iterator[None]:
         raise CalibrationError(f"{path}: {error}") from error
 
 
-#: What making an array of numbers raises where the values are none: text, ragged lists, numbers of 400 digits.
-NO_NUMBERS = (ValueError, TypeError, OverflowError)
-
-#: Numbers of a calibration are smaller than this; larger ones overflow in what is made of them.
-_MOST = 1e9
+def read_calibration(path: Path) -> str:
+    """A calibration file's text; CalibrationError where it is missing, cannot be read, or is too large for one."""
+    if not path.exists():
+        raise CalibrationError(f"{path}: the calibration is missing")
+    return read_text(path, _LIMIT, CalibrationError)
 
 
 def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
@@ -59,18 +59,11 @@ def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
 
 
 def rigid(T: Array, name: str) -> Array:
-    """The rigid motion (4, 4).
-
-    Raises:
-        CalibrationError: its rotation is none.
-    """
+    """The rigid motion (4, 4); CalibrationError where its rotation is none."""
     R = T[:3, :3]
     if np.abs(R).max() > 1.01 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise CalibrationError(f"{name} is not a rigid motion: its rotation is {R.tolist()}")
     return T
-
-
-# ------------------------------------------------------------------------------------------------ KITTI
 
 
 def read_kitti(path: Path) -> dict[str, Array]:

@@ -7,7 +7,6 @@ other. `_SPELLINGS` has the names; `rig_of` does not care whose they are.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,7 @@ from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, pose, so3_exp
-from slam.sequences.calibration import (
-    array,
-    projection_offset,
-    rig_from_projections,
-    rig_from_transform,
-    rigid,
-)
+from slam.sequences.calibration import array, projection_offset, rig_from_projections, rigid
 from slam.sequences.calibration_forms import read_form
 from slam.sequences.images import Size
 
@@ -52,10 +45,12 @@ _FISHEYE = ("equidistant", "fisheye", "kannalabrandt8", "kannalabrandt")
 _PINHOLE = ("", "none", "radialtangential", "radtan", "plumbbob", "rationalpolynomial", "pinhole", "perspective",
             "rectified")  # fmt: skip
 _OF_ONE = ("tbs", "cameramatrix", "projectionmatrix")  # names that a file of one camera has
+_FROM_ZERO = ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx")  # one of these: cameras are counted from 0
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PLAIN = ("fx", "fy", "cx", "cy")
 
-#: Whose a form is, by entries that only it has, and which options go with it.
+#: Whose a form is, by entries that only it has, which options go with it, and what it calls the two cameras and how
+#: they stand to each other, if not K1, K2 and T.
 _FORMS = (
     ("Kalibr's", ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel"), ()),
     ("EuRoC's", ("lefttbs",), ()),
@@ -63,7 +58,7 @@ _FORMS = (
     ("ORB-SLAM's", ("camerabf", "stereotc1c2", "stereob", "camera1fx"), ("rectified",)),
     ("stella_vslam's", ("camerafocalxbaseline",), ("rectified",)),
 )
-_MISSING = {  # the two cameras, and how they stand to each other, by the names of a form
+_MISSING = {
     "Kalibr's": ("cam0/intrinsics", "cam1/intrinsics", "cam1/T_cn_cnm1"),
     "EuRoC's": ("intrinsics", "intrinsics of the right camera", "T_BS"),
 }
@@ -91,8 +86,7 @@ class Entries:
         for known, names, options in _FORMS:
             if not self.form and any(name in self._values for name in names):
                 self.form, self.options = known, options
-        zero = any(name in self._values for name in ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx"))
-        counts = ("0", "1") if zero else ("1", "2")
+        counts = ("0", "1") if any(name in self._values for name in _FROM_ZERO) else ("1", "2")
         self._sides = [
             (word, word[0], count, f"cam{side}", f"camera{count}", f"{word}camera")
             for side, (word, count) in enumerate(zip(("left", "right"), counts))
@@ -102,10 +96,14 @@ class Entries:
         """Name as written, and value, of an entry; None where there is none."""
         spellings = _SPELLINGS.get(role, (role,))
         if side is None:
-            names: Iterator[str] = chain(spellings, (f"camera{s}" for s in spellings))
+            names = [*spellings, *(f"camera{s}" for s in spellings)]
         else:
-            names = (name for s in spellings for token in self._sides[side] for name in (s + token, token + s))
+            names = [name for s in spellings for token in self._sides[side] for name in (s + token, token + s)]
         return next((self._values[n] for n in names if self._values.get(n, ("", None))[1] is not None), None)
+
+    def both(self, role: str) -> bool:
+        """Whether both cameras have an entry."""
+        return all(self.find(role, side) is not None for side in (0, 1))
 
     def numbers(self, role: str, side: int | None, shape: tuple[int, ...] | None) -> Array | None:
         """A finite array of this shape, flat where that is None; None where there is no such entry."""
@@ -118,14 +116,10 @@ class Entries:
 
 
 def read_entries(paths: Sequence[Path], images: Size | None) -> Entries:
-    """The entries of calibration files, read by the XML, INI and YAML libraries: OpenCV's reader can crash.
+    """The entries of one file or two, read by the XML, INI and YAML libraries: OpenCV's reader can crash.
 
-    Args:
-        paths: one file or several.
-        images: width and height of the images, which choose one of several resolutions; None where not known.
-
-    Raises:
-        CalibrationError: a file is missing or unreadable.
+    The size of the images, where it is known, chooses one of several resolutions. CalibrationError where a file is
+    missing or unreadable.
     """
     read = [read_form(path, images) for path in paths]
     return Entries([dict(_flat(root, "", "")) for root, _ in read], read[0][1] if len(read) == 1 else "")
@@ -151,8 +145,7 @@ def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, 
     size = sizes[0] or sizes[1] or images
     if size is None:
         raise CalibrationError("names no image size: give size=(width, height)")
-    P, K = ([entries.find(role, side) is not None for side in (0, 1)] for role in ("P", "K"))
-    scalars = [entries.find("fx", side) is not None for side in (0, 1)]
+    P, K, scalars = ([entries.find(role, side) is not None for side in (0, 1)] for role in ("P", "K", "fx"))
     if rectified or (any(P) and not K[0] and not scalars[0]):
         _require(entries, P, "P1", "P2")
         return rig_from_projections(*_projections(entries, unit), size)
@@ -161,15 +154,16 @@ def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, 
         plain = _plain(entries, size, unit)
         if plain is not None:
             return plain
-    labels = _MISSING.get(entries.form, ("K1", "K2", "T"))
-    there = [k or s for k, s in zip(K, scalars)]
+    cameras_there = [k or s for k, s in zip(K, scalars)]
     if entries.form or entries.find("R") is not None:
-        _require(entries, [*there, T_right_left is not None], *labels)
+        labels = _MISSING.get(entries.form, ("K1", "K2", "T"))
+        _require(entries, [*cameras_there, T_right_left is not None], *labels)
     else:
-        _require(entries, [*there, False, entries.find("T") is not None], "K1", "K2", "R", "T")
+        _require(entries, [*cameras_there, False, entries.find("T") is not None], "K1", "K2", "R", "T")
     assert T_right_left is not None  # `_require` has seen it
-    cameras = [_camera(entries, side, sizes[side] or size, fisheye) for side in (0, 1)]
-    return rig_from_transform(cameras[0], cameras[1], T_right_left)
+    left, right = (_camera(entries, side, sizes[side] or size, fisheye) for side in (0, 1))
+    R, t = T_right_left[:3, :3], T_right_left[:3, 3]
+    return StereoRig.side_by_side(left, right, R, R.T @ t)  # h_right = R (h_left + b), paper A, Eq. 6
 
 
 def body_pose(entries: Entries, side: int) -> Array:
@@ -199,26 +193,21 @@ def _extrinsics(entries: Entries, unit: float) -> Array | None:
     """``T_right_left`` (4, 4) [m], by whichever entries say it; None where none does."""
     R, t = entries.numbers("R", None, None), entries.numbers("T", None, (3,))
     if R is not None and t is not None:
-        rotation = so3_exp(R) if R.size == 3 else array(R, "R", (3, 3))
-        return pose(rotation, unit * t)
-    if any(all(entries.find(role, side) is not None for side in (0, 1)) for role in ("T_BS", "T_cam_imu")):
+        return pose(so3_exp(R) if R.size == 3 else array(R, "R", (3, 3)), unit * t)
+    if entries.both("T_BS") or entries.both("T_cam_imu"):
         return inverse(body_pose(entries, 1)) @ body_pose(entries, 0)
     for role, turned in (("T_cn_cnm1", False), ("T_c1_c2", True)):
         T = entries.numbers(role, None, (4, 4))
         if T is not None:
             return inverse(rigid(T, role)) if turned else rigid(T, role)
     left, right = (entries.numbers("R_rect", side, (3, 3)) for side in (0, 1))
-    offset = _rectified_offset(entries, unit)
+    offset = None  # of the rectified left camera in the rectified right one's axes (3,) [m]
+    if entries.both("P"):
+        P_left, P_right = _projections(entries, unit)
+        offset = projection_offset(P_right) - projection_offset(P_left)
+    elif (baseline := _baseline(entries, unit)) is not None:
+        offset = np.array([-baseline, 0.0, 0.0])
     return None if left is None or right is None or offset is None else pose(right.T @ left, right.T @ offset)
-
-
-def _rectified_offset(entries: Entries, unit: float) -> Array | None:
-    """Where the rectified left camera is in the rectified right one's axes (3,) [m]; None where nothing says it."""
-    if all(entries.find("P", side) is not None for side in (0, 1)):
-        left, right = _projections(entries, unit)
-        return projection_offset(right) - projection_offset(left)
-    baseline = _baseline(entries, unit)
-    return None if baseline is None else np.array([-baseline, 0.0, 0.0])
 
 
 def _projections(entries: Entries, unit: float) -> tuple[Array, Array]:
@@ -258,7 +247,7 @@ def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:
                 raise CalibrationError(f"{name} is missing")
             values[name] = _number(entry)
             if values[name] <= 0 and name not in ("cx", "cy"):
-                wrong.append(f"{name} is {values[name]:g}, which must be positive")
+                raise CalibrationError(f"{name} is {values[name]:g}, which must be positive")
         except CalibrationError as error:
             wrong.append(str(error))
     if wrong:
@@ -272,11 +261,11 @@ def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:
 
 def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCamera:
     """One camera from its matrix, or its four numbers, and its distortion."""
-    models = {role: entries.find(role, side) or entries.find(role) for role in ("distortion model", "camera model")}
-    for role, found in models.items():
-        name = "".join(filter(str.isalnum, str(found[1] if found else "").lower()))
-        if found and name not in _FISHEYE + _PINHOLE and (entries.form or role == "distortion model"):
-            raise CalibrationError(f"{role} {found[1]!r} is not supported")
+    for role in ("distortion model", "camera model"):
+        model = entries.find(role, side) or entries.find(role) or ("", "")
+        name = _plain_name(model[1])
+        if name not in _FISHEYE + _PINHOLE and (entries.form or role == "distortion model"):
+            raise CalibrationError(f"{role} {model[1]!r} is not supported")
         fisheye = fisheye or name in _FISHEYE
     found = entries.find("K", side)
     if found is None:
@@ -295,9 +284,8 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
     if 0 < len(D) < 4:
         raise CalibrationError(f"distortion model takes 4 coefficients or more, got {len(D)}")
     fx, fy, cx, cy = values
-    return PinholeCamera.from_matrix(
-        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float), D if D.any() or fisheye else None, size, fisheye
-    )
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
+    return PinholeCamera.from_matrix(K, D if D.any() or fisheye else None, size, fisheye)
 
 
 def _size(entries: Entries, side: int) -> Size | None:
@@ -320,10 +308,15 @@ def _number(entry: tuple[str, Any]) -> float:
     return float(array(value, name, ())[()])
 
 
+def _plain_name(name: Any) -> str:
+    """A name in lower case, letters and digits only."""
+    return "".join(filter(str.isalnum, str(name).lower()))
+
+
 def _flat(node: Mapping[str, Any], written: str, plain: str) -> Iterator[tuple[str, tuple[str, Any]]]:
     """Entries of nested mappings, their names joined; matrices are values."""
     for key, value in node.items():
-        name = "".join(filter(str.isalnum, str(key).lower()))
+        name = _plain_name(key)
         inner = plain + ("" if name == "stereorectifier" else name)
         if isinstance(value, Mapping) and "data" not in value:
             yield from _flat(value, f"{written}{key}/", inner)

@@ -84,19 +84,18 @@ def _is_stamp(text: str) -> bool:
 
 def _stamps(names: Sequence[str]) -> IntArray | None:
     """A stamp [ns] that every name has and that tells the names apart."""
+    whole = all(_is_stamp(stem(name)) for name in names)
     since_start = all(_SECONDS.fullmatch(stem(name)) for name in names)
     rows = [[(*stem(n).split("."), "", "", "")] if since_start else _STAMP.findall(stem(n)) for n in names]
-    for column in range(min(map(len, rows), default=0)):
-        parts = [row[column] for row in rows]
+    for parts in zip(*rows):
         fractions = [part[1] for part in parts if part[1]]
         # Fractions of unequal length that end in zeros are whole microseconds or nanoseconds, printed without padding.
         unpadded = len(set(map(len, fractions))) > 1 and any(len(f) > 1 and f.endswith("0") for f in fractions)
         width = 0 if not unpadded else 6 if max(map(len, fractions)) <= 6 else 9
         keys = [_nanoseconds(part, width) for part in parts]
-        whole = all(_is_stamp(stem(name)) for name in names)
-        if _median_step(np.array([min(k, MOST_NANOSECONDS) for k in keys])) > _LONGEST:
-            continue  # of a clock that counts from its start, in a finer unit
-        if len(set(keys)) == len(keys) and all(k <= MOST_NANOSECONDS and (whole or k >= _FIRST * 10**9) for k in keys):
+        far = _median_step(np.array([min(k, MOST_NANOSECONDS) for k in keys])) > _LONGEST
+        possible = all(k <= MOST_NANOSECONDS and (whole or k >= _FIRST * 10**9) for k in keys)
+        if possible and not far and len(set(keys)) == len(keys):  # far apart: a clock from its start, in a finer unit
             return np.array(keys, np.int64)
     return None
 
@@ -111,17 +110,17 @@ def _nanoseconds(part: tuple[str, ...], width: int) -> int:
 
 def _dates(names: Sequence[str]) -> IntArray | None:
     """Dates with the time [ns since 1970] that every name has and that tell the names apart."""
-    found = [_DATE.search(stem(name)) for name in sorted(names, key=natural)]
-    if not all(found):
+    found = {name: match for name in sorted(names, key=natural) if (match := _DATE.search(stem(name)))}
+    if len(found) < len(set(names)):
         return None
-    rest = [int(match[7] or 0) for match in found if match]
-    if rest == sorted(rest) and len({match[6] for match in found if match}) > 1 and any(rest):
+    rest = [int(match[7] or 0) for match in found.values()]
+    if rest == sorted(rest) and len({match[6] for match in found.values()}) > 1 and any(rest):
         return None  # it counts on when the second is over: no fraction
     try:
-        keys = {name: _date(match) for name, match in zip(sorted(names, key=natural), found) if match}
+        keys = [_date(found[name]) for name in names]
     except ValueError:
         return None
-    return np.array([keys[name] for name in names], np.int64) if len(set(keys.values())) == len(names) else None
+    return np.array(keys, np.int64) if len(set(keys)) == len(names) else None
 
 
 def _date(match: re.Match[str]) -> int:
@@ -147,16 +146,12 @@ def _numbers(sides: Sequence[Sequence[str]]) -> tuple[list[IntArray], bool, str]
             best, chosen = common, [column, *others]
     guess = ""
     for names, columns, column in zip(sides, told, chosen):
-        order = np.argsort(column, kind="stable").tolist()
-        if any(np.argsort(c, kind="stable").tolist() != order for c in columns):
-            guess = (
-                f"numbers in the names disagree; of {names[order[0]]} the {column[order[0]]} is taken as frame number"
-            )
+        first, *order = np.argsort(column, kind="stable").tolist()
+        if any(np.argsort(c, kind="stable").tolist() != [first, *order] for c in columns):
+            guess = f"numbers in the names disagree; of {names[first]} the {column[first]} is taken as frame number"
     keys = [np.array(column, np.int64) for column in chosen]
     stamped = all(_median_step(k) >= _SHORTEST for k in keys)
-    if not stamped and max(k.max() for k in keys) > MOST_FRAMES:
-        return None
-    return keys, stamped, guess
+    return None if not stamped and max(k.max() for k in keys) > MOST_FRAMES else (keys, stamped, guess)
 
 
 def _columns(names: Sequence[str]) -> list[list[int]] | None:

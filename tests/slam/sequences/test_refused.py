@@ -13,7 +13,7 @@ import pytest
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError, UnknownNameError
 from slam.sequences import open_sequence
-from slam.sequences.yaml_files import read_yaml
+from slam.sequences.calibration_forms import read_yaml
 
 RIGHT = {"euroc": "mav0/cam1", "kitti": "image_1", "raw": "image_01", "two_folders": "right"}
 CALIBRATION = {
