@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
 
-from slam.errors import one_line
+from slam.errors import ConfigurationError, one_line
 
 logger = logging.getLogger("slam.sequences")
 
-_silent: ContextVar[bool] = ContextVar("lines are kept, but not logged", default=False)
+_instead: ContextVar[list[str] | None] = ContextVar("where lines go instead of the log", default=None)
 
 #: So many faults of one kind are reported one by one; the others are counted.
 _LINES_PER_KIND = 5
@@ -41,20 +41,9 @@ class FaultLog:
         """Report what is assumed for want of better, at the end, and not at all where an error ends the work."""
         self._assumptions.append(line)
 
-    def close(self) -> None:
-        """Report what is assumed, and how many faults were only counted."""
-        for line in self._assumptions:
-            self._emit(line)
-        self._assumptions.clear()
-        for kind, count in self._counts.items():
-            if count > _LINES_PER_KIND:
-                self._emit(f"{kind}: {count} in all, {count - _LINES_PER_KIND} not listed")
-        self._counts.clear()
-
     def _emit(self, line: str) -> None:
         line = one_line(line)
-        if not _silent.get():
-            logger.warning("%s", line)
+        _log(line)
         if line not in self._lines:
             self._lines.append(line)
 
@@ -64,16 +53,42 @@ class FaultLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            self._assumptions.clear()
-        self.close()
+        for line in self._assumptions if kind is None else ():
+            self._emit(line)
+        for what, count in self._counts.items():
+            if count > _LINES_PER_KIND:
+                self._emit(f"{what}: {count} in all, {count - _LINES_PER_KIND} not listed")
+
+
+def _log(line: str) -> None:
+    lines = _instead.get()
+    if lines is None:
+        logger.warning("%s", line)
+    else:
+        lines.append(line)
 
 
 @contextmanager
 def said_before() -> Iterator[None]:
     """For opening a sequence once more: what its files lack was logged the first time, and is only kept."""
-    token = _silent.set(True)
+    token = _instead.set([])
     try:
         yield
     finally:
-        _silent.reset(token)
+        _instead.reset(token)
+
+
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Lines are logged at the end, and not at all where an option turns out to be wrong."""
+    lines: list[str] = []
+    token = _instead.set(lines)
+    try:
+        yield
+    except ConfigurationError:
+        lines.clear()
+        raise
+    finally:
+        _instead.reset(token)
+        for line in lines:
+            _log(line)

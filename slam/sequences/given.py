@@ -5,19 +5,40 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from typing import Any
+from urllib.parse import parse_qsl
 
 from slam.errors import ConfigurationError
 
+#: Kinds of motion.
+KINDS = ("driving", "handheld")
+
+#: Options of the formats whose calibration is in a file that can be named.
+CALIBRATION_OPTIONS = frozenset({"calibration", "unit", "rectified", "fisheye"})
+
 #: Options that every recorded format knows; which of them mean something depends on what is found in the folder.
-_CALIBRATION, _IMAGES = {"calibration", "unit", "rectified", "fisheye"}, {"left", "right", "layout", "mask"}
-OPTIONS = frozenset({"kind", "tolerance", "times", "fps"} | _CALIBRATION | _IMAGES)
+OPTIONS = CALIBRATION_OPTIONS | {"kind", "tolerance", "times", "fps", "left", "right", "layout", "mask"}
 
 #: Frame rates that are believed [1/s].
 SLOWEST, FASTEST = 1e-3, 1e5
 
 #: Most that the option ``tolerance`` takes [s].
 WIDEST_TOLERANCE = 10.0
+
+_MOST_OPTIONS = 100
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _YES = {"1": True, "yes": True, "true": True, "0": False, "no": False, "false": False}
+
+
+def read_options(query: str) -> dict[str, str]:
+    """The options ``key=value&key=value`` behind a question mark."""
+    try:
+        options = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=_MOST_OPTIONS))
+    except ValueError:
+        raise ConfigurationError(f"more than {_MOST_OPTIONS} options") from None
+    for key, value in options.items():
+        if "\0" in value:
+            raise ConfigurationError(f"option {key!r} holds a NUL")
+    return options
 
 
 class Given(dict[str, str]):
@@ -37,11 +58,7 @@ class Given(dict[str, str]):
         return super().get(name, default)
 
     def require_read(self, what: str) -> None:
-        """Raise where an option was not read by anything.
-
-        Raises:
-            ConfigurationError: one was not.
-        """
+        """Raise ConfigurationError where an option was not read by anything."""
         unread = sorted(set(self) - self._read)
         if unread:
             raise ConfigurationError(f"option {unread[0]!r} does nothing here: {what}")
@@ -56,12 +73,16 @@ class Given(dict[str, str]):
         return None if seconds is None else round(1e9 * seconds)
 
 
-def number(options: Mapping[str, str], name: str, low: float, high: float) -> float | None:
-    """An option that is a number; None where it is not given.
+def check_values(options: Mapping[str, str]) -> None:
+    """Raise ConfigurationError where an option that is a number, a word, yes or no is none."""
+    given = Given(options)
+    given.rate(), given.tolerance(), metres_per_unit(given), layout_of(given)
+    for name in ("rectified", "fisheye"):
+        flag(given, name)
 
-    Raises:
-        ConfigurationError: it is none, or out of its range.
-    """
+
+def number(options: Mapping[str, str], name: str, low: float, high: float) -> float | None:
+    """An option that is a number in a range; None where it is not given."""
     if name not in options:
         return None
     try:
@@ -74,23 +95,23 @@ def number(options: Mapping[str, str], name: str, low: float, high: float) -> fl
 
 
 def flag(options: Mapping[str, str], name: str) -> bool:
-    """An option that is yes or no.
-
-    Raises:
-        ConfigurationError: it is neither.
-    """
+    """An option that is yes or no."""
     text = options.get(name, "no").lower()
     if text not in _YES:
         raise ConfigurationError(f"{name} must be yes or no, got {text!r}")
     return _YES[text]
 
 
-def layout_of(options: Mapping[str, str]) -> str | None:
-    """The option ``layout``; None where it is not given.
+def metres_per_unit(options: Mapping[str, str]) -> float:
+    """The option ``unit``, of length."""
+    unit = options.get("unit", "m")
+    if unit not in _UNITS:
+        raise ConfigurationError(f"unit must be one of {', '.join(_UNITS)}, got {unit!r}")
+    return _UNITS[unit]
 
-    Raises:
-        ConfigurationError: it is none.
-    """
+
+def layout_of(options: Mapping[str, str]) -> str | None:
+    """The option ``layout``; None where it is not given."""
     layout = options.get("layout")
     if layout not in (None, "sbs"):
         raise ConfigurationError(f"layout must be sbs (side by side), got {layout!r}")

@@ -10,25 +10,20 @@ from slam.errors import CalibrationError, ConfigurationError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig
 from slam.sequences.calibration import naming
+from slam.sequences.calibration_forms import is_kitti
 from slam.sequences.calibration_keys import read_entries, rig_of
-from slam.sequences.given import flag
+from slam.sequences.given import CALIBRATION_OPTIONS, flag, metres_per_unit
 from slam.sequences.images import Size
 from slam.sequences.source import require_size
 
-#: Options of the formats whose calibration is in a file that can be named.
-OPTIONS = frozenset({"calibration", "unit", "rectified", "fisheye"})
+OPTIONS = CALIBRATION_OPTIONS
 
-_STORAGE_SUFFIXES = (".yaml", ".yml", ".xml", ".json", ".conf")
+_SUFFIXES = (".yaml", ".yml", ".xml", ".json", ".conf")
 _STEMS = ("calibration", "calib", "stereo", "camchain")
-_ONE_FILE = tuple(stem + s for stem in _STEMS for s in _STORAGE_SUFFIXES)
-_TWO_FILES = tuple(
-    tuple(f"{name}{s}" for name in names)
-    for names in (("intrinsics", "extrinsics"), ("left", "right"))
-    for s in _STORAGE_SUFFIXES[:2]
-)
-_SENSORS = tuple(tuple(f"{root}{cam}/sensor.yaml" for cam in ("cam0", "cam1")) for root in ("", "mav0/"))
+_PAIRS = (("intrinsics", "extrinsics"), ("left", "right"))
+_USUAL = (*((stem + s,) for stem in _STEMS for s in _SUFFIXES), *((a + s, b + s) for a, b in _PAIRS for s in _SUFFIXES[:2]))
 _KITTI = ("calib.txt", "calib_cam_to_cam.txt")
-_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_SENSORS = tuple((f"{root}cam0/sensor.yaml", f"{root}cam1/sensor.yaml") for root in ("", "mav0/"))
 
 
 def load_rig(
@@ -63,7 +58,10 @@ def load_rig(
     if not files:
         raise CalibrationError("no calibration is named")
     if len(files) == 1 and files[0].is_dir():
-        files = _in_folder(files[0])
+        folder, kitti = files[0], [(name,) for name in _KITTI]
+        files = _first(folder, [*_USUAL, *kitti, ("dso/camchain.yaml",), *_SENSORS])
+        if not files:
+            raise CalibrationError(f"{folder}: no calibration under one of the usual names: name the file")
     rig = read_rig(files, size, options)
     return StereoRig(*rig.as_recorded) if rig.turns else rig  # refused, unless the images are turned, too
 
@@ -94,18 +92,6 @@ def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, str
     return rig
 
 
-def metres_per_unit(options: Mapping[str, str]) -> float:
-    """The option ``unit``, of length.
-
-    Raises:
-        ConfigurationError: it is none.
-    """
-    unit = options.get("unit", "m")
-    if unit not in _UNITS:
-        raise ConfigurationError(f"unit must be one of {', '.join(_UNITS)}, got {unit!r}")
-    return _UNITS[unit]
-
-
 def calibration_files(folder: Path, options: Mapping[str, str], missing: str = "") -> list[Path]:
     """The file, or the two files, by the option ``calibration`` (names joined by a comma) or under usual names.
 
@@ -118,28 +104,23 @@ def calibration_files(folder: Path, options: Mapping[str, str], missing: str = "
         CalibrationError: there is none.
     """
     if "calibration" in options:
-        files = [folder / expanded(name, CalibrationError) for name in options["calibration"].split(",")]
-        for name, file in zip(options["calibration"].split(","), files):
+        names = options["calibration"].split(",")
+        files = [folder / expanded(name, CalibrationError) for name in names]
+        for name, file in zip(names, files):
             if not os.path.exists(file) and os.path.exists(name):  # noqa: PTH110 false for what can be no name, too
                 raise CalibrationError(f"{file}: there is no such file; calibration={name} is relative to {folder}")
         return files
-    found = _usual(folder, (*((name,) for name in _ONE_FILE), *_TWO_FILES))
-    if not found:
-        missing = missing or f"{folder}: the calibration is missing: calibration.yaml, or add calibration=FILE"
-        raise CalibrationError(missing)
-    return found
+    files = _first(folder, _USUAL)
+    texts = [folder / name for name in _KITTI if (folder / name).is_file()]
+    files = files or [file for file in texts if is_kitti(file)][:1]
+    if not files:
+        there = f" ({texts[0].name} is not of KITTI's form)" if texts else ""
+        usual = f"{folder}: the calibration is missing{there}: calibration.yaml, or add calibration=FILE"
+        raise CalibrationError(missing or usual)
+    return files
 
 
-def _in_folder(folder: Path) -> list[Path]:
-    """The files of a folder that is given in place of them."""
-    singles = (*_ONE_FILE, *_KITTI, "dso/camchain.yaml")
-    found = _usual(folder, (*((name,) for name in singles), *_TWO_FILES, *_SENSORS))
-    if not found:
-        raise CalibrationError(f"{folder}: no calibration under one of the usual names: name the file")
-    return found
-
-
-def _usual(folder: Path, names: Sequence[Sequence[str]]) -> list[Path]:
+def _first(folder: Path, names: Sequence[Sequence[str]]) -> list[Path]:
     """The first of several sets of files that is complete; empty where none is."""
     sets = ([folder / name for name in names_] for names_ in names)
     return next((files for files in sets if all(file.is_file() for file in files)), [])

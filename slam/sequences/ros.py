@@ -20,7 +20,7 @@ from slam.sequences import rigs
 from slam.sequences.base import Images, RecordedSequence
 from slam.sequences.calibration import naming
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import Given, flag
+from slam.sequences.given import Given, flag, metres_per_unit
 from slam.sequences.images import Size, halved
 from slam.sequences.ros_bag import Bag, Message, naming_recording, open_bag
 from slam.sequences.ros_topics import Topics, choose_topics, rig_from_camera_infos
@@ -217,6 +217,6 @@ def _rig(path: Path, topics: Topics, size: Size, options: Given) -> StereoRig:
     where = Path(topics.info_names)
     rectified = flag(options, "rectified") if "rectified" in options else topics.rectified
     with naming(where):
-        rig = rig_from_camera_infos(topics.infos, rectified, rigs.metres_per_unit(options))
+        rig = rig_from_camera_infos(topics.infos, rectified, metres_per_unit(options))
     require_size(size, rig, where)
     return rig
