@@ -150,8 +150,7 @@ class RecordedSequence:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
         """Frames `start` up to, but without, `stop`; see `Sequence.frames`."""
-        start, stop = frame_range(start, stop, len(self))
-        return self._read(start, stop)
+        return self._read(*frame_range(start, stop, len(self)))
 
     def _read(self, start: int, stop: int) -> Iterator[StereoFrame]:
         """Decode lazily and sum up repeated faults at the end, also where the caller stops early.

@@ -11,7 +11,7 @@ from slam.data import StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig
-from slam.sequences.images import read_image, size_text
+from slam.sequences.images import read_image, recorded_size, size_text
 
 #: Of the left and the right camera (H, W) bool, False where the image is not to be used; None for all of it.
 Masks = tuple[np.ndarray | None, np.ndarray | None]
@@ -20,23 +20,19 @@ Masks = tuple[np.ndarray | None, np.ndarray | None]
 def at_the_door(frame: StereoFrame, rig: StereoRig, masks: Masks) -> StereoFrame:
     """The frame as the rig sees it: turned as the rig is, with the masks of both cameras."""
     if rig.turns:
-        right = None if frame.right is None else _turned(frame.right, rig)
-        frame = replace(frame, left=_turned(frame.left, rig), right=right)
-    return frame if masks[0] is None and masks[1] is None else replace(frame, left_mask=masks[0], right_mask=masks[1])
+        turned = [None if i is None else np.ascontiguousarray(np.rot90(i, rig.turns)) for i in (frame.left, frame.right)]
+        frame = replace(frame, left=turned[0], right=turned[1])
+    none = masks[0] is None and masks[1] is None
+    return frame if none else replace(frame, left_mask=masks[0], right_mask=masks[1])
 
 
-def _turned(image: np.ndarray, rig: StereoRig) -> np.ndarray:
-    return np.ascontiguousarray(np.rot90(image, rig.turns))
-
-
-def read_masks(text: str | None, folder: Path, rig: StereoRig, recorded: bool = True) -> Masks:
+def read_masks(text: str | None, folder: Path, rig: StereoRig) -> Masks:
     """The masks by the option ``mask``: one image for both cameras, or two joined by a comma, one perhaps empty.
 
     Args:
-        text: the option; None for no mask.
+        text: the option; None for no mask. Masks are of the images as they are recorded, before they are turned.
         folder: that names are relative to.
         rig: of the images.
-        recorded: the masks are of the images as they are recorded, before they are turned.
 
     Raises:
         SequenceError: an image cannot be read.
@@ -47,20 +43,19 @@ def read_masks(text: str | None, folder: Path, rig: StereoRig, recorded: bool = 
     names = text.split(",")
     if len(names) > 2 or not any(names):
         raise ConfigurationError(f"mask must be one image, or two joined by a comma, got {text!r}")
-    masks: list[np.ndarray | None] = []
-    for name in names:
-        mask = None
-        if name:
-            path = folder / expanded(name)
-            try:
-                mask = read_image(path) > 0
-            except SequenceError as error:
-                raise SequenceError(f"mask: {error}") from error
-            mask = np.rot90(mask, rig.turns) if recorded else mask
-            if mask.shape != (rig.height, rig.width):
-                size = (rig.height, rig.width) if rig.turns % 2 else (rig.width, rig.height)
-                raise ConfigurationError(f"mask {path}: images are {size_text(size)}, the mask is of another size")
-            if not mask.any():
-                raise ConfigurationError(f"mask {path}: it is black all over, so that nothing is left of the images")
-        masks.append(mask)
+    masks = [_read_mask(folder / expanded(name), rig) if name else None for name in names]
     return masks[0], masks[-1]
+
+
+def _read_mask(path: Path, rig: StereoRig) -> np.ndarray:
+    """One mask (H, W) bool, turned as the rig is."""
+    try:
+        mask = np.rot90(read_image(path) > 0, rig.turns)
+    except SequenceError as error:
+        raise SequenceError(f"mask: {error}") from error
+    if mask.shape != (rig.height, rig.width):
+        size = size_text(recorded_size(rig))
+        raise ConfigurationError(f"mask {path}: images are {size}, the mask is of another size")
+    if not mask.any():
+        raise ConfigurationError(f"mask {path}: it is black all over, so that nothing is left of the images")
+    return mask

@@ -16,31 +16,22 @@ from slam.sequences.calibration_keys import body_pose, read_entries
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given
 from slam.sequences.rigs import calibration_files, read_rig
-from slam.sequences.source import (
-    Listing,
-    by_names,
-    image_names,
-    in_order,
-    number_of,
-    pair_up,
-    present,
-    read_times,
-)
-from slam.sequences.tables import numbers, read_rows, shorten, stamp_and_name
-from slam.sequences.truth import LARGEST, require_truth
+from slam.sequences.source import Listing, by_names, image_names, in_order, number_of, pair_up, present, read_times
+from slam.sequences.tables import LARGEST, numbers, read_rows, require_truth, shorten, stamp_and_name
 
 #: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
 #: half a metre apart, which makes 2 mrad. The camera's orientation in the vehicle is calibrated to half a degree or so,
 #: its place to a centimetre, and its clock against the camera's to half an exposure.
 MOCAP_NOISE = TruthNoise(rotation=0.002, translation=0.001, mounting=0.01, lever=0.01, clock=0.01)
 
+_CAMERAS = ("cam0", "cam1")
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")  # both give the body's (IMU's) pose
 _CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "../camchain.yaml", "../dso/camchain.yaml")
 
 
 def matches_folder(folder: Path) -> bool:
     """Whether a folder looks like EuRoC's: it, or its ``mav0``, holds ``cam0`` or ``cam1`` with data in it."""
-    return any((_root(folder) / cam / part).exists() for cam in ("cam0", "cam1") for part in ("data", "data.csv"))
+    return any((_root(folder) / cam / part).exists() for cam in _CAMERAS for part in ("data", "data.csv"))
 
 
 def open_folder(folder: Path, options: Given) -> RecordedSequence:
@@ -72,32 +63,32 @@ def _root(folder: Path) -> Path:
 
 def _listings(root: Path, faults: FaultLog) -> list[Listing]:
     """The images of both cameras that exist, by ``data.csv`` or, where there is none, by their names."""
-    cameras = [root / cam for cam in ("cam0", "cam1")]
+    cameras = [root / cam for cam in _CAMERAS]
     for camera in cameras:
         if not camera.is_dir():
             reason = "a file where a folder should be" if camera.exists() else "missing, two cameras are needed"
             raise SequenceError(f"{camera}: {reason}")
-    if all((camera / "data.csv").exists() for camera in cameras):
-        return [_listed(camera, faults) for camera in cameras]
+    tables = [camera / "data.csv" for camera in cameras]
+    if all(table.exists() for table in tables):
+        return [_listed(table, faults) for table in tables]
     folders = [camera / "data" for camera in cameras]
     names = [[name for name in image_names(folder) if number_of(name) is not None] for folder in folders]
-    for folder, own in zip(folders, names):
+    for camera, own in zip(cameras, names):
         if not own:
-            raise SequenceError(f"{folder.parent}: no data.csv, and no images named by their stamps in data")
+            raise SequenceError(f"{camera}: no data.csv, and no images named by their stamps in data")
     return by_names(folders, names, faults)
 
 
-def _listed(camera: Path, faults: FaultLog) -> Listing:
-    """The images that ``data.csv`` lists."""
-    table = camera / "data.csv"
+def _listed(table: Path, faults: FaultLog) -> Listing:
+    """The images that a ``data.csv`` lists."""
     rows = [row for row in read_rows(table, stamp_and_name, faults) if row is not None]
-    listing = Listing(camera / "data", np.array([s for s, _ in rows], np.int64), [n for _, n in rows], True)
+    listing = Listing(table.parent / "data", np.array([s for s, _ in rows], np.int64), [n for _, n in rows], True)
     return present(in_order(listing, str(table), faults), str(table), faults)
 
 
 def _calibration(root: Path) -> list[Path]:
     """Both ``sensor.yaml`` or, where those are missing, a Kalibr ``camchain.yaml``; empty for neither."""
-    files = [root / cam / "sensor.yaml" for cam in ("cam0", "cam1")]
+    files = [root / cam / "sensor.yaml" for cam in _CAMERAS]
     if any(file.exists() for file in files):
         return files
     return next(([root / name] for name in _CAMCHAINS if (root / name).is_file()), [])
@@ -105,8 +96,7 @@ def _calibration(root: Path) -> list[Path]:
 
 def _ground_truth(root: Path, calibration: list[Path], faults: FaultLog) -> Trajectory | None:
     """The left camera's path: body poses times the camera's pose in the body."""
-    for folder in _TRUTH:
-        path = root / folder / "data.csv"
+    for path in (root / folder / "data.csv" for folder in _TRUTH):
         if path.is_file():
             try:
                 if not calibration:

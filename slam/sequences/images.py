@@ -101,11 +101,7 @@ def _by_opencv(data: bytes, size: Size, what: str) -> np.ndarray:
 
 
 def require_image_size(found: Size, expected: Size | None, what: str) -> None:
-    """Raise where an image is of another size than expected, or larger than any.
-
-    Raises:
-        SequenceError: it is.
-    """
+    """Raise SequenceError where an image is of another size than expected, or larger than any."""
     if expected is not None and found != expected:
         raise SequenceError(f"{what}: image is {size_text(found)}, not {size_text(expected)}")
     if min(found) < 1 or found[0] * found[1] > MOST_PIXELS:
@@ -118,22 +114,14 @@ def recorded_size(rig: StereoRig) -> Size:
 
 
 def require_same_size(left: tuple[int, ...], right: tuple[int, ...], *names: object) -> None:
-    """Raise where the images of two cameras, by these names, differ in size (width first).
-
-    Raises:
-        SequenceError: they do.
-    """
+    """Raise SequenceError where the images of two cameras, by these names, differ in size (width first)."""
     if left != right:
         sizes = ", ".join(f"{name} is {size_text(size)}" for name, size in zip(names, (left, right)))
         raise SequenceError(f"left and right images differ in size: {sizes}")
 
 
 def halved(size: Size, what: str) -> Size:
-    """Width and height of each of two images that are side by side in one.
-
-    Raises:
-        SequenceError: its width is odd; the message names `what`.
-    """
+    """Width and height of each of two images that are side by side in one; SequenceError where its width is odd."""
     if size[0] % 2 or size[0] < 2:
         raise SequenceError(f"{what}: an image of {size_text(size)} cannot hold two side by side")
     return size[0] // 2, size[1]

@@ -34,26 +34,16 @@ _PAIRS = (("0", "1"), ("2", "3"))  # grey first, colour where there is no grey
 
 
 class Layout(NamedTuple):
-    """Where the files of a sequence are.
-
-    Attributes:
-        name: of the sequence.
-        left, right: folders of images.
-        cameras: their numbers, as the calibration writes them.
-        calibration: the file, where it is or should be.
-        times: the file, which may be missing.
-        poses: files of poses of the reference camera; the first that is there counts.
-        drive: the folder of a drive of KITTI raw or KITTI-360; None for odometry and tracking.
-    """
+    """Where the files of a sequence are."""
 
     name: str
-    left: Path
+    left: Path  # folders of images
     right: Path
-    cameras: tuple[str, str]
-    calibration: Path
-    times: Path
-    poses: tuple[Path, ...] = ()
-    drive: Path | None = None
+    cameras: tuple[str, str]  # their numbers, as the calibration writes them
+    calibration: Path  # the file, where it is or should be
+    times: Path  # the file, which may be missing
+    poses: tuple[Path, ...] = ()  # files of poses of the reference camera; the first that is there counts
+    drive: Path | None = None  # the folder of a drive of KITTI raw or KITTI-360; None for odometry and tracking
 
 
 def matches_folder(folder: Path) -> bool:

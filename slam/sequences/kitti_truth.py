@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -18,8 +18,7 @@ from slam.sequences.calibration import kitti_matrix, naming, read_kitti, rigid
 from slam.sequences.faults import FaultLog
 from slam.sequences.names import MOST_FRAMES
 from slam.sequences.source import RATE, number_of
-from slam.sequences.tables import date_time, numbers, read_rows, shorten
-from slam.sequences.truth import require_truth
+from slam.sequences.tables import date_time, numbers, read_rows, require_truth, shorten
 
 _EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
 _OXTS, _GPS = "latitude, longitude, altitude, roll, pitch, yaw", "frame, forward, right, third"
@@ -61,15 +60,8 @@ def drive_truth(
     """The left camera's path by the drive's OXTS records; the world is the left camera's first frame there.
 
     KITTI-360 has poses of the rectified left camera. Without either ``poses_cam0_oxts.txt`` serves: poses of camera 0,
-    rows of 12 as in KITTI odometry, one a frame.
-
-    Args:
-        drive: its folder.
-        day: the folder of the calibrations.
-        origin: time of stamp zero [ns since 1970]; None where it is not known.
-        T_left_camera0: pose (4, 4) of the unrectified camera 0 in the left one.
-        frames: of the drive.
-        faults: where a fault of a file is reported.
+    rows of 12 as in KITTI odometry, one a frame. `day` is the folder of the calibrations, `origin` the time of stamp
+    zero [ns since 1970], None where it is not known, `T_left_camera0` of the camera 0 before rectification.
     """
     stamps = dict(zip(frames.numbers.tolist(), frames.stamps.tolist()))
     world = drive.parent.parent / "data_poses" / drive.name / "cam0_to_world.txt"
@@ -151,14 +143,15 @@ def imu_poses(records: Array) -> Array:
 
 def _poses_360(path: Path, stamps: dict[int, float], faults: FaultLog) -> Trajectory:
     """KITTI-360's path of the rectified left camera: rows of a frame's number and 16 numbers of its pose."""
-    rows = [row for row in read_rows(path, _row(17, "a frame and its pose"), faults) if row and row[0] in stamps]
+    rows = [row for row in read_rows(path, _pose_row, faults) if row and row[0] in stamps]
     table = np.array(sorted(rows)).reshape(-1, 17)
     times = np.array([stamps[int(number)] for number in table[:, 0]])
     return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), path)
 
 
-def _row(count: int, what: str) -> Callable[[str], list[float]]:
-    return lambda text: numbers(text, count, what, exactly=True)
+def _pose_row(text: str) -> list[float]:
+    """Frame number, and the 16 numbers of a pose."""
+    return numbers(text, 17, "a frame and its pose", exactly=True)
 
 
 def _record(text: str) -> list[float]:

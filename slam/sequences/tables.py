@@ -1,4 +1,4 @@
-"""Lists of stamps and file names: text tables read row by row, faults named by file and row."""
+"""Lists of stamps and file names, read row by row, faults named by file and row; and whether a true path is one."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from slam.errors import SequenceError
+from slam.errors import SequenceError, TrajectoryError
 from slam.files import read_text
+from slam.geometry.trajectory import Trajectory
 from slam.sequences.faults import FaultLog
 
 T = TypeVar("T")
@@ -18,6 +19,10 @@ T = TypeVar("T")
 #: Latest time [ns]: in the year 2262, where 64 bits end.
 MOST_NANOSECONDS = 2**63 - 1
 
+#: Largest coordinate of a true path [m]: the Earth's circumference.
+LARGEST = 4.1e7
+
+_ROTATION = 1e-2  # largest error of an element of RᵀR: files have six digits and more
 _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
 _EARLIEST, _LATEST = 1e8, 1e10  # of a likely time since 1970 [s]: 1973 to 2286
 _UNITS = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
@@ -106,3 +111,26 @@ def stamp_and_name(text: str) -> tuple[int, str]:
 def shorten(text: str, length: int = 40) -> str:
     """The text in quotes, cut where it is long."""
     return repr(text if len(text) <= length else text[:length] + "…")
+
+
+def require_truth(path: Trajectory, source: Path) -> Trajectory:
+    """The true path of a file, where every pose is a rigid motion, and the whole path not all zeros.
+
+    Raises:
+        TrajectoryError: a rotation is none (a matrix of zeros, a reflection), a position is beyond the Earth, or every
+            position is exactly zero: errors against such a path would mean nothing.
+    """
+    if not len(path):
+        raise TrajectoryError(f"{source}: no pose is left")
+    R, positions = path.poses[:, :3, :3], path.positions
+    beyond = np.abs(positions).max(axis=1) > LARGEST
+    if beyond.any():
+        raise TrajectoryError(f"{source}: the position of pose {int(np.argmax(beyond))} is beyond the Earth")
+    R = np.where((np.abs(R).max(axis=(1, 2)) > 1 + _ROTATION)[:, None, None], 0.0, R)
+    improper = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) > _ROTATION
+    improper |= np.linalg.det(R) < 0
+    if improper.any():
+        raise TrajectoryError(f"{source}: the rotation of pose {int(np.argmax(improper))} is none")
+    if len(path) > 1 and not positions.any():
+        raise TrajectoryError(f"{source}: every position is zero")
+    return path
