@@ -111,8 +111,7 @@ class Finding:
     """What one check found.
 
     Attributes:
-        tier: its tier.
-        check: its name.
+        tier, check: names of its tier and its own.
         demand: what it asks for, a sentence.
         failure: how the back end fails it, a sentence; empty where it passes.
     """

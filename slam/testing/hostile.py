@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam.data import Estimate, IdArray, Observations, UpdateStatus
+from slam.data import Estimate, IdArray, Observations, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
@@ -16,6 +16,7 @@ from slam.testing.scene import DT, MODELS, RIG, Factory, Run, make_scene, raises
 
 _SEQUENCES, _CALLS = 4, 60
 _SIZE = 6  # landmarks in one call
+_ROUNDING = 1e-7  # of correlations
 
 #: Times from one prediction to the next [s], most of them ordinary ones.
 _STEPS = (DT, DT, DT, DT, 1e-6, 1.0, 51.0, 1e3, 1e6, 1e9)
@@ -106,7 +107,7 @@ def rows_that_no_point_explains_are_rejected(factory: Factory) -> None:
 def landmarks_are_placed_in_front(factory: Factory) -> None:
     """`place` refuses landmarks behind the camera; a back end without it has nothing to refuse."""
     backend: Any = factory(RIG, models=MODELS)
-    if not _places(backend):
+    if not isinstance(backend, MapBackend):
         return
     raises(MeasurementError, backend.place, *_cloud([7], [[0.0, 0.0, 5.0]]), what="place before the first predict")
     backend.predict(0.0)
@@ -130,38 +131,43 @@ def play(factory: Factory, seed: int, calls: int = _CALLS) -> None:
     """
     life = _Life(factory(RIG, models=MODELS), np.random.default_rng(seed))
     for number in range(calls):
-        what, refused, call = life.next()
+        what, refused, make, then = life.next()
         where = f"sequence {seed}, call {number}, {what}"
         try:
-            answer = call()
+            answer = make()
         except MeasurementError as error:
             require(refused, f"{where}: was refused ({error})")
         except Exception as error:  # noqa: BLE001 - what somebody else's back end raises is the finding
             require(False, f"{where}: raised {type(error).__name__}: {error}")
         else:
             require(not refused, f"{where}: was accepted, MeasurementError is expected")
+            then()
             life.check(where, answer)
 
 
-@dataclass
+class _Call(NamedTuple):
+    """A call to make."""
+
+    what: str  # its description
+    refused: bool  # whether it must be refused
+    make: Callable[[], Any]
+    then: Callable[[], None]  # what the interface says has changed, where it is taken
+
+
 class _Life:
     """A back end with what the interface says it holds, and the next call to make of it."""
 
-    backend: Any
-    rng: np.random.Generator
-    stamps: list[float] = field(default_factory=list)
-    ids: set[int] = field(default_factory=set)
-    measured: bool = True
-    number: int = 0
+    def __init__(self, backend: Any, rng: np.random.Generator) -> None:
+        self.backend, self.rng = backend, rng
+        self.stamps: list[float] = []
+        self.ids: set[int] = set()
+        self.measured, self.number = True, 0
 
-    def next(self) -> tuple[str, bool, Callable[[], Any]]:
-        """A call: its description, whether it must be refused, and what makes it."""
-        kinds: list[Callable[[], tuple[str, bool, Callable[[], Any]]]]
+    def next(self) -> _Call:
+        """A call."""
         kinds = [self._predict] * 3 + [self._update] * 4 + [self._add] * 3 + [self._remove]
-        if _places(self.backend):
-            kinds += [self._place, self._insert]
-        if hasattr(self.backend, "revise"):
-            kinds += [self._revise]
+        kinds += [self._place, self._insert] if isinstance(self.backend, MapBackend) else []
+        kinds += [self._revise] if hasattr(self.backend, "revise") else []
         return kinds[self.rng.integers(len(kinds))]()
 
     def check(self, where: str, answer: Any) -> None:
@@ -184,99 +190,81 @@ class _Life:
             require_same(path.stamps, self.stamps, f"{where}: stamps of the path")
             require(np.isfinite(path.poses).all(), f"{where}: a pose of the path is not finite")
 
-    # --- the calls ---
-
-    def _predict(self) -> tuple[str, bool, Callable[[], Any]]:
+    def _predict(self) -> _Call:
         last = self.stamps[-1] if self.stamps else 0.0
         stamp = last + float(self.rng.choice(_STEPS if self.rng.random() < 0.8 else _NO_STEPS))
         refused = not np.isfinite(stamp) or bool(self.stamps and stamp <= last) or abs(stamp) > 1e12
+        return _Call(f"predict({stamp})", refused, lambda: self.backend.predict(stamp), lambda: self._predicted(stamp))
 
-        def call() -> Any:
-            answer = self.backend.predict(stamp)
-            self.stamps.append(stamp)
-            self.measured = False
-            return answer
+    def _predicted(self, stamp: float) -> None:
+        self.stamps.append(stamp)
+        self.measured = False
 
-        return f"predict({stamp})", refused, call
-
-    def _update(self) -> tuple[str, bool, Callable[[], Any]]:
+    def _update(self) -> _Call:
         known = self.rng.permutation(sorted(self.ids))[: self.rng.integers(3 * _SIZE)].astype(np.int64)
         unknown = self.rng.random() < 0.1
-        ids = np.append(known, 10**6).astype(np.int64) if unknown else known
-        seen = self._pixels(ids)
+        seen = self._pixels(np.append(known, 10**6).astype(np.int64) if unknown else known)
+        refused = not self.stamps or self.measured or unknown
+        return _Call(f"update with {len(seen)} rows", refused, lambda: self._report(seen), lambda: self._added(()))
 
-        def call() -> Any:
-            report = self.backend.update(seen)
-            self.measured = True
-            if not len(seen):
-                require_status(report, UpdateStatus.EMPTY, "an update without rows")
-            return report
+    def _report(self, seen: Observations) -> UpdateReport:
+        report = self.backend.update(seen)
+        if not len(seen):
+            require_status(report, UpdateStatus.EMPTY, "an update without rows")
+        return report
 
-        return f"update with {len(seen)} rows", not self.stamps or self.measured or unknown, call
-
-    def _add(self) -> tuple[str, bool, Callable[[], Any]]:
+    def _add(self) -> _Call:
         seen = self._pixels(self._new_ids())
         if self.ids and self.rng.random() < 0.1:
             seen = replace(seen, ids=np.append(seen.ids[1:], min(self.ids))) if len(seen) else seen
         known = bool(self.ids & set(seen.ids.tolist()))
         flat = not (np.isfinite(seen.uv_right).all() and (seen.uv_left[:, 0] > seen.uv_right[:, 0]).all())
-        return (
-            f"add of {len(seen)} landmarks",
-            not self.stamps or known or flat,
-            self._adding(lambda: self.backend.add(seen), seen.ids),
-        )
+        refused, ids = not self.stamps or known or flat, seen.ids
+        return _Call(
+            f"add of {len(ids)} landmarks", refused, lambda: self.backend.add(seen),
+            lambda: self._added(ids, self.measured or len(ids) > 0),
+        )  # fmt: skip
 
-    def _remove(self) -> tuple[str, bool, Callable[[], Any]]:
+    def _remove(self) -> _Call:
         share = self.rng.choice([0.0, 0.2, 1.0])
         ids = [i for i in sorted(self.ids) if self.rng.random() < share]
         unknown = self.rng.random() < 0.2
         ids += [10**6] if unknown else []
+        return _Call(
+            f"remove of {len(ids)} landmarks", unknown, lambda: self.backend.remove(ids),
+            lambda: self.ids.difference_update(ids),
+        )  # fmt: skip
 
-        def call() -> None:
-            self.backend.remove(ids)
-            self.ids -= set(ids)
-
-        return f"remove of {len(ids)} landmarks", unknown, call
-
-    def _place(self) -> tuple[str, bool, Callable[[], Any]]:
+    def _place(self) -> _Call:
         ids, local, covariances = _cloud(self._new_ids(), None, self.rng)
         behind = self.rng.random() < 0.2 and len(ids) > 0
         if behind:
             local[0, 2] = self.rng.choice([-5.0, 0.0, float("nan")])
-        return (
-            f"place of {len(ids)} landmarks",
-            not self.stamps or behind,
-            self._adding(lambda: self.backend.place(ids, local, covariances), ids),
-        )
+        return _Call(
+            f"place of {len(ids)} landmarks", not self.stamps or behind,
+            lambda: self.backend.place(ids, local, covariances),
+            lambda: self._added(ids, self.measured or len(ids) > 0),
+        )  # fmt: skip
 
-    def _insert(self) -> tuple[str, bool, Callable[[], Any]]:
+    def _insert(self) -> _Call:
         ids, positions, covariances = _cloud(self._new_ids(), None, self.rng)
         flat = self.rng.random() < 0.2 and len(ids) > 0
         if flat:
             covariances[0] = self.rng.choice([0.0, -1.0]) * np.eye(3)
+        return _Call(
+            f"insert of {len(ids)} landmarks", flat, lambda: self.backend.insert(ids, positions, covariances),
+            lambda: self._added(ids, self.measured),
+        )  # fmt: skip
 
-        def call() -> None:
-            self.backend.insert(ids, positions, covariances)
-            self.ids |= set(ids.tolist())
-
-        return f"insert of {len(ids)} landmarks", flat, call
-
-    def _revise(self) -> tuple[str, bool, Callable[[], Any]]:
+    def _revise(self) -> _Call:
         shift = self.rng.choice([0.0, 0.01])
+        return _Call(
+            f"revise by {shift} px", False, lambda: self.backend.revise(lambda z: z + shift), lambda: self._added(())
+        )
 
-        def call() -> None:
-            self.backend.revise(lambda z: z + shift)
-            self.measured = True
-
-        return f"revise by {shift} px", False, call
-
-    def _adding(self, call: Callable[[], Any], ids: IdArray) -> Callable[[], Any]:
-        def adding() -> None:
-            call()
-            self.ids |= set(ids.tolist())
-            self.measured = self.measured or len(ids) > 0
-
-        return adding
+    def _added(self, ids: Iterable[int], measured: bool = True) -> None:
+        self.ids.update(int(i) for i in ids)
+        self.measured = measured
 
     def _new_ids(self) -> IdArray:
         count = int(self.rng.integers(_SIZE + 1))
@@ -292,20 +280,9 @@ class _Life:
         left, right = left + 0.5 * noise[0], right + 0.5 * noise[1]
         if wild and len(ids):
             row, kind = self.rng.integers(len(ids)), self.rng.integers(4)
-            if kind == 0:
-                right[row] = np.nan
-            elif kind == 1:
-                right[row] = left[row] + [20.0, 0.0]
-            elif kind == 2:
-                left[row], right[row] = (9e4, 9e4), (9e4 - 10.0, 9e4)
-            else:
-                right[row] = left[row] - [1e-9, 0.0]
+            left[row] = (9e4, 9e4) if kind == 2 else left[row]
+            right[row] = ((np.nan, np.nan), left[row] + [20.0, 0.0], (9e4 - 10.0, 9e4), left[row] - [1e-9, 0.0])[kind]
         return Observations(ids, left, right)
-
-
-def _places(backend: object) -> bool:
-    """Whether a back end can start in a map."""
-    return isinstance(backend, MapBackend)
 
 
 def _point(number: int) -> Array:
@@ -338,5 +315,3 @@ def assert_definite(P: Array, what: str) -> None:
     least = np.linalg.eigvalsh(P / sigma[:, :, None] / sigma[:, None, :]).min(initial=0.0)
     require(least > -_ROUNDING, f"{what}: a covariance is not positive definite ({least:.2g} of its variances)")
 
-
-_ROUNDING = 1e-7  # of correlations

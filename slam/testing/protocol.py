@@ -11,22 +11,9 @@ from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.testing.scene import (
-    DT,
-    MODELS,
-    NONE,
-    RIG,
-    Factory,
-    Run,
-    assert_covariance,
-    assert_near,
-    make_scene,
-    raises,
-    require,
-    require_same,
-    require_status,
-    started,
-    tracked,
-)
+    DT, MODELS, NONE, RIG, Factory, Run, assert_covariance, assert_near, make_scene, raises, require, require_same,
+    require_status, started, tracked,
+)  # fmt: skip
 
 
 def first_prediction_is_the_start(factory: Factory) -> None:
@@ -125,9 +112,8 @@ def estimate_is_in_order(factory: Factory) -> None:
     off = np.abs(backend.positions(whole.ids[::-1])[::-1] - whole.positions)
     deviations = np.sqrt(np.diagonal(whole.covariances, axis1=1, axis2=2))
     require((off < deviations).all(), "positions(ids) and the estimate differ by more than a standard deviation")
-    require_same(pose_only.ids, NONE, "landmarks of estimate(landmarks=False)")
-    require_same(pose_only.positions, np.zeros((0, 3)), "positions of estimate(landmarks=False)")
-    require_same(pose_only.covariances, np.zeros((0, 3, 3)), "covariances of estimate(landmarks=False)")
+    for name, shape in (("ids", (0,)), ("positions", (0, 3)), ("covariances", (0, 3, 3))):
+        require_same(getattr(pose_only, name), np.zeros(shape), f"{name} of estimate(landmarks=False)")
     # A smoother may solve further for the whole estimate.
     off = np.abs(se3.log(se3.inverse(pose_only.T_world_left) @ whole.T_world_left))
     off /= np.sqrt(np.diag(whole.covariance))
@@ -180,25 +166,23 @@ def results_are_the_callers_own(factory: Factory) -> None:
     """Writing into what a back end returned does not reach its state."""
     backend = tracked(factory, make_scene(4))[0].backend
     before = backend.estimate()
-    copy = (before.T_world_left.copy(), before.positions.copy(), before.covariance.copy())
-    returned = backend.estimate()
-    for array in (returned.T_world_left, returned.positions, returned.covariance, backend.trajectory().poses):
+    names = ("T_world_left", "positions", "covariance")
+    copies, returned = [getattr(before, name).copy() for name in names], backend.estimate()
+    for array in (*(getattr(returned, name) for name in names), backend.trajectory().poses):
         if array.flags.writeable:
             array[:] = 7.0
     backend.positions(before.ids)[:] = 7.0
     after = backend.estimate()
-    now = (after.T_world_left, after.positions, after.covariance)
-    for what, a, b in zip(("pose", "positions", "covariance"), now, copy):
-        require_same(a, b, f"{what} after the caller wrote into an array that was returned")
+    for name, copy in zip(names, copies):
+        require_same(getattr(after, name), copy, f"{name} after the caller wrote into an array that was returned")
 
 
 def same_input_same_bytes(factory: Factory) -> None:
     """Two runs over the same observations agree to the last bit."""
     runs = [tracked(factory, make_scene(8))[0].backend for _ in range(2)]
     first, second = (backend.estimate() for backend in runs)
-    require_same(second.T_world_left, first.T_world_left, "pose of a second run on the same input")
-    require_same(second.covariance, first.covariance, "covariance of a second run on the same input")
-    require_same(second.positions, first.positions, "positions of a second run on the same input")
+    for name in ("T_world_left", "covariance", "positions"):
+        require_same(getattr(second, name), getattr(first, name), f"{name} of a second run on the same input")
     require_same(runs[1].trajectory().poses, runs[0].trajectory().poses, "path of a second run on the same input")
 
 

@@ -9,18 +9,8 @@ from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
 from slam.system import StereoSlam
 from slam.testing.scene import (
-    DT,
-    MODELS,
-    NONE,
-    RIG,
-    Factory,
-    make_scene,
-    require,
-    require_same,
-    require_status,
-    started,
-    tracked,
-)
+    DT, MODELS, NONE, RIG, Factory, make_scene, require, require_same, require_status, started, tracked,
+)  # fmt: skip
 from slam.worlds import open_world
 
 METHODS = ("predict", "update", "add", "remove", "estimate", "positions", "trajectory")
@@ -38,12 +28,12 @@ def predictions_have_their_shapes(factory: Factory) -> None:
     """`predict` gives a `Prediction` of finite arrays, a row for each landmark in view."""
     backend, _ = started(factory)
     prediction = backend.predict(DT)
-    require(isinstance(prediction, Prediction), f"predict returned {type(prediction).__name__}, not a Prediction")
-    rows = len(prediction.ids)
+    _require_kind(prediction, Prediction, "predict")
+    n = len(prediction.ids)
     require_same(prediction.stamp, DT, "stamp of the prediction")
-    _require_arrays(prediction, {"T_world_left": (4, 4), "covariance": (6, 6), "ids": (rows,)}, "predict")
-    _require_arrays(prediction, {"uv_left": (rows, 2), "uv_right": (rows, 2), "innovation": (rows, 2, 2)}, "predict")
-    require(rows > 0, "predict lists no landmark, but the camera has hardly moved since they were added")
+    shapes = {"T_world_left": (4, 4), "covariance": (6, 6), "ids": (n,), "uv_left": (n, 2), "uv_right": (n, 2)}
+    _require_arrays(prediction, {**shapes, "innovation": (n, 2, 2)}, "predict")
+    require(n > 0, "predict lists no landmark, but the camera has hardly moved since they were added")
     require(np.isin(prediction.ids, backend.estimate().ids).all(), "predict lists a landmark that is not in the map")
 
 
@@ -51,8 +41,9 @@ def updates_are_reported(factory: Factory) -> None:
     """`update` gives an `UpdateReport` that says which landmarks were used; a frame without any is no error."""
     backend, seen = started(factory)
     backend.predict(DT)
-    report = backend.update(make_scene(2).frames[1].select(np.isin(make_scene(2).frames[1].ids, seen.ids)))
-    require(isinstance(report, UpdateReport), f"update returned {type(report).__name__}, not an UpdateReport")
+    second = make_scene(2).frames[1]
+    report = backend.update(second.select(np.isin(second.ids, seen.ids)))
+    _require_kind(report, UpdateReport, "update")
     require_status(report, UpdateStatus.OK, "an update with good observations")
     require(len(report.used) > 0 and np.isin(report.used, seen.ids).all(), "update used none of the good observations")
     backend.predict(2 * DT)
@@ -63,9 +54,9 @@ def estimates_have_their_shapes(factory: Factory) -> None:
     """`estimate` gives an `Estimate` of finite arrays; with ``landmarks=False`` the pose alone."""
     backend, seen = started(factory)
     found, n = backend.estimate(), len(seen)
-    require(isinstance(found, Estimate), f"estimate returned {type(found).__name__}, not an Estimate")
-    _require_arrays(found, {"T_world_left": (4, 4), "covariance": (6, 6), "ids": (n,)}, "estimate")
-    _require_arrays(found, {"positions": (n, 3), "covariances": (n, 3, 3)}, "estimate")
+    _require_kind(found, Estimate, "estimate")
+    shapes = {"T_world_left": (4, 4), "covariance": (6, 6), "ids": (n,), "positions": (n, 3), "covariances": (n, 3, 3)}
+    _require_arrays(found, shapes, "estimate")
     require_same(np.sort(found.ids), np.sort(seen.ids), "landmarks of the estimate, against those that were added")
     require_same(backend.positions(found.ids), found.positions, "positions(ids), against those of the estimate", 0.1)
     require_same(backend.estimate(landmarks=False).ids, NONE, "landmarks of estimate(landmarks=False)")
@@ -80,9 +71,8 @@ def landmarks_can_be_removed(factory: Factory) -> None:
 
 def trajectory_has_a_pose_for_every_prediction(factory: Factory) -> None:
     """`trajectory` gives a `Trajectory` with every stamp predicted so far."""
-    backend = tracked(factory, make_scene(4))[0].backend
-    path = backend.trajectory()
-    require(isinstance(path, Trajectory), f"trajectory returned {type(path).__name__}, not a Trajectory")
+    path = tracked(factory, make_scene(4))[0].backend.trajectory()
+    _require_kind(path, Trajectory, "trajectory")
     require_same(path.stamps, DT * np.arange(4), "stamps of the trajectory", 1e-12)
 
 
@@ -93,6 +83,10 @@ def a_run_comes_to_its_end(factory: Factory) -> None:
     results = [system.process_features(world.observations(k)) for k in range(_FRAMES)]
     lost = [r for r in results[1:] if r.status != "tracked"]
     require(not lost, f"a run over a built-in world: {len(lost)} of {_FRAMES - 1} frames not tracked")
+
+
+def _require_kind(found: object, kind: type, method: str) -> None:
+    require(isinstance(found, kind), f"{method} returned {type(found).__name__}, not a {kind.__name__}")
 
 
 def _require_arrays(found: object, shapes: dict[str, tuple[int, ...]], method: str) -> None:
