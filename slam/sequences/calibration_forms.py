@@ -83,7 +83,9 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             long = isinstance(event, yaml.ScalarEvent) and len(event.value) > _LONGEST
             if depth > _DEEPEST or long or isinstance(event, yaml.AliasEvent):
-                what = "nested too deeply" if depth > _DEEPEST else "a value too long" if long else "no aliases are read"
+                what = (
+                    "nested too deeply" if depth > _DEEPEST else "a value too long" if long else "no aliases are read"
+                )
                 row = event.start_mark.line + 1  # type: ignore[union-attr]
                 raise CalibrationError(f"{path}, row {row}: {what} for a calibration")
         node = yaml.load(text, loader)

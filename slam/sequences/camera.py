@@ -68,16 +68,17 @@ class CameraSequence:
         wait = number(options, "wait", 0.0, _LONGEST_WAIT)
         self._wait = WAIT if wait is None else wait
         self._origin = time.time() - time.monotonic()
-        self._cameras: _Cameras | None = self._open()
+        self._cameras: _Cameras | None
+        self._cameras = cameras = self._open()
         try:
             missing = f"{self.name}: there is no calibration.yaml or the like in {Path.cwd()}"
             missing += f"; name the file: '{self.name}?calibration=FILE'"
             paths = rigs.calibration_files(Path.cwd(), options, missing)
-            _, left, _ = self._waited(self._cameras.read, "it is open, but gives no images")  # some take a moment
+            _, left, _ = self._waited(cameras.read, "it is open, but gives no images")  # some take a moment
             self.rig = self._rig(paths, (left.shape[1], left.shape[0]), options)
             self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
         except BaseException:
-            self._cameras.release()
+            cameras.release()
             raise
 
     def _rig(self, paths: list[Path], size: Size, options: Mapping[str, str]) -> StereoRig:

@@ -35,7 +35,9 @@ def open_device(address: str, width: int | None = None, height: int | None = Non
     Args:
         address: a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address
             of a network.
-        width, height, fps: asked of the camera [px], [1/s]; None for its own choice.
+        width: asked of the camera [px]; None for its own choice.
+        height: the same.
+        fps: the same [1/s].
 
     Raises:
         SequenceError: it cannot be opened, or is a file.

@@ -20,8 +20,8 @@ Masks = tuple[np.ndarray | None, np.ndarray | None]
 def at_the_door(frame: StereoFrame, rig: StereoRig, masks: Masks) -> StereoFrame:
     """The frame as the rig sees it: turned as the rig is, with the masks of both cameras."""
     if rig.turns:
-        turned = [None if i is None else np.ascontiguousarray(np.rot90(i, rig.turns)) for i in (frame.left, frame.right)]
-        frame = replace(frame, left=turned[0], right=turned[1])
+        right = None if frame.right is None else np.ascontiguousarray(np.rot90(frame.right, rig.turns))
+        frame = replace(frame, left=np.ascontiguousarray(np.rot90(frame.left, rig.turns)), right=right)
     none = masks[0] is None and masks[1] is None
     return frame if none else replace(frame, left_mask=masks[0], right_mask=masks[1])
 

@@ -78,7 +78,9 @@ def _open(folder: Path, where: Layout, options: Given) -> RecordedSequence:
     with FaultLog(warnings) as faults:
         listings = [numbered(side, faults) for side in (where.left, where.right)]
         dated = where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options)
-        origin, times = _dates(where.times, faults) if dated else (None, read_times(folder, options, faults, where.times))
+        origin, times = (
+            _dates(where.times, faults) if dated else (None, read_times(folder, options, faults, where.times))
+        )
         left, source = pair_up(listings[0], listings[1], options, faults, times, by_number=True)
         assert source.size is not None
         rig, T_left_reference = _rig(folder, where, source.size, options)

@@ -21,7 +21,10 @@ OPTIONS = CALIBRATION_OPTIONS
 _SUFFIXES = (".yaml", ".yml", ".xml", ".json", ".conf")
 _STEMS = ("calibration", "calib", "stereo", "camchain")
 _PAIRS = (("intrinsics", "extrinsics"), ("left", "right"))
-_USUAL = (*((stem + s,) for stem in _STEMS for s in _SUFFIXES), *((a + s, b + s) for a, b in _PAIRS for s in _SUFFIXES[:2]))
+_USUAL = (
+    *((stem + s,) for stem in _STEMS for s in _SUFFIXES),
+    *((a + s, b + s) for a, b in _PAIRS for s in _SUFFIXES[:2]),
+)
 _KITTI = ("calib.txt", "calib_cam_to_cam.txt")
 _SENSORS = tuple((f"{root}cam0/sensor.yaml", f"{root}cam1/sensor.yaml") for root in ("", "mav0/"))
 

@@ -46,7 +46,9 @@ class CameraInfo:
             raise CalibrationError(f"{recording.path}: topic {topic} has no messages")
         with naming_recording(recording.path), naming(Path(topic)):
             shapes = {"K": (3, 3), "D": None, "R": (3, 3), "P": (3, 4)}
-            matrices = {n: array(getattr(message, n, getattr(message, n.lower(), None)), n, s) for n, s in shapes.items()}
+            matrices = {
+                n: array(getattr(message, n, getattr(message, n.lower(), None)), n, s) for n, s in shapes.items()
+            }
             size = int(message.width), int(message.height)
             roi = int(message.roi.width), int(message.roi.height)
             if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):

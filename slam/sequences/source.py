@@ -17,7 +17,13 @@ from slam.sequences.base import Images
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import WIDEST_TOLERANCE, Given
 from slam.sequences.images import (
-    IMAGE_SUFFIXES, Size, halves, read_image, recorded_size, require_same_size, size_text,
+    IMAGE_SUFFIXES,
+    Size,
+    halves,
+    read_image,
+    recorded_size,
+    require_same_size,
+    size_text,
 )  # fmt: skip
 from slam.sequences.names import MOST_FRAMES, keys_of, natural, same_order, stem
 from slam.sequences.tables import read_rows, seconds
@@ -270,7 +276,7 @@ def hardware_tolerance(listing: Listing, told: bool = False) -> int:
 
 
 def _stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:
-    """Rows and stamps of the frames that have a time, which most must; `times` (T,) is by frame number, NaN for none."""
+    """Rows and stamps of the frames that have a time, as most must; `times` (T,) is by frame number, NaN for none."""
     inside = numbers < len(times)
     stamps = np.where(inside, times[np.minimum(numbers, len(times) - 1)], np.nan)
     good = np.flatnonzero(np.isfinite(stamps))

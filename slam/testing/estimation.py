@@ -10,8 +10,23 @@ from slam.data import Observations, UpdateReport, UpdateStatus
 from slam.geometry import se3
 from slam.models import MotionModel
 from slam.testing.scene import (
-    DT, GENERAL_RIG, MODELS, RIG, SIGMA, Factory, Run, Scene, all_but_the_last, assert_covariance, assert_near,
-    make_scene, require, require_same, require_status, started, tracked,
+    DT,
+    GENERAL_RIG,
+    MODELS,
+    RIG,
+    SIGMA,
+    Factory,
+    Run,
+    Scene,
+    all_but_the_last,
+    assert_covariance,
+    assert_near,
+    make_scene,
+    require,
+    require_same,
+    require_status,
+    started,
+    tracked,
 )  # fmt: skip
 
 _OFTEN = 15  # measurements of a landmark

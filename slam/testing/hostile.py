@@ -107,7 +107,7 @@ def rows_that_no_point_explains_are_rejected(factory: Factory) -> None:
 def landmarks_are_placed_in_front(factory: Factory) -> None:
     """`place` refuses landmarks behind the camera; a back end without it has nothing to refuse."""
     backend: Any = factory(RIG, models=MODELS)
-    if not isinstance(backend, MapBackend):
+    if not hasattr(backend, "place"):
         return
     raises(MeasurementError, backend.place, *_cloud([7], [[0.0, 0.0, 5.0]]), what="place before the first predict")
     backend.predict(0.0)
@@ -314,4 +314,3 @@ def assert_definite(P: Array, what: str) -> None:
     sigma = np.sqrt(variances)
     least = np.linalg.eigvalsh(P / sigma[:, :, None] / sigma[:, None, :]).min(initial=0.0)
     require(least > -_ROUNDING, f"{what}: a covariance is not positive definite ({least:.2g} of its variances)")
-

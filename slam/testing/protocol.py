@@ -11,8 +11,21 @@ from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.testing.scene import (
-    DT, MODELS, NONE, RIG, Factory, Run, assert_covariance, assert_near, make_scene, raises, require, require_same,
-    require_status, started, tracked,
+    DT,
+    MODELS,
+    NONE,
+    RIG,
+    Factory,
+    Run,
+    assert_covariance,
+    assert_near,
+    make_scene,
+    raises,
+    require,
+    require_same,
+    require_status,
+    started,
+    tracked,
 )  # fmt: skip
 
 

@@ -9,7 +9,17 @@ from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
 from slam.system import StereoSlam
 from slam.testing.scene import (
-    DT, MODELS, NONE, RIG, Factory, make_scene, require, require_same, require_status, started, tracked,
+    DT,
+    MODELS,
+    NONE,
+    RIG,
+    Factory,
+    make_scene,
+    require,
+    require_same,
+    require_status,
+    started,
+    tracked,
 )  # fmt: skip
 from slam.worlds import open_world
 

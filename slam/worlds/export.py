@@ -106,7 +106,10 @@ def _write_images(
             images, nanoseconds = [frame.left, frame.right], round(frame.stamp * 1e9)
             if truth_images:
                 depth = np.rint(sequence.depth(k) * steps)
-                images += [np.where(depth < 65536, depth, 0).astype(np.uint16), sequence.object_ids(k).astype(np.uint16)]
+                images += [
+                    np.where(depth < 65536, depth, 0).astype(np.uint16),
+                    sequence.object_ids(k).astype(np.uint16),
+                ]
             for name, table, image in zip(names, tables, images):
                 if image is not None:
                     write_png(root / name / "data" / f"{nanoseconds}.png", image)

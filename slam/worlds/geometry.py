@@ -152,14 +152,14 @@ class RectangleArrays:
         """Stack rectangles, each in its own body frame."""
         rows = list(rectangles)
         vectors = [np.array([getattr(r, f.name) for r in rows], float).reshape(-1, 3) for f in fields(cls)[:4]]
-        return cls(*vectors, np.array([r.body for r in rows], np.int64))
+        origin, along, down, normal = vectors
+        return cls(origin, along, down, normal, np.array([r.body for r in rows], np.int64))
 
     def placed(self, T_world_body: Array) -> RectangleArrays:
         """In world coordinates, for body poses (B + 1, 4, 4) whose row 0 is the identity."""
-        columns = [turned(v, self.body, T_world_body) for v in (self.origin, self.along, self.down, self.normal)]
-        if columns[0] is not self.origin:
-            columns[0] += T_world_body[self.body, :3, 3]
-        return RectangleArrays(*columns, self.body)
+        vectors = (self.origin, self.along, self.down, self.normal)
+        origin, along, down, normal = (turned(v, self.body, T_world_body) for v in vectors)
+        return RectangleArrays(origin + T_world_body[self.body, :3, 3], along, down, normal, self.body)
 
     def select(self, rows: np.ndarray) -> RectangleArrays:
         """These rows."""

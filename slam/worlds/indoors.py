@@ -14,6 +14,7 @@ from slam.worlds.geometry import BACK, DOWN, FACES, FORWARD, LEFT, RIGHT, Parts,
 from slam.worlds.paths import camera_poses, carried, clock, placed, sway, through, watching, yaw_pitch_roll
 from slam.worlds.surfaces import Material, Signs
 
+
 def carton(size: Array, lowest: Array, body: int, seed: int) -> list[Rectangle]:
     """All six sides of a printed carton with edges `size` (3,) [m] from its `lowest` corner (3,) in body axes."""
     return crate(size, Material(0, 0, "carton", 10 * seed, 250, (0.01, 0.03)), lowest, body)

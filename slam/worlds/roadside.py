@@ -96,7 +96,9 @@ def surroundings(layout: int) -> list[Rectangle]:
         ((WEST, y2 + WEST), (END, y2 + WEST)),
         ((END, y2 + WEST), (END, y2 + EAST)),
     ]
-    out = [house for number, row in enumerate(rows) for house in _houses(*row, np.random.default_rng([layout, 44, number]))]
+    out = [
+        house for number, row in enumerate(rows) for house in _houses(*row, np.random.default_rng([layout, 44, number]))
+    ]
     first = Material(width, y2 + 30 + EAST, "road", layout, 0.3, (0.05, 0.3))
     second = Material(-END + WEST, width, "road_across", layout + 1, 0.3, (0.05, 0.3))
     out += [rectangle(m, (x, y2 + EAST, 0), RIGHT, BACK) for m, x in ((first, WEST), (second, END))]

@@ -19,7 +19,6 @@ from slam.geometry.trajectory import Trajectory
 from slam.showing import sequence_html, sequence_line
 from slam.worlds.appearance import Appearance, appearance
 from slam.worlds.faults import Faults
-from slam.worlds.geometry import Landmarks
 from slam.worlds.observe import SimulatedFeatures, simulate
 from slam.worlds.world import World
 

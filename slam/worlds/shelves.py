@@ -40,7 +40,12 @@ def paint_bay(bay: Bay, density: float) -> np.ndarray:
 
 
 def _book(
-    page: Page, cloth: np.ndarray, size: tuple[float, float], place: tuple[float, float, float], label: float, looks: Rng
+    page: Page,
+    cloth: np.ndarray,
+    size: tuple[float, float],
+    place: tuple[float, float, float],
+    label: float,
+    looks: Rng,
 ) -> None:
     """One book of a width and height: its spine painted upright, leaned over if it leans, and put in its place."""
     (width, height), (left, top, lean) = size, place

@@ -17,7 +17,7 @@ import numpy as np
 from slam.commands.cli import main
 from tests.fuzz.harness import LONGEST_LINE, Broken, Subject
 from tests.fuzz.hostile import NUMBERS, PATHS, choose
-from tests.fuzz.readers import FORMATS, mutate, write
+from tests.fuzz.readers import mutate, some_format, write
 from tests.fuzz.settings import TEXTS
 
 _RANGES = (
@@ -56,10 +56,10 @@ def _arguments(rng: np.random.Generator, folder: Path) -> list[str]:
     """A command line with one or two hostile options."""
     sequence = "synthetic:desk?frames=2&width=96&height=72"
     if rng.random() < 0.3:
-        files = choose(rng, FORMATS)()
+        files, sequence = some_format(rng)
         mutate(rng, files)
-        write(files, folder / "sequence")
-        sequence = str(folder / "sequence")
+        write(files, folder / "tree")
+        sequence = str(folder / "tree" / sequence)
     name = choose(rng, ("run", "run", "run", "run", "replay", "render", "view", "nothing"))
     out = str(folder / "out")
     if name == "replay":

@@ -4,49 +4,20 @@ from __future__ import annotations
 
 import os
 import struct
+import tempfile
 import zlib
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 import slam
+from tests import recordings
 from tests.fuzz.harness import Broken, Subject
 from tests.fuzz.hostile import NUMBERS, PATHS, XML_BOMBS, YAML_BOMBS, broken_bytes, broken_text, choose
 
-WIDTH, HEIGHT, FRAMES = 64, 48, 4
-T0, STEP = 1_403_715_273_262_142_976, 50_000_000
-
 Files = dict[str, bytes]
-
-_SENSOR = """%YAML:1.0
-T_BS:
-  cols: 4
-  rows: 4
-  data: [1, 0, 0, {x}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
-resolution: [64, 48]
-camera_model: pinhole
-intrinsics: [50.0, 51.0, 31.5, 23.5]
-distortion_model: radial-tangential
-distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]
-"""
-
-_STORAGE = """%YAML:1.0
----
-K1: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 50., 0., 31.5, 0., 50., 23.5, 0., 0., 1. ]
-K2: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 50., 0., 31.5, 0., 50., 23.5, 0., 0., 1. ]
-R: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]
-T: [ -0.2, 0., 0. ]
-"""
 
 _OXTS = "49.0 8.4 112.8 0.02 0.01 -1.2 1 1 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 4 9 4 4 0\n"
 
@@ -54,93 +25,68 @@ _OXTS = "49.0 8.4 112.8 0.02 0.01 -1.2 1 1 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 4 9
 @cache
 def image(seed: int, ending: str = ".png") -> bytes:
     """A small image file."""
-    pixels = np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
-    return cv2.imencode(ending, pixels)[1].tobytes()
+    return cv2.imencode(ending, recordings.picture(seed))[1].tobytes()
 
 
-def euroc() -> Files:
-    """A folder in EuRoC's format, with ground truth."""
-    files: Files = {}
-    stamps = [T0 + k * STEP for k in range(FRAMES)]
-    for number, cam in enumerate(("cam0", "cam1")):
-        files[f"mav0/{cam}/sensor.yaml"] = _SENSOR.format(x=0.11 * number).encode()
-        files[f"mav0/{cam}/data.csv"] = "".join(["#t,name\n", *(f"{s},{s}.png\n" for s in stamps)]).encode()
-        files |= {f"mav0/{cam}/data/{s}.png": image(10 * number + k) for k, s in enumerate(stamps)}
-    rows = "".join(f"{s},{0.1 * k},0,1,1,0,0,0\n" for k, s in enumerate(stamps))
-    files["mav0/state_groundtruth_estimate0/data.csv"] = f"#t,p,q\n{rows}".encode()
-    return files
-
-
-def kitti() -> Files:
-    """A sequence of KITTI odometry, with poses."""
-    files = {f"image_{c}/{k:06d}.png": image(10 * c + k) for c in (0, 1) for k in range(FRAMES)}
-    P = "P{}: 50 0 31.5 {} 0 50 23.5 0 0 0 1 0\n"
-    files["calib.txt"] = (P.format(0, 0) + P.format(1, -25)).encode()
-    files["times.txt"] = "".join(f"{0.1 * k:e}\n" for k in range(FRAMES)).encode()
-    files["poses.txt"] = "".join(f"1 0 0 0 0 1 0 0 0 0 1 {1.5 * k}\n" for k in range(FRAMES)).encode()
-    return files
-
-
-def raw() -> Files:
-    """A drive of KITTI raw, with OXTS records and GPS."""
-    files: Files = {}
-    for c in ("00", "01"):
-        files |= {f"image_{c}/data/{k:010d}.png": image(10 * int(c) + k) for k in range(FRAMES)}
-        times = "".join(f"2011-09-26 13:10:{51 + 0.1 * k:.9f}\n" for k in range(FRAMES))
-        files[f"image_{c}/timestamps.txt"] = times.encode()
-    P = "S_rect_{0}: 64 48\nP_rect_{0}: 50 0 31.5 {1} 0 50 23.5 0 0 0 1 0\n"
-    files["calib_cam_to_cam.txt"] = (
-        P.format("00", 0) + P.format("01", -25) + "R_rect_00: 1 0 0 0 1 0 0 0 1\n"
-    ).encode()
+def raw(folder: Path) -> Path:
+    """A drive of KITTI raw, with OXTS records too."""
+    drive = recordings.write_raw(folder / "day")
     for name in ("velo_to_cam", "imu_to_velo"):
-        files[f"calib_{name}.txt"] = b"R: 1 0 0 0 1 0 0 0 1\nT: 0.1 0.2 0.3\n"
-    files["oxts/timestamps.txt"] = files["image_00/timestamps.txt"]
-    files |= {f"oxts/data/{k:010d}.txt": _OXTS.replace("8.4", f"8.400{k}").encode() for k in range(FRAMES)}
-    files["ego_gps_m.txt"] = "".join(f"{k} {k} 0 0\n" for k in range(FRAMES)).encode()
-    return files
+        (drive.parent / f"calib_{name}.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: 0.1 0.2 0.3\n")
+    (drive / "oxts" / "data").mkdir(parents=True)
+    (drive / "oxts" / "timestamps.txt").write_text((drive / "image_00" / "timestamps.txt").read_text())
+    for k in range(6):
+        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(_OXTS.replace("8.4", f"8.400{k}"))
+    return drive
 
 
-def folders() -> Files:
-    """Two folders of images with OpenCV's calibration."""
-    files = {
-        f"{side}/{k:03d}.png": image(10 * i + k) for i, side in enumerate(("left", "right")) for k in range(FRAMES)
-    }
-    files["calibration.yaml"] = _STORAGE.encode()
-    files["times.txt"] = "".join(f"{0.1 * k}\n" for k in range(FRAMES)).encode()
-    return files
-
-
-@lru_cache(maxsize=1)
-def _video() -> bytes:
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = f"{folder}/v.avi"
-        writer = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"MJPG"), 20, (WIDTH, HEIGHT))
-        for k in range(FRAMES):
-            writer.write(np.random.default_rng(k).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
-        writer.release()
-        return Path(path).read_bytes()
-
-
-def videos() -> Files:
+def videos(folder: Path) -> Path:
     """Two videos with OpenCV's calibration."""
-    return {"left.avi": _video(), "right.avi": _video(), "calibration.yaml": _STORAGE.encode()}
+    recordings.write_storage(folder / "calibration.xml", recordings.stereo_entries())
+    for side in ("left", "right"):
+        writer = cv2.VideoWriter(str(folder / f"{side}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 20, (64, 48))
+        for k in range(4):
+            writer.write(np.random.default_rng(k).integers(0, 256, (48, 64, 3), dtype=np.uint8))
+        writer.release()
+    return folder
 
 
-FORMATS = (euroc, kitti, raw, folders, videos)
+def folders(folder: Path) -> Path:
+    """Two folders of images with OpenCV's calibration in JSON, and times."""
+    root = recordings.write_two_folders(folder)
+    (root / "calibration.yaml").unlink()
+    recordings.write_storage(root / "calibration.json", recordings.stereo_entries())
+    (root / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(6)))
+    return root
+
+
+WRITERS = (recordings.write_euroc, recordings.write_kitti, raw, recordings.write_two_folders, folders, videos)
+
+
+@cache
+def _written(number: int) -> tuple[Files, str]:
+    """The files of a format, by their names, and the folder of the sequence among them."""
+    with tempfile.TemporaryDirectory() as name:
+        sequence = WRITERS[number](Path(name))
+        files = {str(p.relative_to(name)): p.read_bytes() for p in sorted(Path(name).rglob("*")) if p.is_file()}
+        return files, str(sequence.relative_to(name))
+
+
+def some_format(rng: np.random.Generator) -> tuple[Files, str]:
+    """The files of one of the formats, and the folder of the sequence among them."""
+    files, sequence = _written(int(rng.integers(len(WRITERS))))
+    return dict(files), sequence
 
 
 def read_folder(rng: np.random.Generator, folder: Path) -> None:
     """Write a mutated folder and read it to its end."""
-    root = folder / "sequence"
-    files = choose(rng, FORMATS)()
+    files, sequence = some_format(rng)
     for _ in range(int(rng.integers(1, 4))):
         mutate(rng, files)
-    write(files, root)
+    write(files, folder / "tree")
     for _ in range(int(rng.integers(3)) // 2):
-        special(rng, root)
-    consume(str(root))
+        special(rng, folder / "tree")
+    consume(str(folder / "tree" / sequence))
 
 
 def read_path(rng: np.random.Generator, folder: Path) -> None:
@@ -148,10 +94,10 @@ def read_path(rng: np.random.Generator, folder: Path) -> None:
     if rng.random() < 0.5:
         consume(choose(rng, PATHS), frames=2)
         return
-    root = folder / "sequence"
-    write(choose(rng, FORMATS)(), root)
+    files, sequence = some_format(rng)
+    write(files, folder / "tree")
     key = choose(rng, ("left", "right", "calibration", "times", "fps", "unit", "rectified", "fisheye", "kind", "x"))
-    consume(f"{root}?{key}={choose(rng, (*PATHS, *NUMBERS))}")
+    consume(f"{folder / 'tree' / sequence}?{key}={choose(rng, (*PATHS, *NUMBERS))}")
 
 
 def consume(path: str, frames: int = 100) -> None:
@@ -193,7 +139,7 @@ def mutate(rng: np.random.Generator, files: Files) -> None:
         files[name] = hostile_truth(rng, files[name].decode("utf-8", "replace")).encode("utf-8", "replace")
     elif name.endswith((".png", ".avi")):
         files[name] = hostile_image(rng, files[name])
-    elif name.endswith(".yaml") and kind < 6:
+    elif name.endswith((".yaml", ".xml", ".json")) and kind < 6:
         bomb = choose(rng, (*YAML_BOMBS, *XML_BOMBS)).encode("utf-8", "replace")
         files[name] = choose(rng, (bomb, files[name] + bomb))
     else:
@@ -225,10 +171,8 @@ def hostile_image(rng: np.random.Generator, data: bytes) -> bytes:
     """An image with a false header, odd chunks, of another kind, or damaged."""
     kind = int(rng.integers(6))
     if kind == 0:
-        size = choose(rng, ((30_000, 30_000), (2**31 - 1, 1), (0, 0), (WIDTH, 60_000), (WIDTH, HEIGHT), (1, 1)))
-        return png(
-            size, choose(rng, (b"", rng.bytes(50), zlib.compress(bytes(WIDTH * HEIGHT)))), int(choose(rng, (8, 16, 3)))
-        )
+        size = choose(rng, ((30_000, 30_000), (2**31 - 1, 1), (0, 0), (64, 60_000), (64, 48), (1, 1)))
+        return png(size, choose(rng, (b"", rng.bytes(50), zlib.compress(bytes(64 * 48)))), int(choose(rng, (8, 16, 3))))
     if kind == 1:
         extra = chunk(
             choose(rng, (b"iCCP", b"gAMA", b"tEXt", b"zTXt", b"sRGB", b"PLTE", b"IDAT", b"tRNS")), rng.bytes(20)

@@ -1,169 +1,38 @@
-"""Small sequences of every format, written to a temporary folder."""
+"""Small sequences of every format in a temporary folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
-import numpy as np
 import pytest
 
-WIDTH, HEIGHT = 64, 48
-
-SENSOR = """%YAML:1.0
-sensor_type: camera
-T_BS:
-  cols: 4
-  rows: 4
-  data: [{T}]
-rate_hz: 20
-resolution: [{width}, {height}]
-camera_model: pinhole
-intrinsics: [50.0, 51.0, 31.5, 23.5]
-distortion_model: {model}
-distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]
-"""
-
-#: Body axes as on EuRoC's sensor: the camera's x is the body's y, its y is minus the body's x.
-BODY_CAMERA = np.array([[0.0, -1.0, 0.0, 0.02], [1.0, 0.0, 0.0, -0.06], [0.0, 0.0, 1.0, 0.01], [0.0, 0.0, 0.0, 1.0]])
-
-
-def picture(seed: int, width: int = WIDTH, height: int = HEIGHT, depth: type = np.uint8) -> np.ndarray:
-    """A picture that is told from others by its mean."""
-    noise = np.random.default_rng(seed).integers(0, 4, (height, width))
-    return (10 * (seed + 1) + noise).astype(depth)
-
-
-def write_image(path: Path, seed: int, width: int = WIDTH, height: int = HEIGHT, depth: type = np.uint8) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), picture(seed, width, height, depth))
-
-
-def cut(path: Path, share: float = 0.5) -> None:
-    """Keep the first part of a file."""
-    data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * share)])
-
-
-def write_sensor(path: Path, baseline: float = 0.11, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-    """EuRoC's sensor.yaml of a camera `baseline` to the right of camera 0."""
-    T = BODY_CAMERA.copy()
-    T[:3, 3] += T[:3, 0] * baseline
-    path.parent.mkdir(parents=True, exist_ok=True)
-    numbers = ", ".join(str(x) for x in T.ravel())
-    path.write_text(SENSOR.format(T=numbers, width=size[0], height=size[1], model="radial-tangential"))
-
-
-def write_csv(camera: Path, stamps: list[int], ending: str = ".png") -> None:
-    camera.mkdir(parents=True, exist_ok=True)
-    lines = ["#timestamp [ns],filename", *(f"{s},{s}{ending}" for s in stamps)]
-    (camera / "data.csv").write_text("\n".join(lines) + "\n")
-
-
-T0 = 1_403_715_273_262_142_976
-STEP = 50_000_000
+from tests import recordings
 
 
 @pytest.fixture
 def euroc(tmp_path: Path) -> Path:
-    """Six frames in EuRoC's format, with ground truth."""
-    root = tmp_path / "V0_01"
-    stamps = [T0 + i * STEP for i in range(6)]
-    for number, cam in enumerate(("cam0", "cam1")):
-        folder = root / "mav0" / cam
-        write_csv(folder, stamps)
-        write_sensor(folder / "sensor.yaml", 0.11 * number)
-        for i, s in enumerate(stamps):
-            write_image(folder / "data" / f"{s}.png", i + 10 * number)
-    truth = root / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-    truth.parent.mkdir()
-    rows = [f"{T0 + i * STEP // 4},{0.1 * i},0,1,1,0,0,0,0.5,0,0" for i in range(24)]
-    truth.write_text("#timestamp,p,q\n" + "\n".join(rows) + "\n")
-    return root
-
-
-def projection_row(name: str, offset: float) -> str:
-    P = [50.0, 0, 31.5, offset, 0, 50.0, 23.5, 0, 0, 0, 1, 0]
-    return f"{name}: " + " ".join(f"{x:.6e}" for x in P)
+    return recordings.write_euroc(tmp_path / "V0_01")
 
 
 @pytest.fixture
 def kitti(tmp_path: Path) -> Path:
-    """Six frames of KITTI odometry in the publishers' layout, with poses; the path goes straight ahead."""
-    folder = tmp_path / "dataset" / "sequences" / "03"
-    for number in (0, 1):
-        for i in range(6):
-            write_image(folder / f"image_{number}" / f"{i:06d}.png", i + 10 * number)
-    rows = [projection_row("P0", 0), projection_row("P1", -25), projection_row("P2", 3), projection_row("P3", -22)]
-    (folder / "calib.txt").write_text("\n".join([*rows, "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0"]) + "\n")
-    (folder / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(6)))
-    poses = tmp_path / "dataset" / "poses" / "03.txt"
-    poses.parent.mkdir()
-    poses.write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {1.5 * i}\n" for i in range(6)))
-    return folder
+    return recordings.write_kitti(tmp_path / "dataset")
 
 
 @pytest.fixture
 def raw(tmp_path: Path) -> Path:
-    """Six frames of a KITTI raw drive, with a GPS track; the calibration is in the day's folder."""
-    day = tmp_path / "2011_09_26"
-    drive = day / "2011_09_26_drive_0013_sync"
-    for number in (0, 1):
-        camera = drive / f"image_{number:02d}"
-        for i in range(6):
-            write_image(camera / "data" / f"{i:010d}.png", i + 10 * number)
-        times = [f"2011-09-26 13:10:{51 + 0.1 * i:.9f}\n" for i in range(6)]
-        (camera / "timestamps.txt").write_text("".join(times))
-    rows = ["calib_time: 09-Jan-2012 13:57:47", f"S_00: {WIDTH + 10} {HEIGHT + 10}"]
-    for camera_name, offset in (("00", 0), ("01", -25)):
-        rows += [f"S_rect_{camera_name}: {WIDTH} {HEIGHT}", projection_row(f"P_rect_{camera_name}", offset)]
-    rows += ["R_rect_00: 1 0 0 0 1 0 0 0 1"]
-    (day / "calib_cam_to_cam.txt").write_text("\n".join(rows) + "\n")
-    (drive / "ego_gps_m.txt").write_text("# frame forward right third\n" + "".join(f"{i} {i} 0 0\n" for i in range(6)))
-    return drive
+    return recordings.write_raw(tmp_path / "2011_09_26")
 
 
 @pytest.fixture
 def two_folders(tmp_path: Path) -> Path:
-    """Six frames in two folders, with a calibration as ``cv2.stereoCalibrate`` users write it."""
-    folder = tmp_path / "mine"
-    for number, side in enumerate(("left", "right")):
-        for i in range(6):
-            write_image(folder / side / f"{side}_{i:03d}.png", i + 10 * number)
-    write_storage(folder / "calibration.yaml", stereo_entries())
-    return folder
-
-
-def stereo_entries(baseline: float = 0.2) -> dict[str, np.ndarray | int]:
-    K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
-    D = np.array([[-0.2, 0.05, 0.001, -0.001, 0.0]])
-    R = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
-    T = R @ np.array([[-baseline], [0.001], [0.002]])
-    return {"K1": K, "D1": D, "K2": K * [[1.1], [1.1], [1]], "D2": D / 2, "R": R, "T": T}
-
-
-def write_storage(path: Path, entries: dict[str, np.ndarray | int]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in entries.items():
-        storage.write(name, value)
-    storage.release()
+    return recordings.write_two_folders(tmp_path / "mine")
 
 
 @pytest.fixture
 def build() -> SimpleNamespace:
-    """The functions of this file that tests change a sequence with."""
+    """The functions that tests change a sequence with."""
     return SimpleNamespace(
-        cut=cut,
-        picture=picture,
-        write_image=write_image,
-        write_sensor=write_sensor,
-        write_csv=write_csv,
-        write_storage=write_storage,
-        stereo_entries=stereo_entries,
-        T0=T0,
-        STEP=STEP,
-        size=(WIDTH, HEIGHT),
-        T_body_camera=BODY_CAMERA,
+        **vars(recordings), size=(recordings.WIDTH, recordings.HEIGHT), T_body_camera=recordings.BODY_CAMERA
     )

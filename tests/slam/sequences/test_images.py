@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import struct
 import zlib
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 
 from slam.errors import SequenceError
 from slam.sequences.images import MOST_PIXELS, decode_image, read_image
+from tests.fuzz.readers import chunk, png
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
@@ -118,34 +118,25 @@ def test_the_camera_s_turned_flag_is_ignored(tmp_path: Path) -> None:
     assert read_image(tmp_path / "a.jpg").shape == SCENE.shape
 
 
-def png(width, height, pixels=b"", extra=b""):
-    def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    parts = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), extra, chunk(b"IDAT", pixels)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts) + chunk(b"IEND", b"")
-
-
 @pytest.mark.parametrize("size", [(8_000, 9_000), (30_000, 30_000), (2**31 - 1, 2**31 - 1), (0, 5)])
 def test_a_huge_image_is_refused_by_its_header(tmp_path, size):
-    (tmp_path / "a.png").write_bytes(png(*size))
+    (tmp_path / "a.png").write_bytes(png(size, b""))
     with pytest.raises(SequenceError, match=f"at most {MOST_PIXELS} pixels|damaged|not a readable"):
         read_image(tmp_path / "a.png")
 
 
 def test_an_image_of_another_size_is_not_decoded(tmp_path, monkeypatch):
-    (tmp_path / "a.png").write_bytes(png(8000, 8000))
+    (tmp_path / "a.png").write_bytes(png((8000, 8000), b""))
     monkeypatch.setattr(PIL.ImageFile.ImageFile, "load", None)
     with pytest.raises(SequenceError, match="8000x8000, not 64x48"):
         read_image(tmp_path / "a.png", (64, 48))
 
 
 def test_a_damaged_image_prints_nothing(tmp_path, capfd):
-    chunk = struct.pack(">I", 20) + b"iCCP" + bytes(20)
-    extra = chunk + struct.pack(">I", zlib.crc32(chunk[4:]))
-    (tmp_path / "a.png").write_bytes(png(64, 48, zlib.compress(bytes(65 * 48)), extra))
+    whole = png((64, 48), zlib.compress(bytes(65 * 48)))
+    (tmp_path / "a.png").write_bytes(whole[:33] + chunk(b"iCCP", bytes(20)) + whole[33:])
     assert read_image(tmp_path / "a.png").shape == (48, 64)
-    (tmp_path / "b.png").write_bytes(png(64, 48, b"no stream"))
+    (tmp_path / "b.png").write_bytes(png((64, 48), b"no stream"))
     with pytest.raises(SequenceError, match=r"b\.png"):
         read_image(tmp_path / "b.png")
     assert capfd.readouterr().err == ""
