@@ -102,11 +102,11 @@ class CameraSequence:
         return self._frames(start, stop)
 
     def _frames(self, start: int, stop: int | None) -> Iterator[StereoFrame]:
-        cameras, self._cameras = self._cameras, None
-        if cameras is not None and time.monotonic() - cameras.last_read > _OLD:
-            cameras.release()
-            cameras = None
-        cameras = cameras or self._open()
+        kept, self._cameras = self._cameras, None
+        if kept is not None and time.monotonic() - kept.last_read > _OLD:
+            kept.release()
+            kept = None
+        cameras = kept or self._open()
         index, last, expected = 0, -math.inf, recorded_size(self.rig)
         with ExitStack() as stack, FaultLog(self.warnings) as faults:
             stack.callback(lambda: cameras.release())  # whichever they are in the end

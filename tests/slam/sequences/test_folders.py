@@ -45,6 +45,27 @@ def test_an_assumed_rate_is_said_once_and_not_above_an_error(
     assert len(caplog.records) == 1
 
 
+@pytest.mark.parametrize("query", ["fps=fast", "rectified=maybe", "tolerance=0.1", "layout=stacked"])
+def test_a_wrong_option_is_said_before_anything_of_the_files(
+    two_folders: Path, caplog: pytest.LogCaptureFixture, query: str
+) -> None:
+    (two_folders / "right" / "right_003.png").unlink()
+    with pytest.raises(ConfigurationError):
+        open_sequence(f"{two_folders}?{query}")
+    assert caplog.records == []
+    assert "have no partner" in open_sequence(two_folders).warnings[0]
+    assert "have no partner" in caplog.text
+
+
+def test_kitti_s_calib_txt_beside_the_images_is_read_and_another_one_named(two_folders: Path, kitti: Path) -> None:
+    (two_folders / "calibration.yaml").unlink()
+    (two_folders / "calib.txt").write_text((kitti / "calib.txt").read_text())
+    assert open_sequence(two_folders).rig.baseline == pytest.approx(0.5)
+    (two_folders / "calib.txt").write_text("cam0=[50 0 31.5; 0 50 23.5; 0 0 1]\n")
+    with pytest.raises(CalibrationError, match=r"the calibration is missing \(calib.txt is not of KITTI's form\)"):
+        open_sequence(two_folders)
+
+
 def test_times_belong_to_the_left_images_in_order(two_folders: Path) -> None:
     (two_folders / "right" / "right_000.png").unlink()
     (two_folders / "times.txt").write_text("".join(f"{7 + i}\n" for i in range(6)))
