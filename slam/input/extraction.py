@@ -40,19 +40,12 @@ def as_frame(left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: fl
 
 @dataclass(frozen=True, eq=False)
 class Extracted:
-    """A frame and what the front end found in it.
+    """A frame and what the front end found in it."""
 
-    Attributes:
-        frame: as given.
-        features: found in it.
-        milliseconds: wall time of the extraction.
-        checksum: of the images, see `checksum_of`.
-    """
-
-    frame: StereoFrame
+    frame: StereoFrame  # as given
     features: StereoFeatures
-    milliseconds: dict[str, float]
-    checksum: tuple[int, int] | None
+    milliseconds: dict[str, float]  # wall time of the extraction
+    checksum: tuple[int, int] | None  # of the images, see `checksum_of`
 
 
 def checksum_of(frame: StereoFrame) -> tuple[int, int] | None:

@@ -28,27 +28,16 @@ _SIGMAS = 5.0  # guard: a chance of 3e-7 to be wrong
 
 @dataclass(frozen=True)
 class PairGeometry:
-    """How the matches of two images fit the rectified rig.
+    """How the matches of two images fit the rectified rig."""
 
-    Attributes:
-        matches: number of matches that agree with one another.
-        conclusive: there are more than wrong matches would give by chance; else the other numbers are zero.
-        as_given: number of matches in the same row and with positive disparity, as they must be.
-        as_swapped: likewise with left and right image exchanged.
-        without_disparity: number of matches in the same row without disparity.
-        off_rows: number of matches whose rows differ, by more than the front end finds reliably.
-        row_offset: median difference of their rows [px].
-        raw_offset: the same of the images as they are, not rectified [px].
-    """
-
-    matches: int
-    conclusive: bool = False
-    as_given: int = 0
-    as_swapped: int = 0
-    without_disparity: int = 0
-    off_rows: int = 0
-    row_offset: float = 0.0
-    raw_offset: float = 0.0
+    matches: int  # that agree with one another
+    conclusive: bool = False  # there are more than wrong ones would give by chance; else the other numbers are zero
+    as_given: int = 0  # in the same row and with positive disparity, as they must be
+    as_swapped: int = 0  # likewise with left and right image exchanged
+    without_disparity: int = 0  # in the same row without disparity
+    off_rows: int = 0  # whose rows differ, by more than the front end finds reliably
+    row_offset: float = 0.0  # median difference of their rows [px]
+    raw_offset: float = 0.0  # the same of the images as they are, not rectified [px]
 
     @property
     def swapped(self) -> bool:

@@ -67,7 +67,7 @@ class InputWarnings:
                 self._check_intervals(float(np.median(np.diff(self._stamps))))
         if not self._texture_is_known:
             self._check_texture(frame.left, len(features))
-        if _is_a_power_of_two(self._count) and self._count <= _LAST_LOOK:
+        if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK:  # a power of two
             self._check_pair(frame)
         if not self._partners_are_known and frame.right is not None:
             self._check_partners(features)
@@ -108,17 +108,13 @@ class InputWarnings:
             return
         self._partners_are_known = True
         alike = look_alikes(features)
-        found = f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image"
+        cause = ": check that the images are of two cameras at one moment, the left one first, and that the "
+        cause += "calibration is theirs"
         if 2 * alike > len(features):
-            self._warn(
-                f"{found}, because the view is a repeated pattern: {alike} of them have a look-alike in the same "
-                "image, so that which belong together cannot be told; let the view show other things too"
-            )
-        else:
-            self._warn(
-                f"{found}: check that the images are of two cameras at one moment, the left one first, and that the "
-                "calibration is theirs"
-            )
+            cause = f", because the view is a repeated pattern: {alike} of them have a look-alike in the same image, "
+            cause += "so that which belong together cannot be told; let the view show other things too"
+        found = f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image"
+        self._warn(found + cause)
 
     def _check_pair(self, frame: StereoFrame) -> None:
         """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
@@ -236,10 +232,6 @@ def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:
     """
     half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
     return float((half_view / models.motion.angular_acceleration) ** (2 / 3))
-
-
-def _is_a_power_of_two(number: int) -> bool:
-    return number & (number - 1) == 0
 
 
 def _is_image(image: object, rig: StereoRig) -> bool:

@@ -78,7 +78,6 @@ RIGHT: Sequence[Check] = (
     protocol.trajectory_has_every_stamp,
     protocol.recent_poses_fit_the_estimate,
     protocol.results_are_the_callers_own,
-    protocol.same_input_same_bytes,
     protocol.removed_landmarks_are_gone,
     hostile.queries_are_pure,
     hostile.a_stamp_has_one_update,

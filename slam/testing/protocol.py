@@ -190,15 +190,6 @@ def results_are_the_callers_own(factory: Factory) -> None:
         require_same(getattr(after, name), copy, f"{name} after the caller wrote into an array that was returned")
 
 
-def same_input_same_bytes(factory: Factory) -> None:
-    """Two runs over the same observations agree to the last bit."""
-    runs = [tracked(factory, make_scene(8))[0].backend for _ in range(2)]
-    first, second = (backend.estimate() for backend in runs)
-    for name in ("T_world_left", "covariance", "positions"):
-        require_same(getattr(second, name), getattr(first, name), f"{name} of a second run on the same input")
-    require_same(runs[1].trajectory().poses, runs[0].trajectory().poses, "path of a second run on the same input")
-
-
 def removed_landmarks_are_gone(factory: Factory) -> None:
     """Removal takes landmarks out of everything; tracking goes on; an id may come back."""
     scene = make_scene()

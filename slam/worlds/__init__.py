@@ -21,18 +21,15 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
 from slam.naming import unknown
 from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
-from slam.worlds.scenes import SCENES, Scene, build
+from slam.worlds.scenes import SCENES, Scene, assemble
 from slam.worlds.sequence import WorldSequence
 from slam.worlds.world import World
 
 __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world", "options"]
 
 #: Options that change the world itself; the others only change how it is recorded.
-_RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"} | {
-    "seed",
-    "focal_error",
-    "turn_error",
-}
+_RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"}
+_RECORDING_ONLY |= {"seed", "focal_error", "turn_error"}
 
 
 def names() -> list[str]:
@@ -95,7 +92,8 @@ def _scene(name: str) -> Scene:
 @lru_cache(maxsize=8)
 def _build(name: str, key: tuple[tuple[str, Any], ...]) -> World:
     """A world, kept for the next recording of it: Monte-Carlo runs differ in `seed` alone."""
-    return build(name, dict(key))
+    scene = SCENES[name]
+    return assemble(name, scene, dict(key), scene.build(dict(key)))
 
 
 def describe_common() -> str:

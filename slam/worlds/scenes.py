@@ -93,31 +93,22 @@ SCENES = {
 }  # fmt: skip
 
 
-def build(name: str, values: Mapping[str, Any]) -> World:
-    """The world of a scene, by the values of its options."""
-    scene = SCENES[name]
-    return assemble(name, scene, values, scene.build(values))
-
-
 def assemble(name: str, scene: Scene, values: Mapping[str, Any], parts: Parts) -> World:
     """A world from its parts, with its landmarks chosen."""
     rng = np.random.default_rng([values["layout"], 31])
     landmarks = place_landmarks(parts.rectangles, values["density"], rng, scene.alike)
     objects = np.zeros((0, len(parts.stamps), 4, 4)) if parts.objects is None else parts.objects
-    focal, width = _FOCAL[scene.kind]
-    rig = make_rig(values, focal * values["width"] / width)
+    focal, usual = _FOCAL[scene.kind]
+    width, height, baseline = values["width"], values["height"], values["baseline"]
+    focal = focal * width / usual
+    if values["rig"] == "rectified":
+        rig = StereoRig.rectified_pair(focal, (width - 1) / 2, (height - 1) / 2, baseline, width, height)
+    else:
+        rig = toed_in_rig(focal, width, height, baseline)
     return World(
         name, scene.kind, rig, parts.stamps, parts.poses, tuple(parts.rectangles), landmarks, objects, scene.reach,
         scene.texels,
     )  # fmt: skip
-
-
-def make_rig(values: Mapping[str, Any], focal: float) -> StereoRig:
-    """The rig of the options; `focal` [px] is meant for the image width that the world has by default."""
-    width, height, baseline = values["width"], values["height"], values["baseline"]
-    if values["rig"] == "rectified":
-        return StereoRig.rectified_pair(focal, (width - 1) / 2, (height - 1) / 2, baseline, width, height)
-    return toed_in_rig(focal, width, height, baseline)
 
 
 def toed_in_rig(f: float, width: int, height: int, baseline: float) -> StereoRig:

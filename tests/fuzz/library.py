@@ -12,7 +12,8 @@ from slam.data import StereoFeatures, StereoFrame
 from slam.errors import SlamError
 from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
-from tests.fuzz.harness import Broken, Subject, require_line
+from slam.testing.hostile import assert_definite, assert_sound
+from tests.fuzz.harness import Subject, require_line
 from tests.fuzz.hostile import VALUES, choose
 from tests.fuzz.settings import scene
 
@@ -36,8 +37,8 @@ def hostile_features(rng: np.random.Generator, folder: Path) -> None:
         except SlamError as error:
             require_line(error)
         else:
-            _require_sound(result.estimate.T_world_left, result.estimate.covariance, "a frame's pose")
-    _require_estimate(system.estimate())
+            assert_definite(result.estimate.covariance[None], "a frame's pose")
+    assert_sound(system.estimate(), "the estimate")
 
 
 def _spoilt(rng: np.random.Generator, features: StereoFeatures) -> StereoFeatures:
@@ -94,34 +95,6 @@ def _images(good: np.ndarray) -> tuple[Any, ...]:
         good.astype(complex), np.full((240, 320), np.nan), good[::-1, ::-1], np.asfortranarray(good), good.tolist(),
         "x",
     )  # fmt: skip
-
-
-def _require_estimate(estimate: Any) -> None:
-    _require_sound(estimate.T_world_left, estimate.covariance, "the pose")
-    if not np.isfinite(estimate.positions).all():
-        raise Broken("a landmark's position is not finite")
-    if len(estimate.ids):
-        _require_covariances(estimate.covariances, "a landmark")
-
-
-def _require_sound(T: np.ndarray, covariance: np.ndarray, what: str) -> None:
-    if not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
-        raise Broken(f"{what} is none")
-    _require_covariances(covariance[None], what)
-
-
-def _require_covariances(P: np.ndarray, what: str) -> None:
-    """Raise where a covariance (N, k, k) is not finite, symmetric and positive definite to within its rounding."""
-    if not np.isfinite(P).all():
-        raise Broken(f"the covariance of {what} is not finite")
-    scale = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
-    if (np.diagonal(P, axis1=1, axis2=2) <= 0).any():
-        raise Broken(f"the covariance of {what} has a variance that is not positive")
-    C = P / scale[:, :, None] / scale[:, None, :]
-    if np.abs(C - np.swapaxes(C, 1, 2)).max() > 1e-6:
-        raise Broken(f"the covariance of {what} is not symmetric")
-    if (np.linalg.eigvalsh(0.5 * (C + np.swapaxes(C, 1, 2)))[:, 0] < -1e-6).any():
-        raise Broken(f"the covariance of {what} is not positive definite")
 
 
 SUBJECTS = (
