@@ -56,7 +56,10 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
             listings = by_names([s.path for s in sides], [s.names or [] for s in sides], faults)
             times = read_times(home, options, faults, *(home / name for name in _TIMES))
             _, source = pair_up(listings[0], listings[1] if right else None, options, faults, times)
-        rig = read_rig(calibration_files(home, options), source.size, options)
+        files = calibration_files(home, options)
+        if files[0].suffix == ".txt" and "calibration" not in options:  # KITTI's, of four cameras
+            faults.assume(f"{files[0]}: the images are taken as its cameras' 0 and 1 (see calibration=…)")
+        rig = read_rig(files, source.size, options)
     return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 

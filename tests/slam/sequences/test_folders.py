@@ -60,7 +60,9 @@ def test_a_wrong_option_is_said_before_anything_of_the_files(
 def test_kitti_s_calib_txt_beside_the_images_is_read_and_another_one_named(two_folders: Path, kitti: Path) -> None:
     (two_folders / "calibration.yaml").unlink()
     (two_folders / "calib.txt").write_text((kitti / "calib.txt").read_text())
-    assert open_sequence(two_folders).rig.baseline == pytest.approx(0.5)
+    sequence = open_sequence(two_folders)
+    assert sequence.rig.baseline == pytest.approx(0.5)
+    assert any("calib.txt: the images are taken as its cameras' 0 and 1" in line for line in sequence.warnings)
     (two_folders / "calib.txt").write_text("cam0=[50 0 31.5; 0 50 23.5; 0 0 1]\n")
     with pytest.raises(CalibrationError, match=r"the calibration is missing \(calib.txt is not of KITTI's form\)"):
         open_sequence(two_folders)
