@@ -17,7 +17,6 @@ from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.door import Masks, at_the_door
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import halves
 from slam.showing import sequence_html, sequence_line
 
 
@@ -95,11 +94,6 @@ class FrameSource(Protocol):
         """Times of the frames (N,) [s], strictly increasing."""
         ...
 
-    @property
-    def halves(self) -> bool:
-        """Whether left images hold both, side by side."""
-        ...
-
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode the left and right images of frames `start` to `stop`; they may end early, with a fault."""
         ...
@@ -159,8 +153,6 @@ class RecordedSequence:
         """
         with FaultLog(self.warnings) as faults, closing(self.source.images(start, stop, faults)) as images:
             for index, (left, right) in zip(range(start, stop), images):
-                if isinstance(left, np.ndarray) and self.source.halves:
-                    left, right = halves(left, f"frame {index}")
                 if isinstance(right, SequenceError) and not isinstance(left, SequenceError):
                     line = f"frame {index} is given without its right image: {right}"
                     faults.report("right images unreadable, frames given without them", line)

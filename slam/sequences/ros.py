@@ -21,7 +21,7 @@ from slam.sequences.base import Images, RecordedSequence
 from slam.sequences.calibration import naming
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given, flag, metres_per_unit
-from slam.sequences.images import Size, halved
+from slam.sequences.images import Size, halved, halves
 from slam.sequences.ros_bag import Bag, Message, naming_recording, open_bag
 from slam.sequences.ros_topics import Topics, choose_topics, rig_from_camera_infos
 from slam.sequences.source import Listing, hardware_tolerance, in_order, in_seconds, pair_listings, require_size
@@ -93,11 +93,6 @@ class RosPairs:
     rows: IntArray  # which messages of each topic are the frames, -1 for none (N, 1 or 2)
     size: Size  # width and height that every message's image must have
 
-    @property
-    def halves(self) -> bool:
-        """Both images are in one topic."""
-        return len(self.topics) == 1
-
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode the images of frames `start` to `stop`; an error in place of one that is damaged."""
         frames = [
@@ -118,6 +113,8 @@ class RosPairs:
                     if place in wanted:
                         ahead[place] = message
                 images = [self._image(bag, ahead.pop(place), place) for place in frame]
+                if len(self.topics) == 1 and isinstance(images[0], np.ndarray):
+                    images = list(halves(images[0], self.topics[0].topic))
                 yield images[0], images[1] if len(images) > 1 else None
 
     def _seek(self, wanted: set[tuple[str, int]]) -> tuple[int | None, Counter[str]]:

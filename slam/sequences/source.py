@@ -68,8 +68,11 @@ class ImagePairs:
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode the images of frames `start` to `stop`; an error in place of one that is unreadable."""
         for name, partner in zip(self.left[start:stop], self.right[start:stop]):
-            right = None if self.halves or partner is None else self._read_one(self.right_folder / partner)
-            yield self._read_one(self.left_folder / name), right
+            left = self._read_one(self.left_folder / name)
+            if self.halves:
+                yield (left, None) if isinstance(left, SequenceError) else halves(left, name)
+            else:
+                yield left, None if partner is None else self._read_one(self.right_folder / partner)
 
     def _read_one(self, path: Path) -> np.ndarray | SequenceError:
         size = self.size

@@ -17,7 +17,7 @@ from slam.sequences.base import Images
 from slam.sequences.devices import quiet_libraries, read_image
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import FASTEST, SLOWEST
-from slam.sequences.images import MOST_PIXELS, Size, halved, require_same_size
+from slam.sequences.images import MOST_PIXELS, Size, halved, halves, require_same_size
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -33,11 +33,6 @@ class VideoPairs:
     left: Path
     right: Path | None  # None where the left one has both images side by side
     size: Size  # width and height of the frames
-
-    @property
-    def halves(self) -> bool:
-        """Both images are in the left file."""
-        return self.right is None
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode frames `start` to `stop`, in grey; a video that ends too early ends the sequence with a line.
@@ -59,7 +54,7 @@ class VideoPairs:
                         faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
                 if any(image is None for image in images):
                     return
-                yield images[0], images[1] if len(images) > 1 else None
+                yield halves(images[0], str(self.left)) if self.right is None else (images[0], images[1])
 
 
 def open_videos(left: Path, right: Path | None, rate: float | None, faults: FaultLog) -> VideoPairs:
