@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from slam.errors import SequenceError
 from slam.files import expanded
@@ -21,8 +21,7 @@ _NAMES = (*SIDES, ("image_left", "image_right"))
 _TIMES = ("times.txt", "timestamps.txt")
 
 
-@dataclass(frozen=True)
-class _Side:
+class _Side(NamedTuple):
     """The images of a camera: a video, or a folder and the names in it."""
 
     path: Path
@@ -46,16 +45,16 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
     home = folder.parent if folder.is_file() else folder
     with FaultLog(warnings) as faults:
         sides = _sides(folder, options)
-        left, right = sides[0], sides[1] if len(sides) > 1 else None
+        paths, names = [side.path for side in sides], [side.names for side in sides]
         source: ImagePairs | VideoPairs
-        if right is not None and (left.names is None) != (right.names is None):
-            raise SequenceError(f"{left.path} and {right.path}: one is a video and the other is not")
-        if left.names is None:
-            source = open_videos(left.path, None if right is None else right.path, options.rate(), faults)
+        if len({own is None for own in names}) > 1:
+            raise SequenceError(f"{paths[0]} and {paths[1]}: one is a video and the other is not")
+        if names[0] is None:
+            source = open_videos(paths[0], paths[1] if len(paths) > 1 else None, options.rate(), faults)
         else:
-            listings = by_names([s.path for s in sides], [s.names or [] for s in sides], faults)
+            left, *right = by_names(paths, [own or [] for own in names], faults)
             times = read_times(home, options, faults, *(home / name for name in _TIMES))
-            _, source = pair_up(listings[0], listings[1] if right else None, options, faults, times)
+            _, source = pair_up(left, right[0] if right else None, options, faults, times)
         files = calibration_files(home, options)
         if files[0].suffix == ".txt" and "calibration" not in options:  # KITTI's, of four cameras
             faults.assume(f"{files[0]}: the images are taken as its cameras' 0 and 1 (see calibration=…)")
@@ -69,18 +68,15 @@ def _sides(folder: Path, options: Given) -> list[_Side]:
         return [_side(folder, side, options) for side in (0, 1)]
     if folder.is_file():
         return [_Side(folder)]
-    return [_found(folder / expanded(options["left"]) if "left" in options else _only(folder))]
-
-
-def _only(folder: Path) -> Path:
-    """Where the images of a folder are that has both cameras in each: in it, or in its only folder or video."""
+    if "left" in options:
+        return [_found(folder / expanded(options["left"]))]
     inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
     if any(path.suffix.lower() in IMAGE_SUFFIXES for path in inside):
-        return folder
+        return [_found(folder)]
     places = [path for path in inside if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES]
     if len(places) != 1:
         raise SequenceError(f"{folder}: {len(places)} folders and videos, where layout=sbs needs one: add left=…")
-    return places[0]
+    return [_found(places[0])]
 
 
 def _side(folder: Path, side: int, options: Given) -> _Side:
@@ -89,26 +85,26 @@ def _side(folder: Path, side: int, options: Given) -> _Side:
     if name in options:
         return _found(folder / expanded(options[name]))
     found = _by_convention(folder, side)
-    if found is not None and found.names == []:
-        raise SequenceError(f"{found.path}: no images")
     if found is None:
         raise SequenceError(f"{folder}: two cameras are needed, but there is no {name} one: add {name}=…")
-    return found
+    return _with_images(found)
 
 
 def _found(path: Path) -> _Side:
     """What a path stands for: a folder, a video, or a pattern with ``*``."""
     if "*" in path.name:
-        side = _Side(path.parent, [n for n in image_names(path.parent) if Path(n).match(path.name)])
-    elif not path.exists():
+        return _with_images(_Side(path, [n for n in image_names(path.parent) if Path(n).match(path.name)]))
+    if not path.exists():
         raise SequenceError(f"{path}: there is no such folder or video")
-    elif path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
-        return _Side(path)
-    else:
-        side = _Side(path, image_names(path))
-    if not side.names:
-        raise SequenceError(f"{path}: no images")
-    return side
+    is_video = path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+    return _Side(path) if is_video else _with_images(_Side(path, image_names(path)))
+
+
+def _with_images(side: _Side) -> _Side:
+    """A side, which must have images; a pattern's folder in the place of the pattern."""
+    if side.names == []:
+        raise SequenceError(f"{side.path}: no images")
+    return side._replace(path=side.path.parent) if "*" in side.path.name else side
 
 
 def _by_convention(folder: Path, side: int) -> _Side | None:
@@ -118,11 +114,11 @@ def _by_convention(folder: Path, side: int) -> _Side | None:
     for names in _NAMES:
         if (folder / names[side]).is_dir():
             return _Side(folder / names[side], image_names(folder / names[side]))
-    for names in _NAMES:
-        for suffix in sorted(VIDEO_SUFFIXES):
-            if (folder / f"{names[side]}{suffix}").is_file():
-                return _Side(folder / f"{names[side]}{suffix}")
-    both = None
+    films = (folder / f"{names[side]}{suffix}" for names in _NAMES for suffix in sorted(VIDEO_SUFFIXES))
+    film = next((path for path in films if path.is_file()), None)
+    if film is not None:
+        return _Side(film)
     with suppress(SequenceError):  # a folder that may not be looked into
         both = of_sides(image_names(folder))
-    return None if both is None else _Side(folder, both[side])
+        return None if both is None else _Side(folder, both[side])
+    return None

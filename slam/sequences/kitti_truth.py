@@ -33,17 +33,17 @@ class Frames(NamedTuple):
 
 
 @contextmanager
-def _optional(what: str, missing: str, faults: FaultLog) -> Iterator[None]:
+def _optional(what: str, faults: FaultLog) -> Iterator[None]:
     """Report a fault of a file that a sequence can do without."""
     try:
         yield
     except (SequenceError, CalibrationError, TrajectoryError) as error:
-        faults.report(what, f"{error}; there is no {missing}")
+        faults.report(what, f"{error}; there is no {what}")
 
 
 def read_poses(path: Path, frames: Frames, T_left_reference: Array, faults: FaultLog) -> Trajectory | None:
     """Poses of the left camera from rows of 12, one for each frame number; a fault of the file is reported."""
-    with _optional("ground truth", "ground truth", faults):
+    with _optional("ground truth", faults):
         table = Trajectory.read_kitti(path)
         inside = frames.numbers < len(table)
         if not inside.all():
@@ -65,14 +65,16 @@ def drive_truth(
     """
     stamps = dict(zip(frames.numbers.tolist(), frames.stamps.tolist()))
     world = drive.parent.parent / "data_poses" / drive.name / "cam0_to_world.txt"
-    with _optional("ground truth", "ground truth", faults):
+    with _optional("ground truth", faults):
         if world.is_file() and frames.of_reference:
-            return _poses_360(world, stamps, faults)
+            rows = [row for row in read_rows(world, _pose_row, faults) if row and row[0] in stamps]
+            table = np.array(sorted(rows)).reshape(-1, 17)
+            times = np.array([stamps[int(number)] for number in table[:, 0]])
+            return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), world)
         if (drive / "oxts").is_dir():
-            T_left_imu = T_left_camera0 @ _extrinsics(day / "calib_velo_to_cam.txt")
-            T_left_imu = T_left_imu @ _extrinsics(day / "calib_imu_to_velo.txt")
+            T_camera0_velo, T_velo_imu = (_extrinsics(day / f"calib_{n}.txt") for n in ("velo_to_cam", "imu_to_velo"))
             body = require_truth(read_oxts(drive / "oxts", origin, stamps, faults), drive / "oxts")
-            poses = body.poses @ inverse(T_left_imu)
+            poses = body.poses @ inverse(T_left_camera0 @ T_camera0_velo @ T_velo_imu)
             return Trajectory(body.stamps, inverse(poses[0]) @ poses)
     path = drive / "poses_cam0_oxts.txt"
     known = path.is_file() and frames.of_reference and not (drive / "oxts").is_dir()
@@ -83,7 +85,7 @@ def read_gps(path: Path, times: Array | None, faults: FaultLog) -> Array | None:
     """The positions-only track (N, 4): stamp [s], forward, right, third [m]; rows are ``frame forward right third``."""
     if not path.exists():
         return None
-    with _optional("GPS", "GPS track", faults):
+    with _optional("GPS track", faults):
         table = np.array([row for row in read_rows(path, _gps_row, faults) if row is not None]).reshape(-1, 4)
         if times is None:
             table[:, 0] /= RATE
@@ -98,27 +100,24 @@ def read_oxts(folder: Path, origin: int | None, frame_stamps: dict[int, float], 
     """Poses ``T_world_imu`` of the records ``data/NUMBER.txt``; the world's origin is the first record's position.
 
     Stamps come from ``timestamps.txt`` [s since `origin`, ns since 1970]; where it or `origin` is missing, a record
-    has the stamp of the frame of its number.
-
-    Raises:
-        SequenceError: there are no records, or none is readable and has a stamp.
+    has the stamp of the frame of its number. SequenceError where no record is readable and has a stamp.
     """
-    files = sorted((folder / "data").glob("*.txt"))
-    numbered = [(number, file) for file in files if (number := number_of(file.name)) is not None]
-    if not numbered:
+    numbered = [(number_of(file.name), file) for file in sorted((folder / "data").glob("*.txt"))]
+    if all(number is None for number, _ in numbered):
         raise SequenceError(f"{folder / 'data'}: no OXTS records")
     stamps, rows = frame_stamps, []
     if origin is not None and (folder / "timestamps.txt").exists():
         dates = read_rows(folder / "timestamps.txt", date_time, faults)
         stamps = {number: (row - origin) * 1e-9 for number, row in enumerate(dates) if row is not None}
     for number, file in numbered:
-        try:
-            record = read_rows(file, _record, faults)[0]
-        except SequenceError as error:
-            faults.report("OXTS records left out", f"{error}; record left out")
-            continue
-        if record is not None and number in stamps:
-            rows.append([stamps[number], *record])
+        if number is not None:
+            try:
+                record = read_rows(file, _record, faults)[0]
+            except SequenceError as error:
+                faults.report("OXTS records left out", f"{error}; record left out")
+                continue
+            if record is not None and number in stamps:
+                rows.append([stamps[number], *record])
     if not rows:
         raise SequenceError(f"{folder}: no OXTS record is readable and has a stamp")
     table = np.array(rows)
@@ -137,16 +136,7 @@ def imu_poses(records: Array) -> Array:
     east = scale * np.radians(longitude)
     north = scale * np.log(np.tan(np.radians(90 + latitude) / 2))
     position = np.stack([east, north, altitude], axis=1)
-    R = about(yaw, 2) @ about(pitch, 1) @ about(roll, 0)
-    return pose(R, position - position[0])
-
-
-def _poses_360(path: Path, stamps: dict[int, float], faults: FaultLog) -> Trajectory:
-    """KITTI-360's path of the rectified left camera: rows of a frame's number and 16 numbers of its pose."""
-    rows = [row for row in read_rows(path, _pose_row, faults) if row and row[0] in stamps]
-    table = np.array(sorted(rows)).reshape(-1, 17)
-    times = np.array([stamps[int(number)] for number in table[:, 0]])
-    return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), path)
+    return pose(about(yaw, 2) @ about(pitch, 1) @ about(roll, 0), position - position[0])
 
 
 def _pose_row(text: str) -> list[float]:
