@@ -52,9 +52,10 @@ class VideoPairs:
                 for path, image in zip(paths, images):
                     if image is None:
                         faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
-                if any(image is None for image in images):
+                whole = [image for image in images if image is not None]
+                if len(whole) < len(images):
                     return
-                yield halves(images[0], str(self.left)) if self.right is None else (images[0], images[1])
+                yield halves(whole[0], str(self.left)) if self.right is None else (whole[0], whole[1])
 
 
 def open_videos(left: Path, right: Path | None, rate: float | None, faults: FaultLog) -> VideoPairs:
