@@ -67,6 +67,7 @@ class MovingObjectDetector:
         self.config = config
         self.sigma = models.pixel_sigma
         self.models = models.objects
+        self.slide = (models.objects.drift / rig.left.fu) ** 2  # [rad² / rad]
         self.bodies: dict[int, Body] = {}
         self.tracks: Tracks | None = None
         self._stamps = np.full(config.window, np.nan)
@@ -215,7 +216,7 @@ class MovingObjectDetector:
                 continue
             members = np.flatnonzero((tracks.body == body.id) & tracks.seen)
             members = members[tracks.count(members) >= c.min_frames - 1]
-            moved = displacements(tracks, members, ages, self._poses[self.slot, :3, 3])
+            moved = displacements(tracks, members, ages, self._poses[:, :3, 3], self.slide)
             way = Way.of(body, self._stamps, self._poses, self.rig, self.sigma)
             evidence, proven = with_frame(body.evidence, moved, scene, way, body.far)
             body = replace(body, evidence=evidence, proven=body.proven or proven)
@@ -239,7 +240,7 @@ class MovingObjectDetector:
         free = np.flatnonzero(tracks.seen & (tracks.body < 0))
         rows, place = known_well(tracks, free, T_world_left, c.min_frames)
         ages = (self.slot - np.arange(c.window)) % c.window
-        moved = displacements(tracks, rows, ages, T_world_left[:3, 3])
+        moved = displacements(tracks, rows, ages, self._poses[:, :3, 3], self.slide)
         scene = classify_scene(moved, place, c.suspect, c.min_support)
         parts = moving_parts(self.bodies, tracks, ages, T_world_left, self._dt(times), c)
         tracks.doubtful[:] = False
