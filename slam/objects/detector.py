@@ -133,7 +133,8 @@ class MovingObjectDetector:
         )
         self._change_members(initializer)
         scene = self._find_bodies(initializer, T_world_left)
-        self._follow_candidates(initializer, T_world_left)
+        if self.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.objects.candidates`
+            self._follow_candidates(initializer, T_world_left)
         self._prove(scene)
         self._begin_tracks(features, local, T_world_left, landmark)
         return self._motion_labels(features)

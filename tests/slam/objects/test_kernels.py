@@ -64,10 +64,12 @@ def test_the_common_motion_solves_the_normal_equations_where_no_track_pulls():
     motion = np.array([0.01, -0.02, 0.005, 0.01, 0.02, -0.01])
     d = lag[:, None] * (np.cross(motion[:3], points) + motion[3:])
     problem = scene_kernels.normal_equations(points, d, np.repeat(1e4 * np.eye(3)[None], n, axis=0), lag)
-    found = scene_kernels.common_motion(*problem, np.ones(n, bool), np.full(6, 1e-9), 16.0, 3, 2)
-    np.testing.assert_allclose(found, motion, atol=1e-9)
-    np.testing.assert_allclose(scene_kernels.squares_against(*problem, found), 0.0, atol=1e-6)
-    np.testing.assert_allclose(scene_kernels.squares_against(*problem, np.zeros(6)), 1e4 * (d**2).sum(axis=1))
+    windows = scene_kernels.full_windows(np.ones((n, 3)), np.ones((1, 3)), n + 1)
+    asked = np.full(n + 1, 30.0)
+    group, values, alone, found, scale = scene_kernels.groups_apart(*problem, points, *windows, asked, 4, 1.0)
+    np.testing.assert_allclose(found, motion, atol=1e-6)  # a weak prior draws it to zero
+    np.testing.assert_allclose(alone, 0.0, atol=1e-4)
+    assert scale == 1.0 and not len(values) and (group == -1).all()
 
 
 def test_windows_hold_all_tracks_of_their_cells():
