@@ -79,8 +79,7 @@ def compile_objects(backend: str) -> None:
         estimator.predict(features.stamp)
         estimator.update(measured)
         landmark = np.where(np.isin(np.arange(len(features)), still[old]), ids, -1)
-        detector.classify(features, estimator.estimate(landmarks=False), landmark)
-        detector.update(estimator, features)
+        detector.step(estimator, features, estimator.estimate(landmarks=False), landmark)
         estimator.add(new)
         known = np.union1d(known, new.ids)
 

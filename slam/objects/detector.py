@@ -1,11 +1,8 @@
-"""The detector of moving objects: tracks all features, classifies which move, and keeps the bodies that they form.
-
-A step has two parts, called after the back end's update: `classify` says which features move, before any of them
-becomes a landmark; `update` estimates the bodies and reports them.
-"""
+"""The detector of moving objects: tracks all features, says which move, and estimates the bodies that they form."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -26,6 +23,7 @@ from slam.objects.bodies import (
     advanced,
     continued,
     hidden,
+    with_belief,
     with_evidence,
     with_extent,
 )
@@ -33,7 +31,7 @@ from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.candidates import Candidate, MovingTracks, follow_candidates
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import LAG, displacements, known_well
-from slam.objects.estimates import estimated
+from slam.objects.estimates import reported
 from slam.objects.estimator import FRAMES, BodyEstimator
 from slam.objects.first_frames import FirstSights, Places, moving_landmarks
 from slam.objects.following import follow
@@ -41,7 +39,7 @@ from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
 from slam.objects.proof import Way, with_frame
-from slam.objects.recovery import locate
+from slam.objects.recovery import located, observed
 from slam.objects.regions import Scene, classify_scene
 from slam.objects.revision import CorrectRows, revise_tracks
 from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_velocities, make_room, record
@@ -78,8 +76,6 @@ class MovingObjectDetector:
         self._next_body = 1
         self._estimator = BodyEstimator(rig, models)
         self._path: RecentPoses | None = None
-        self._estimate: Estimate | None = None
-        self._measuring: Array = np.zeros((0, 3))  # what measured the pose, in camera coordinates
         self._candidates: list[Candidate] = []
         self._pose_covariance: Array = np.zeros((6, 6))
         self.suspects = np.zeros(0, np.int64)
@@ -106,17 +102,18 @@ class MovingObjectDetector:
         self._first = self._first.after(ids, places, np.maximum(now - ages, 0))
         return ids[moving_landmarks(self.rig, T_world_left, self._first.of(ids), pixels, now, self.sigma, self.config)]
 
-    # ------------------------------------------------------------------------------------------- a step, first part
-
-    def classify(
-        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, still: IndexArray = NONE
-    ) -> MotionLabels:
+    def step(
+        self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,
+        still: IndexArray = NONE,
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Follow all tracks into this frame, test them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
         self._poses[self.slot], self._pose_covariance = T_world_left, estimate.covariance
-        self._estimate, self._measuring = estimate, local[(landmark >= 0) & np.isfinite(local[:, 0])]
+        measuring = local[(landmark >= 0) & np.isfinite(local[:, 0])]
+        self._path = with_estimate(self._path, estimate, self.rig, self.sigma, measuring, FRAMES + 1)
+        cameras = recent_poses(backend, FRAMES + 1, self._path, estimate.covariance)
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
@@ -124,7 +121,7 @@ class MovingObjectDetector:
             tracks, self.bodies, self._candidates, T_world_left, features, local, self._dt(times), self.rig, self.sigma,
             self.config,
         )  # fmt: skip
-        self._measure(tracks, features, local, T_world_left)
+        self._measure(tracks, features, local, cameras)
         tracks.assign_landmarks(landmark)
         tracks.still[:] = tracks.seen & among(max(len(features), 1), still)[tracks.row]
         self._fit(tracks, times)
@@ -136,8 +133,9 @@ class MovingObjectDetector:
         if self.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.objects.candidates`
             self._follow_candidates(initializer, T_world_left)
         self._prove(scene)
+        self._begin_estimates(features, cameras)
         self._begin_tracks(features, local, T_world_left, landmark)
-        return self._motion_labels(features)
+        return self._motion_labels(features), reported(self.bodies, tracks, self.config)
 
     def _begin(self, features: StereoFeatures) -> Array:
         """Move on by a frame; times of the window's slots less the present (W,) [s], zero where there is none yet."""
@@ -178,18 +176,21 @@ class MovingObjectDetector:
 
     # ------------------------------------------------------------------------------------------- measuring
 
-    def _measure(self, tracks: Tracks, features: StereoFeatures, local: Array, T_world_left: Array) -> None:
-        """Locate the bodies by their members, and add this frame's measurements to the tracks, in world coordinates."""
-        c = self.config
+    def _measure(self, tracks: Tracks, features: StereoFeatures, local: Array, cameras: RecentPoses) -> None:
+        """Estimate the bodies, and add this frame's measurements to the tracks, in world coordinates."""
+        c, T_world_left = self.config, cameras.poses[-1]
         for body in list(self.bodies.values()):
             mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
             front = (other for other in self.bodies.values() if other.proven and other.id != body.id)
             tracks.row[mine[hidden(front, T_world_left[:3, 3], tracks.position[mine])]] = -1
-            located = locate(body, tracks, features, local, T_world_left, self.rig, self.sigma, c, self._frame)
-            if located is not None:
-                times_seen = body.seen + 1
-                body = body.placed(located, self.slot, True, seen_at=features.stamp, seen=times_seen, missed=0)
-                self.bodies[body.id] = body
+            belief = located(
+                body, tracks, features, local, cameras, self._estimator, self.rig, self.sigma, c, self._frame
+            )
+            if belief is None or not self.models.known(belief.estimate):  # it begins anew once it is measured again
+                body = replace(body, belief=None)
+            else:
+                body = with_belief(body, belief, self.slot, features.stamp, c.min_speed)
+            self.bodies[body.id] = body
             mine = tracks.body == body.id
             tracks.position[mine] = transform(body.T, tracks.local[mine])
         make_room(tracks, self.slot)
@@ -290,6 +291,7 @@ class MovingObjectDetector:
         self.bodies[body.id] = body
         self._next_body = max(self._next_body, body.id + 1)
         membership.add_members(body, tracks, members, sure=True)
+        self.bodies[body.id] = with_extent(body, tracks.local[members])
 
     def _again(self, body: Body, whole: int | None) -> Body:
         """A new body, or a known one that was out of view and reappears: that keeps its id, but not its points.
@@ -311,6 +313,8 @@ class MovingObjectDetector:
         assert tracks is not None
         tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
         grown = continued(body, known)
+        own = np.flatnonzero(tracks.body == body.id)
+        membership.take_to(tracks, own, inverse(grown.T) @ body.T)
         membership.add_members(grown, tracks, mine, sure=True)
         return grown
 
@@ -391,6 +395,8 @@ class MovingObjectDetector:
         for known in older.values():
             theirs = np.flatnonzero((tracks.body == known.id) & tracks.seen)
             fewer = known.measured and len(theirs) < count and known.id != body.apart_from
+            if math.dist(body.middle, known.middle) > body.across + known.across:
+                continue
             if not fewer or not membership.moves_with(body, tracks, theirs):
                 continue
             mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
@@ -432,11 +438,13 @@ class MovingObjectDetector:
         undecided[tracks.row[near]] = undecided[tracks.row[doubtful]] = True
         return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks[landmarks >= 0])
 
-    # ------------------------------------------------------------------------------------------- a step, second part
-
-    def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
-        """Estimate the bodies, and report them."""
-        assert self.tracks is not None and self._estimate is not None
-        self._path = with_estimate(self._path, self._estimate, self.rig, self.sigma, self._measuring, FRAMES + 1)
-        cameras = recent_poses(backend, FRAMES + 1, self._path, self._estimate.covariance)
-        return estimated(self.bodies, self.tracks, self._estimator, features, cameras, self.config)
+    def _begin_estimates(self, features: StereoFeatures, cameras: RecentPoses) -> None:
+        """Begin the estimates of bodies that have none."""
+        tracks = self.tracks
+        assert tracks is not None
+        for id, body in list(self.bodies.items()):
+            if body.belief is None and body.measured:
+                mine = np.flatnonzero((tracks.body == id) & tracks.seen)
+                seen = observed(body, tracks, mine, tracks.row[mine], features, body.T)
+                belief = self._estimator.updated(None, id, seen, cameras)
+                self.bodies[id] = replace(body, belief=belief, measured_at=features.stamp)

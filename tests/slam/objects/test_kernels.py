@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.geometry.gauss_kernels import near_pairs
-from slam.geometry.se3 import exp, points_by_pose
-from slam.objects import body_kernels, scene_kernels, track_kernels
+from slam.geometry.se3 import exp
+from slam.objects import scene_kernels, track_kernels
 
 RNG = np.random.default_rng(5)
 TRACKS, SLOTS = 7, 6
@@ -90,30 +90,6 @@ def test_windows_hold_all_tracks_of_their_cells():
         assert tracks[starts[m] : starts[m + 1]].tolist() == inside
         np.testing.assert_allclose(centres[m], centre, atol=1e-12)
         np.testing.assert_allclose(widths[m], width)
-
-
-def test_a_body_is_corrected_by_the_points_that_agree():
-    """Points displaced alike and one that is far off: the correction is the Kalman update without that one."""
-    rng = np.random.default_rng(6)
-    y, sigma, count = rng.uniform(-0.3, 0.3, (7, 3)), 0.5, 7
-    change = np.array([0.02, -0.01, 0.03, 0.05, -0.02, 0.01])
-    J_body = -points_by_pose(y)
-    T = exp(np.array([0.3, -0.2, 0.1, 0.5, 1.0, -4.0]))  # T_body_left
-    gaps = J_body @ change + rng.normal(0, 1e-3, (count, 3))
-    gaps[4] += 1.0
-    seen = (y + gaps - T[:3, 3]) @ T[:3, :3]
-    J, information = rng.normal(0, 1, (count, 3, 3)) + 40 * np.eye(3), np.tile(1e4 * np.eye(3), (count, 1, 1))
-    P = np.diag([0.01] * 3 + [0.04] * 3)
-    found, agrees, enough = body_kernels.agreed_correction(
-        y, information, seen, J, T[:3, :3], T[:3, 3], P, np.linalg.inv(P), sigma, 1e-6, 11.3, 2
-    )
-    assert enough and agrees.tolist() == [m != 4 for m in range(count)]
-    B = sigma * T[:3, :3] @ np.linalg.inv(J)
-    W = np.linalg.inv(B @ np.swapaxes(B, 1, 2) + 1e-4 * np.eye(3))[agrees]
-    D = J_body[agrees]
-    normal = np.linalg.inv(P) + (np.swapaxes(D, 1, 2) @ W @ D).sum(axis=0)
-    right = (np.swapaxes(D, 1, 2) @ W @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0]
-    np.testing.assert_allclose(found, np.linalg.solve(normal, right), rtol=1e-6)
 
 
 def test_pairs_of_near_gaussians():
