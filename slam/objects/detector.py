@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import IndexArray, among, median
@@ -37,6 +34,7 @@ from slam.objects.first_frames import FirstSights, Places, moving_landmarks
 from slam.objects.following import follow
 from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
+from slam.objects.merging import merge
 from slam.objects.parts import moving_parts
 from slam.objects.proof import Way, with_frame
 from slam.objects.recovery import located, observed
@@ -46,8 +44,6 @@ from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_ve
 
 NONE = np.zeros(0, np.intp)
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
-_MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
-_DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 _ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
 
 
@@ -66,30 +62,27 @@ class MovingObjectDetector:
         self.sigma = models.pixel_sigma
         self.models = models.objects
         self.slide = (models.objects.drift / rig.left.fu) ** 2  # [rad² / rad]
-        self.bodies: dict[int, Body] = {}
-        self.tracks: Tracks | None = None
-        self._stamps = np.full(config.window, np.nan)
-        self._poses = np.tile(np.eye(4), (config.window, 1, 1))  # of the left camera in the window's frames
-        self._frame = -1
-        self._first = FirstSights.none()
+        self._estimator = BodyEstimator(rig, models)
         self._next_track = 0
         self._next_body = 1
-        self._estimator = BodyEstimator(rig, models)
-        self._path: RecentPoses | None = None
-        self._candidates: list[Candidate] = []
-        self._pose_covariance: Array = np.zeros((6, 6))
-        self.suspects = np.zeros(0, np.int64)
+        self.restart()
 
     def restart(self) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
-        self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
-        self._stamps[:], self._frame = np.nan, -1
-        self._candidates, self._first, self._path = [], FirstSights.none(), None
+        self.bodies: dict[int, Body] = {}
+        self.tracks = Tracks.empty(0, self.config.window)
+        self.suspects = np.zeros(0, np.int64)
+        self._stamps = np.full(self.config.window, np.nan)
+        self._poses = np.tile(np.eye(4), (self.config.window, 1, 1))  # of the left camera in the window's frames
+        self._frame = -1
+        self._first = FirstSights.none()
+        self._path: RecentPoses | None = None
+        self._candidates: list[Candidate] = []
+        self._pose_covariance: Array = np.zeros((6, 6))
 
     def revise(self, correct: CorrectRows) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
-        if self.tracks is not None:
-            revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, correct)
+        revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, correct)
 
     def newly_moving(
         self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
@@ -116,7 +109,6 @@ class MovingObjectDetector:
         cameras = recent_poses(backend, FRAMES + 1, self._path, estimate.covariance)
         self._advance_bodies(times)
         tracks = self.tracks
-        assert tracks is not None
         follow(
             tracks, self.bodies, self._candidates, T_world_left, features, local, self._dt(times), self.rig, self.sigma,
             self.config,
@@ -140,7 +132,7 @@ class MovingObjectDetector:
     def _begin(self, features: StereoFeatures) -> Array:
         """Move on by a frame; times of the window's slots less the present (W,) [s], zero where there is none yet."""
         dimensions = features.descriptors.shape[1]
-        if self.tracks is None or self.tracks.descriptors.shape[1] != dimensions:  # of frames without features
+        if self.tracks.descriptors.shape[1] != dimensions:  # of frames without features
             self.tracks = Tracks.empty(dimensions, self.config.window)
         self._frame += 1
         self._stamps[self.slot] = features.stamp
@@ -165,14 +157,10 @@ class MovingObjectDetector:
         for body in list(self.bodies.values()):
             fresh = (body.seen + 0.5) * dt < _ESTABLISHED  # to the nearest frame
             if now - body.seen_at > self.config.forget_after or (fresh and body.missed >= _PATIENCE + body.seen):
-                self._forget(body.id)
+                del self.bodies[body.id]
+                self.tracks.give_up(np.flatnonzero(self.tracks.body == body.id))
             else:
                 self.bodies[body.id] = advanced(body, dt, self.slot, self.models)
-
-    def _forget(self, id: int) -> None:
-        assert self.tracks is not None
-        del self.bodies[id]
-        self.tracks.give_up(np.flatnonzero(self.tracks.body == id))
 
     # ------------------------------------------------------------------------------------------- measuring
 
@@ -211,7 +199,6 @@ class MovingObjectDetector:
     def _prove(self, scene: Scene) -> None:
         """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
         c, tracks = self.config, self.tracks
-        assert tracks is not None
         ages = (self.slot - np.arange(c.window)) % c.window
         for body in list(self.bodies.values()):
             if not body.measured:
@@ -228,7 +215,6 @@ class MovingObjectDetector:
 
     def _drop(self, body: Body) -> None:
         """Let a body's tracks go; they need proof to become members of another one."""
-        assert self.tracks is not None
         membership.remove_members(self.tracks, np.flatnonzero(self.tracks.body == body.id), body)
         del self.bodies[body.id]
 
@@ -238,7 +224,6 @@ class MovingObjectDetector:
         Returns the still scene.
         """
         c, tracks, times = self.config, self.tracks, initializer.times
-        assert tracks is not None
         free = np.flatnonzero(tracks.seen & (tracks.body < 0))
         rows, place = known_well(tracks, free, T_world_left, c.min_frames)
         ages = (self.slot - np.arange(c.window)) % c.window
@@ -285,7 +270,6 @@ class MovingObjectDetector:
             far: whether they were followed for farther than they are wide already.
         """
         tracks, members = self.tracks, group.members
-        assert tracks is not None
         body = replace(initializer.body(self._next_body, tracks, group), far=far)
         body = replace(self._again(body, whole), apart_from=whole)
         self.bodies[body.id] = body
@@ -299,7 +283,6 @@ class MovingObjectDetector:
         A part of the body `whole` is compared with earlier parts of that body only.
         """
         tracks, known = self.tracks, None
-        assert tracks is not None
         parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
         known = membership.reappeared(parts, body)
         if known is None:
@@ -307,21 +290,9 @@ class MovingObjectDetector:
         tracks.give_up(np.flatnonzero(tracks.body == known.id))
         return continued(body, known)
 
-    def _in_place_of(self, known: Body, body: Body, mine: NDArray[np.intp]) -> Body:
-        """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
-        tracks = self.tracks
-        assert tracks is not None
-        tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
-        grown = continued(body, known)
-        own = np.flatnonzero(tracks.body == body.id)
-        membership.take_to(tracks, own, inverse(grown.T) @ body.T)
-        membership.add_members(grown, tracks, mine, sure=True)
-        return grown
-
     def _follow_candidates(self, initializer: BodyInitializer, T_world_left: Array) -> None:
         """Follow the regions that may move; one that has moved for certain becomes a body."""
         c, tracks, times = self.config, self.tracks, initializer.times
-        assert tracks is not None
         rows = np.flatnonzero(tracks.seen & (tracks.body < 0) & ~tracks.still)
         rows = rows[tracks.count(rows) >= c.min_frames - 1]
         motion = constant_velocity(tracks, rows, times, c.max_speed)
@@ -349,7 +320,6 @@ class MovingObjectDetector:
     def _change_members(self, initializer: BodyInitializer) -> None:
         """Update the bodies' members; bodies that do not move are dropped."""
         tracks = self.tracks
-        assert tracks is not None
         measured = {body.id: body for body in self.bodies.values() if body.measured}
         resolved = {body.id for body in self.bodies.values() if initializer.resolves(body.T[:3, 3])}
         gains = membership.update_members(measured, resolved, tracks, self.slot, self.config)
@@ -361,58 +331,11 @@ class MovingObjectDetector:
             elif id in gains:
                 mine = np.flatnonzero((tracks.body == id) & tracks.sure)
                 self.bodies[id] = with_extent(body, tracks.local[mine])
-        self._merge()
-
-    def _merge(self) -> None:
-        """Merge bodies that move as an older one does: young ones at once, others only if that lasts.
-
-        It has to last because the parts of an articulated body move alike now and then. If fewer members of the older
-        body are seen, that one is merged into the younger.
-        """
-        tracks = self.tracks
-        assert tracks is not None
-        for id in sorted(self.bodies, reverse=True):
-            body = self.bodies.get(id)  # it may have taken the place of another
-            if body is not None and body.measured:
-                mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
-                older = {id: b for id, b in self.bodies.items() if id < body.id and id not in body.distinct}
-                whole = membership.body_around(older, tracks, mine, body)
-                alike = body.alike + 1 if whole is not None else 0
-                if alike != body.alike:
-                    self.bodies[body.id] = replace(body, alike=alike)
-                young = body.seen < _MERGES and (whole is None or whole.id != body.apart_from)
-                if whole is not None and (young or alike > _MERGES):
-                    whole = self.bodies[whole.id] = membership.with_reach(whole, tracks, mine)
-                    membership.add_members(whole, tracks, mine, sure=True)
-                    self._forget(body.id)
-                elif whole is None and body.seen < _MERGES:
-                    self._outgrow(body, len(mine), older)
-
-    def _outgrow(self, body: Body, count: int, older: Mapping[int, Body]) -> None:
-        """Let a young body, of which `count` members are seen, replace an older one with the same motion."""
-        tracks = self.tracks
-        assert tracks is not None
-        for known in older.values():
-            theirs = np.flatnonzero((tracks.body == known.id) & tracks.seen)
-            fewer = known.measured and len(theirs) < count and known.id != body.apart_from
-            if math.dist(body.middle, known.middle) > body.across + known.across:
-                continue
-            if not fewer or not membership.moves_with(body, tracks, theirs):
-                continue
-            mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
-            distinctness = membership.distinctness(body, mine, known, theirs, tracks)
-            if distinctness > _DISTINCT:
-                body = self.bodies[body.id] = replace(body, distinct=body.distinct | {known.id})
-            elif distinctness < 1.0:
-                self.bodies[known.id] = self._in_place_of(known, body, theirs)
-                tracks.body[tracks.body == body.id] = known.id
-                del self.bodies[body.id]
-                return
+        merge(self.bodies, tracks)
 
     def _begin_tracks(self, features: StereoFeatures, local: Array, T_world_left: Array, landmark: IdArray) -> None:
         """New tracks at stereo features that continue none; give up tracks not seen for long."""
         tracks = self.tracks
-        assert tracks is not None
         tracks.give_up(np.flatnonzero((tracks.missed > self.config.patience) & (tracks.body < 0)))
         taken = among(len(features), tracks.row[tracks.seen])
         rows = np.flatnonzero(~taken & np.isfinite(local[:, 0]))
@@ -427,7 +350,6 @@ class MovingObjectDetector:
 
     def _motion_labels(self, features: StereoFeatures) -> MotionLabels:
         tracks = self.tracks
-        assert tracks is not None
         on, near = membership.tracks_on_bodies(self.bodies, tracks, self.config.margin)
         doubtful = np.flatnonzero(tracks.seen & tracks.doubtful)
         proven = np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
@@ -441,7 +363,6 @@ class MovingObjectDetector:
     def _begin_estimates(self, features: StereoFeatures, cameras: RecentPoses) -> None:
         """Begin the estimates of bodies that have none."""
         tracks = self.tracks
-        assert tracks is not None
         for id, body in list(self.bodies.items()):
             if body.belief is None and body.measured:
                 mine = np.flatnonzero((tracks.body == id) & tracks.seen)

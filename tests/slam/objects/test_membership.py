@@ -10,11 +10,10 @@ import pytest
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse, transform
-from slam.models import EstimatorModels
 from slam.objects import membership
 from slam.objects.bodies import Body, continued, new_body, with_extent
 from slam.objects.config import ObjectsConfig
-from slam.objects.detector import MovingObjectDetector
+from slam.objects.merging import merge
 from slam.objects.tracks import Tracks, fit_positions, record
 
 WINDOW = 12
@@ -129,12 +128,11 @@ def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() ->
     )
     few = replace(few, alike=1, T=few.T @ exp(np.array([0, 0, 0, 0.1, 0, 0])))
     more = replace(more, seen=5)
-    detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
-    detector.tracks, detector.bodies = tracks, {1: few, 2: more}
-    detector._merge()
-    assert list(detector.bodies) == [1]
+    bodies = {1: few, 2: more}
+    merge(bodies, tracks)
+    assert list(bodies) == [1]
     assert (tracks.body == np.where(tracks.ids >= 0, 1, -1)).all()
-    grown = detector.bodies[1]
+    grown = bodies[1]
     np.testing.assert_allclose(grown.T[:3, :3], few.T[:3, :3])  # the older one's axes, at its own place
     np.testing.assert_allclose(grown.history @ inverse(grown.T), more.history @ inverse(more.T), atol=1e-12)
     assert grown.belief is None  # its estimate begins anew
@@ -153,12 +151,11 @@ def test_bodies_side_by_side_are_one_only_where_they_move_alike(share: float, on
     assert membership.moves_with(more, tracks, theirs)
     alike = membership.moves_with(more, tracks, theirs)
     assert (alike and membership.distinctness(more, mine, few, theirs, tracks) < 1.0) == one
-    detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
-    detector.tracks, detector.bodies = tracks, {1: few, 2: replace(more, seen=5)}
-    detector._outgrow(detector.bodies[2], 8, {1: few})
-    assert list(detector.bodies) == ([1] if one else [1, 2])
+    bodies = {1: replace(few, T=few.T @ exp(np.array([0, 0, 0, 0.1, 0, 0]))), 2: replace(more, seen=5)}
+    merge(bodies, tracks)
+    assert list(bodies) == ([1] if one else [1, 2])
     if not one:  # known for good: in a later frame they may happen to move alike
-        assert detector.bodies[2].distinct == {1}
+        assert bodies[2].distinct == {1}
 
 
 def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
