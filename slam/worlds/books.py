@@ -43,10 +43,6 @@ class Shelves:
         """The bays, from the left."""
         return [Bay(self, number) for number in range(self.bays)]
 
-    def paint(self, density: float) -> np.ndarray:
-        """The whole wall in one picture."""
-        return np.concatenate([bay.paint(density) for bay in self.parts()], axis=1)
-
 
 @dataclass(frozen=True)
 class Bay:
@@ -78,12 +74,6 @@ class Bay:
     def marks(self) -> Array:
         """None: the whole wall has them."""
         return np.zeros((0, 3))
-
-    def paint(self, density: float) -> np.ndarray:
-        """See `slam.worlds.geometry.Texture.paint`."""
-        from slam.worlds.shelves import paint_bay
-
-        return paint_bay(self, density)
 
 
 @dataclass(frozen=True, eq=False)

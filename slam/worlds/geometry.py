@@ -20,7 +20,10 @@ RIGHT, LEFT, FORWARD, BACK, UP, DOWN = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1
 
 
 class Texture(Protocol):
-    """What is painted on a rectangle, `width` by `height` [m]; its layout is known without painting it."""
+    """What is painted on a rectangle, `width` by `height` [m], by `slam.worlds.painting.paint`.
+
+    Its layout is known without painting it.
+    """
 
     @property
     def width(self) -> float: ...  # noqa: D102
@@ -30,10 +33,6 @@ class Texture(Protocol):
 
     def marks(self) -> Array:
         """Points (M, 3) where something stands out: x, y from the top-left corner, and its size [m]."""
-        ...
-
-    def paint(self, density: float) -> np.ndarray:
-        """The picture, BGR uint8 (round(height · density), round(width · density), 3), texels per metre."""
         ...
 
 

@@ -10,19 +10,29 @@ import numpy as np
 
 from slam.errors import UnknownNameError
 from slam.worlds import streetside
+from slam.worlds.books import Bay
 from slam.worlds.brushes import Box, Colour, Page, Rng, Size, clouds, grain, tinted, wood, words
-from slam.worlds.surfaces import Material, Signs
+from slam.worlds.geometry import Texture
+from slam.worlds.shelves import paint_bay
+from slam.worlds.streetside import paint_facade
+from slam.worlds.surfaces import Facade, Material, Signs
 
 _INKS = ((25, 30, 40), (235, 240, 240), (40, 40, 170), (150, 70, 30))
 _DARK = (30.0, 30.0, 40.0)
 
 
-def paint(piece: Material, density: float) -> np.ndarray:
-    """The picture of a piece, BGR uint8 (round(height · density), round(width · density), 3), texels per metre.
+def paint(texture: Texture, density: float) -> np.ndarray:
+    """The picture of a texture, BGR uint8 (round(height · density), round(width · density), 3), texels per metre.
 
-    Raises:
-        UnknownNameError: there is no such material.
+    A texture of another class than the built-in ones paints itself: its ``paint(density)`` is called.
     """
+    painter = PAINTERS.get(type(texture))
+    picture: np.ndarray = painter(texture, density) if painter else texture.paint(density)  # type: ignore[attr-defined]
+    return picture
+
+
+def _paint_material(piece: Material, density: float) -> np.ndarray:
+    """A piece of a material; UnknownNameError where there is no such material."""
     if piece.material not in RECIPES:
         raise UnknownNameError(f"unknown material {piece.material!r}; known: {', '.join(RECIPES)}")
     recipe = RECIPES[piece.material]
@@ -222,7 +232,7 @@ def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
     return page.picture
 
 
-def paint_signs(board: Signs, density: float) -> np.ndarray:
+def _paint_signs(board: Signs, density: float) -> np.ndarray:
     """A white board with signs: discs and squares with a pattern of their own around and on them."""
     rng = np.random.default_rng([board.seed, 65])
     page = Page(_board((round(board.height * density), round(board.width * density)), rng, density), rng)
@@ -293,3 +303,7 @@ RECIPES = {
     "cabin_end": Recipe(partial(streetside.cabin, panes=streetside.END_PANES)),
     "field": Recipe(streetside.field, _fleck),
 }
+
+PAINTERS: dict[type, Callable[..., np.ndarray]] = {
+    Material: _paint_material, Facade: paint_facade, Signs: _paint_signs, Bay: paint_bay,
+}  # fmt: skip

@@ -16,6 +16,7 @@ from slam.data import StereoFrame
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, exp, inverse, log
 from slam.worlds.faults import Faults, in_hand
+from slam.worlds.painting import paint
 from slam.worlds.placing import NEAR, View, place
 from slam.worlds.raster import Ripmap, draw
 from slam.worlds.world import World
@@ -74,7 +75,7 @@ class Recorder:
         key = (texture, self._values["colour"])
         found: Ripmap | None = painted.pop(key, None)
         if found is None:
-            picture = texture.paint(self._world.texels)
+            picture = paint(texture, self._world.texels)
             found = Ripmap(picture if self._values["colour"] else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
             if len(painted) >= _PAINTED:
                 del painted[next(iter(painted))]

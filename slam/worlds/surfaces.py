@@ -27,12 +27,6 @@ class Material:
         x, y = rng.uniform(0, self.width, count), rng.uniform(0, self.height, count)
         return np.stack([x, y, np.exp(rng.uniform(np.log(self.sizes[0]), np.log(self.sizes[1]), count))], axis=1)
 
-    def paint(self, density: float) -> np.ndarray:
-        """See `slam.worlds.geometry.Texture.paint`."""
-        from slam.worlds.painting import paint
-
-        return paint(self, density)
-
 
 @dataclass(frozen=True)
 class Facade:
@@ -63,12 +57,6 @@ class Facade:
         at = [(left + a * width, top + b * height, 0 * left + 0.25) for a in (0, 0.5, 1) for b in (0, 1)]
         return np.concatenate([*(np.stack(corner, axis=1) for corner in at), self.stains.marks()])
 
-    def paint(self, density: float) -> np.ndarray:
-        """See `slam.worlds.geometry.Texture.paint`."""
-        from slam.worlds.streetside import paint_facade
-
-        return paint_facade(self, density)
-
 
 @dataclass(frozen=True)
 class Signs:
@@ -85,9 +73,3 @@ class Signs:
         place = np.stack([x.ravel() * self.width, y.ravel() * self.height], axis=1)
         place += rng.uniform(-0.015, 0.015, place.shape)
         return np.column_stack([place, rng.uniform(0.03, 0.05, len(place))])
-
-    def paint(self, density: float) -> np.ndarray:
-        """See `slam.worlds.geometry.Texture.paint`."""
-        from slam.worlds.painting import paint_signs
-
-        return paint_signs(self, density)
