@@ -189,9 +189,9 @@ def plot_command(
     overwrite: of.OverwriteOption = False,
 ) -> None:
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
-    from slam.commands.plot import plot_runs
+    from slam.run.plots import plot_folders
 
-    for file, caption in plot_runs(folders, out, figure, width, overwrite):
+    for file, caption in plot_folders(folders, out, figure, width, overwrite):
         print(f"{file}: {caption}")
 
 
@@ -367,8 +367,8 @@ def _finish(summary: dict[str, Any], folder: Path, picture: bool, quiet: bool) -
     The exit status is 1 where none was.
     """
     from slam.commands.display import print_summary
-    from slam.commands.plot import leave_picture
     from slam.run.outcome import nothing_tracked
+    from slam.run.plots import leave_picture
 
     if not summary["frames"]:
         print(f"slam: the run ended before its first frame; files: {folder}", file=sys.stderr)

@@ -16,21 +16,19 @@ from rich.progress import Progress as RichProgress
 from rich.table import Table
 
 from slam.data import FrameResult
-from slam.evaluation.consistency import verdict
-from slam.run.results import rows
+from slam.run.results import rows, verdict_of_run
 from slam.runtime.compile_clock import working_time
 
 if TYPE_CHECKING:
-    from slam.compare.report import Conclusions
+    from slam.compare.wording import Conclusions
 
 _console = Console()
 
 
 def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
     """A progress bar on standard error that fits into 80 columns."""
-    shown = (BarColumn(bar_width=10), MofNCompleteColumn(), *columns, TimeRemainingColumn())
-    first = TextColumn("{task.description}")
-    return RichProgress(first, *shown, console=Console(stderr=True), disable=quiet, **options)
+    shown = (TextColumn("{task.description}"), BarColumn(bar_width=10), MofNCompleteColumn(), *columns)
+    return RichProgress(*shown, TimeRemainingColumn(), console=Console(stderr=True), disable=quiet, **options)
 
 
 class Progress:
@@ -88,9 +86,8 @@ def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str
         caution: what so few trials can show at best; empty where they are enough.
         reference: the back end that the others are compared with.
     """
-    from slam.compare.wording import STRENGTH, WORDS
+    from slam.compare.wording import STRENGTH
 
-    used = {line.verdict for found in every for line in found.headlines}
     for found in every:
         _say(found.name, "bold")
         for text in (*found.verdict, found.failed):
@@ -98,13 +95,13 @@ def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str
                 _say(text)
         table = Table.grid(padding=(0, 2))
         for line in found.headlines:
-            style = f"bold {_COLOURS[line.direction]}" if WORDS[line.verdict] == "certain" else _COLOURS[line.direction]
+            style = f"bold {_COLOURS[line.direction]}" if line.verdict == "certain" else _COLOURS[line.direction]
             table.add_row(f"  [{style}]{escape(line.badge)}[/]", escape(line.text))
         _console.print(table, highlight=False)
         for text in found.honesty:
             _say(f"  {text}")
-    meanings = [meaning for verdict, meaning in STRENGTH.items() if verdict in used]
-    if meanings:
+    used = {line.verdict for found in every for line in found.headlines}
+    if meanings := [meaning for verdict, meaning in STRENGTH.items() if verdict in used]:
         _say(f"Better or worse than {reference}: {'; '.join(meanings)}.")
     if caution:
         _say(caution)
@@ -124,7 +121,7 @@ def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
         table.add_row(escape(label), *values)
     _console.print(table)
     for summary in summaries:
-        if words := verdict(summary.get("consistency", {})):
+        if words := verdict_of_run(summary):
             _say(f"{summary['backend']}: {words}")
     _say(f"Files: {out}")
 

@@ -159,6 +159,11 @@ def fewest(tests: int) -> int:
     return int(np.ceil(np.log2(2 * max(tests, 1) / ALPHA)))
 
 
+def certain_of(trials: int) -> int:
+    """The most tests of which one can be certain with so many trials, see `fewest`."""
+    return int(ALPHA * 2 ** min(trials - 1, 60))
+
+
 #: Values from which on a mean has a confidence interval.
 FEWEST = fewest(1)
 
@@ -176,14 +181,12 @@ def interval(values: Array) -> tuple[float, float]:
 def _bootstrap(values: tuple[float, ...]) -> tuple[float, float]:
     from scipy.stats import bootstrap
 
+    options = {"confidence_level": LEVEL, "n_resamples": _RESAMPLES}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # BCa says so where it is not defined; then percentiles are taken
         for method in ("BCa", "percentile"):
-            result = bootstrap(
-                (np.array(values),), np.mean, confidence_level=LEVEL, n_resamples=_RESAMPLES, method=method,
-                rng=np.random.default_rng(_SEED),
-            )  # fmt: skip
-            low, high = result.confidence_interval
+            rng = np.random.default_rng(_SEED)
+            low, high = bootstrap((np.array(values),), np.mean, method=method, rng=rng, **options).confidence_interval
             if np.isfinite(low) and np.isfinite(high):
                 break
     return float(low), float(high)

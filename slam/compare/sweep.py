@@ -8,26 +8,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from slam import registry
-from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Trial
+from slam.compare.plan import CLOSED_LOOP, REPLAY, SIMULATED, Plan, Trial
 from slam.compare.scheduler import Job, Scheduler
-from slam.compare.trial import (
-    COMPLETED,
-    RECORDING,
-    RESULT,
-    TIMING,
-    Files,
-    config_of,
-    failure,
-    frontend_of,
-    result_files,
-    run_trial,
-)
+from slam.compare.trial import COMPLETED, RECORDING, RESULT, TIMING, Files, config_of, failed, run_trial
 from slam.errors import SlamError
 from slam.files import noting_inputs, read_object, remove_file
 from slam.outputs import Output, require_outputs
@@ -39,9 +28,7 @@ from slam.sequences.faults import said_before
 RUNS, SWEEP = "runs", "sweep.json"
 
 #: What a comparison leaves in its folder.
-NAMES = (
-    SWEEP, f"{RUNS}/", "runs.csv", "means.csv", "differences.csv", "timings.csv", "report.html",
-)  # fmt: skip
+NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "means.csv", "differences.csv", "timings.csv", "report.html")
 
 
 @dataclass(frozen=True)
@@ -84,22 +71,26 @@ def sweep(
         SlamError: a sequence, name or setting is bad (nothing is run then), or the folder holds something else.
     """
     check(plan, out, overwrite)
+    told = on_done or (lambda trial: None)
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_json(out / SWEEP, {"plan": plan.to_json(), "command": plan.command(), "versions": running_code()})
+    write_json(out / SWEEP, {"plan": asdict(plan), "command": plan.command(), "versions": running_code()})
     for mode in plan.modes:
         jobs = {}
         for trial in plan.trials_of(mode):
-            if not overwrite and _is_done(trial, out):
-                if on_done is not None:
-                    on_done(trial)
-            else:
+            if overwrite or not _is_done(trial, out):
                 jobs[trial.folder] = trial
-        scheduler.run(
-            [Job(name, run_trial, partial(_arguments, plan, trial, out)) for name, trial in jobs.items()],
-            partial(_keep, jobs, out, on_done),
-        )
-    return [read_run(trial, out) for mode in plan.modes for trial in plan.trials_of(mode)]
+            else:
+                told(trial)
+
+        def keep(job: Job, files: Files | None, error: BaseException | None, jobs: dict[str, Trial] = jobs) -> None:
+            trial = jobs[job.name]
+            _keep(out / RUNS / trial.folder, files or failed(trial, error or SlamError("nothing came back")))
+            told(trial)
+
+        arguments = partial(_arguments, plan, out)
+        scheduler.run([Job(name, run_trial, partial(arguments, trial)) for name, trial in jobs.items()], keep)
+    return [read_run(trial, out) for trial in plan.every]
 
 
 def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
@@ -116,28 +107,22 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
     Raises:
         SlamError: something cannot work.
     """
+    frames: dict[str, int] = {}
     with noting_inputs() as inputs:
-        frames = _tried(plan)
+        for trial in plan.trials_of(CLOSED_LOOP):
+            if trial.seed:
+                continue
+            with said_before() if trial.sequence in frames else nullcontext():
+                sequence = open_sequence(trial.source)
+            frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
+            config = config_of(trial, sequence)
+            if trial.variant.frontend != SIMULATED:
+                registry.create("frontends", trial.variant.frontend, sequence.rig, **config.frontend)
+            registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
     goes_on = not overwrite and (out / SWEEP).is_file()
     if goes_on:
         _require_same_versions(out / SWEEP)
     require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)
-    return frames
-
-
-def _tried(plan: Plan) -> dict[str, int]:
-    """Number of frames of a run by sequence; raises SlamError for what cannot work."""
-    frames: dict[str, int] = {}
-    for trial in plan.trials_of(CLOSED_LOOP):
-        if trial.seed:
-            continue
-        with said_before() if trial.sequence in frames else nullcontext():
-            sequence = open_sequence(trial.source)
-        frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
-        config = config_of(trial, sequence)
-        if frontend_of(trial, sequence) is None:
-            registry.create("frontends", trial.variant.frontend, sequence.rig, **config.frontend)
-        registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
     return frames
 
 
@@ -164,36 +149,22 @@ def _figures(tree: Any, file: Path) -> dict[str, float]:
         raise SlamError(f"{file}: its figures are no numbers by name") from error
 
 
-def _arguments(plan: Plan, trial: Trial, out: Path) -> tuple[Trial, bytes | None]:
+def _arguments(plan: Plan, out: Path, trial: Trial) -> tuple[Trial, bytes | None]:
     """A trial, and for a replay the measurements of the first back end's closed loop."""
     if trial.mode != REPLAY:
         return trial, None
-    first = Trial(trial.sequence, trial.variant, plan.backends[0], trial.seed, CLOSED_LOOP, trial.start, trial.stop)
-    run = read_run(first, out)
+    run = read_run(replace(trial, backend=plan.backends[0], mode=CLOSED_LOOP), out)
     return trial, (run.folder / RECORDING).read_bytes() if run.completed else None
 
 
-def _keep(
-    jobs: dict[str, Trial],
-    out: Path,
-    on_done: Callable[[Trial], None] | None,
-    job: Job,
-    files: Files | None,
-    error: BaseException | None,
-) -> None:
-    """Put a trial's files in their place; one that raised is a failed run, with its reason."""
-    trial = jobs[job.name]
-    if files is None:
-        files = result_files(trial, failure(error or SlamError("nothing came back")))
-    folder = out / RUNS / trial.folder
+def _keep(folder: Path, files: Files) -> None:
+    """Put a trial's files in their place."""
     with naming_folder(folder):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / RESULT).unlink(missing_ok=True)
         for name in sorted(files, key=lambda name: name == RESULT):  # last: what is there then is whole
             remove_file(folder / name)
             (folder / name).write_bytes(files[name])
-    if on_done is not None:
-        on_done(trial)
 
 
 def _is_done(trial: Trial, out: Path) -> bool:
@@ -208,7 +179,7 @@ def _is_done(trial: Trial, out: Path) -> bool:
     try:
         before = read_object(path).get("trial")
     except SlamError:
-        return False
+        before = None
     if before is None:
         return False
     if before != json.loads(json.dumps(asdict(trial))):

@@ -18,8 +18,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import MovingObject
 from slam.outputs import Output
-from slam.run.growing_map import GrowingMap
-from slam.run.style import body_colour
+from slam.run.growing_map import GrowingMap, body_colour
 
 _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
@@ -139,14 +138,8 @@ def _line(
     good = np.asarray((np.abs(np.nan_to_num(uv, nan=2.0 * limit)) < limit).all(axis=1))
     for i in range(0, len(points) - 1, 2 if dashed else 1):
         if good[i] and good[i + 1]:
-            cv2.line(
-                picture,
-                _pixel(uv[i, 0], uv[i, 1], scale),
-                _pixel(uv[i + 1, 0], uv[i + 1, 1], scale),
-                colour,
-                thickness,
-                cv2.LINE_AA,
-            )
+            begin, end = (_pixel(uv[j, 0], uv[j, 1], scale) for j in (i, i + 1))
+            cv2.line(picture, begin, end, colour, thickness, cv2.LINE_AA)
 
 
 def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:

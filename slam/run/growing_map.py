@@ -6,12 +6,17 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult
 from slam.geometry.se3 import Array, transform
-from slam.run.style import body_colour
 
 _AHEAD = 0.3  # of the map behind the camera
 _PAPER, _OLD, _NOW, _PATH, _INK = (255, 255, 255), (200, 200, 200), (200, 130, 30), (0, 110, 240), (90, 90, 90)  # BGR
 _REACH = 2.5  # widths of the map in distances of the first landmarks
 _FONT = 0  # OpenCV's plain one
+_BODIES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))  # BGR
+
+
+def body_colour(number: int) -> tuple[int, int, int]:
+    """The colour (BGR) of a moving body in images, by its number."""
+    return _BODIES[(number - 1) % len(_BODIES)]
 
 
 class GrowingMap:

@@ -50,6 +50,7 @@ def run(
     frontend: Frontend | None = None,
     watches: Iterable[Watch] = (),
     until: threading.Event | None = None,
+    record: RunRecord | None = None,
 ) -> dict[str, Any]:
     """Run a sequence; returns the summary that is also written to ``summary.json``.
 
@@ -64,6 +65,7 @@ def run(
         frontend: used in place of the one that the options name.
         watches: called after every step with its images, its result and the system, to show or to draw it.
         until: ends a live run when it is set, as if there were no more frames.
+        record: gathers what the run gives, for whom the files are not enough.
 
     Raises:
         SlamError: bad input; one line says what and where.
@@ -95,14 +97,17 @@ def run(
     )
     if live is not None:  # before its clock starts, with its first frame
         warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
-    record = RunRecord()
+    record = RunRecord() if record is None else record
     results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)
     return _Run(sequence, options, system, record, live).drive(results, on_frame)
 
 
 @one_blas_thread
 def run_recording(
-    recording: Recording, options: RunOptions, on_frame: Callable[[FrameResult], None] | None = None
+    recording: Recording,
+    options: RunOptions,
+    on_frame: Callable[[FrameResult], None] | None = None,
+    record: RunRecord | None = None,
 ) -> dict[str, Any]:
     """Replay a recording through a back end; leaves the files of a run and returns its summary, as `run` does.
 
@@ -110,6 +115,7 @@ def run_recording(
         recording: what the back end is given.
         options: back end, settings and folder; there is no front end and no range of frames.
         on_frame: called after every frame, for a progress display.
+        record: gathers what the run gives, for whom the files are not enough.
 
     Raises:
         SlamError: bad input; one line says what and where.
@@ -117,7 +123,7 @@ def run_recording(
     config = options.config
     backend = registry.create("backends", options.backend, recording.rig, models=config.models, **config.backend)
     results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
-    record = RunRecord()
+    record = RunRecord() if record is None else record
     return _Run(recording, options, Replayed(recording, backend, record), record).drive(results, on_frame)
 
 
