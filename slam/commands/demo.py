@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from slam.commands.background_compilation import compiled_in_background
 from slam.commands.display import Progress, print_summary
 from slam.config import SystemConfig
 from slam.data import FrameResult
@@ -18,6 +17,7 @@ from slam.run.outputs import NAMES, write_json
 from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.run.runner import run
+from slam.run.warm_up import compiled_in_background
 from slam.sequences import open_sequence
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.

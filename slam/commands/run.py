@@ -7,19 +7,27 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import typer
+
+from slam.commands.display import print_summary
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
 from slam.run import drawing
 from slam.run import viewer as viewing
 from slam.run.options import RunOptions, parse_frames
+from slam.run.outcome import nothing_tracked
+from slam.run.plots import leave_picture
+from slam.run.recorded import Recording
 from slam.run.repeat import Origin, Repeat, changed_versions, load, versions
+from slam.run.runner import Watch
 from slam.sequences import Sequence as StereoSequence
-from slam.sequences import open_sequence
+from slam.sequences import is_live, open_sequence
 from slam.settings import require_settable
 
 _BACKEND, _FRONTEND = "ekf", "surf"
@@ -81,11 +89,54 @@ def shown(draw: Path | None, viewer: str | None) -> list[Output]:
     return pictures + ([] if viewer is None else viewing.outputs(viewer, "--viewer"))
 
 
+def watches(
+    stack: ExitStack, opened: StereoSequence, viewer: str | None, draw: Path | None, draw_map: bool
+) -> list[Watch]:
+    """What is shown of every frame: the viewer, and pictures in a folder or a video; the stack closes them."""
+    found: list[Watch] = []
+    if viewer is not None:
+        found.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
+    if draw is not None:
+        found.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
+    return found
+
+
+def title(sequence: StereoSequence | Recording, backend: str) -> str:
+    """A short name for a progress bar: of a world its name alone."""
+    name = sequence.name.partition("?")[0]
+    return f"{name if len(name) <= 12 else f'…{name[-11:]}'} · {backend}"
+
+
+def frame_count(sequence: StereoSequence, start: int, stop: int | None) -> int | None:
+    """Number of frames in a range; None for those of a camera without an end."""
+    if is_live(sequence):
+        return None if stop is None else stop - start
+    return len(range(len(sequence))[start:stop])
+
+
+def finish(summary: dict[str, Any], folder: Path, picture: bool, quiet: bool) -> None:
+    """Leave the picture of a run and print its table, and a line where many frames were not tracked.
+
+    The exit status is 1 where none was.
+    """
+    if not summary["frames"]:
+        print(f"slam: the run ended before its first frame; files: {folder}", file=sys.stderr)
+        return
+    if picture:
+        leave_picture(folder)
+    if not quiet:
+        print_summary([summary], folder)
+    if summary["tracking"]:
+        print(f"slam: {summary['tracking']}", file=sys.stderr)
+    if nothing_tracked(summary):
+        raise typer.Exit(1)
+
+
 def _repeated(before: Repeat, default: SystemConfig, frontend: str, backend: str) -> SystemConfig:
     """The settings of an earlier run; options of another front end or back end than its are the defaults."""
     changed = changed_versions(before.versions, versions())
     if changed:
-        logging.getLogger(__name__).warning("made with other versions, results may differ: %s", changed)
+        logging.getLogger(__name__).warning("made with other versions, results may differ: %s", "; ".join(changed))
     return replace(
         before.config,
         frontend=before.config.frontend if frontend == before.frontend else default.frontend,

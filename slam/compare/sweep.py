@@ -21,7 +21,7 @@ from slam.errors import SlamError
 from slam.files import noting_inputs, read_object, remove_file
 from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder, write_json
-from slam.run.repeat import running_code
+from slam.run.repeat import changed_versions, running_code
 from slam.sequences import open_sequence
 from slam.sequences.faults import said_before
 
@@ -191,10 +191,6 @@ def _require_same_versions(path: Path) -> None:
     before = read_object(path).get("versions")
     if not isinstance(before, dict):
         raise SlamError(f"{path}: not that of a comparison")
-    now = running_code()
-    changed = [name for name, version in now.items() if before.get(name) != version]
+    changed = changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code())
     if changed:
-        raise SlamError(
-            f"{path.parent}: begun with {changed[0]} {before.get(changed[0])}, now {now[changed[0]]}: runs cannot be "
-            "compared; give another --out"
-        )
+        raise SlamError(f"{path.parent}: begun with {changed[0]}: runs cannot be compared; give another --out")

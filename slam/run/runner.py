@@ -14,7 +14,7 @@ from slam import registry
 from slam.calibration import load_calibration
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
-from slam.evaluation.objects import ObjectScore, labels_in_images, score_for
+from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
@@ -78,27 +78,24 @@ def run(
     if options.record is not None:
         config = replace(options.config, map=replace(options.config.map, monocular=False))
         options = replace(options, config=config)
-    frames = sequence.frames(options.start, options.stop)
-    live = None
+    frames, live = sequence.frames(options.start, options.stop), None
     if options.live or is_live(sequence):
         live = LiveFrames(frames, not is_live(sequence), until)
         frames = iter(live)
     if options.mono:
         frames = (replace(frame, right=None) for frame in frames)
-    known = None if options.prior_map is None else load_map(options.prior_map)
-    rig_prior = None if options.calibration is None else load_calibration(options.calibration)
     system = StereoSlam(
         sequence.rig,
         frontend or options.frontend,
         options.backend,
         config=options.config,
-        prior_map=known,
-        rig_prior=rig_prior,
+        prior_map=None if options.prior_map is None else load_map(options.prior_map),
+        rig_prior=None if options.calibration is None else load_calibration(options.calibration),
     )
     if live is not None:  # before its clock starts, with its first frame
         warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
     record = RunRecord() if record is None else record
-    results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)
+    results = _processed(system, frames, live, tuple(watches), options.overlap, record)
     return _Run(sequence, options, system, record, live).drive(results, on_frame)
 
 
@@ -125,6 +122,38 @@ def run_recording(
     results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
     record = RunRecord() if record is None else record
     return _Run(recording, options, Replayed(recording, backend, record), record).drive(results, on_frame)
+
+
+def _processed(
+    system: StereoSlam,
+    frames: Iterator[StereoFrame],
+    live: LiveFrames | None,
+    watches: tuple[Watch, ...],
+    overlap: bool,
+    record: RunRecord,
+) -> Iterator[tuple[int, FrameResult]]:
+    """Each frame's number and what the system did with it; a live run's time of reading is one of waiting, and 0."""
+    reading: dict[int, float] = {}  # wall time [ms] by number of the frame
+
+    def timed() -> Iterator[StereoFrame]:
+        while True:
+            start = time.perf_counter()
+            frame = next(frames, None)
+            if frame is None:
+                return
+            reading[frame.index] = 1e3 * (time.perf_counter() - start) if live is None else 0.0
+            yield frame
+
+    for frame, result in system.run(timed(), overlap):
+        result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
+        if live is not None:
+            record.ages.append(live.age(frame))
+        if frame.right is None:
+            record.without_right.append(len(record.statuses))
+        record.depths.append(median_depth(result.features, system.rig))
+        yield frame.index, result
+        for watch in watches:
+            watch(frame, result, system)
 
 
 @dataclass(eq=False)
@@ -157,8 +186,7 @@ class _Run:
             try:
                 for number, result in results:
                     record.add(number, result)
-                    places = (_place(step, record) for step in (result.loop, result.refused_loop))
-                    files.write_frame(number, result, *places)
+                    files.write_frame(number, result, self._place(result.loop), self._place(result.refused_loop))
                     if score is not None:
                         score.add(number, result, labels_in_images(self.sequence, number, result.features))
                     if self.options.record is not None:
@@ -171,28 +199,40 @@ class _Run:
             finally:
                 if self.live is not None and self.live.ended_early and stopped_by is None:
                     ended = "ended by the user"
-                summary = self._finish(files, ended, score)
+                summary = self._head(ended)
+                if record.stamps:
+                    self._write_last(files, summary, score)
+                summary["seed"] = getattr(self.sequence, "values", {}).get("seed", 0)  # nothing else is random
+                summary |= {"configuration": self.options.config.to_json(), "versions": versions()}
+                with self._each():
+                    files.write_json("summary.json", summary)
                 self._write_copies()
                 if self.failures:
                     summary["failures"] = self._said()
                     with self._each():
                         files.write_json("summary.json", summary)
-                self._report(stopped_by)
+                self._raise_failures(stopped_by)
         return summary
+
+    def _place(self, step: int | None) -> int | str:
+        """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
+        if step is None:
+            return ""
+        return self.record.numbers[step] if step >= 0 else "map"
 
     @contextmanager
     def _each(self) -> Iterator[None]:
         """One of the last files: it is written although another one failed."""
         try:
             yield
-        except Exception as error:  # noqa: BLE001 `_report` raises it
+        except Exception as error:  # noqa: BLE001 `_raise_failures` raises it
             self.failures.append(error)
 
     def _said(self) -> list[str]:
         """What failed, a line each."""
         return [one_line(text_of(error)) or type(error).__name__ for error in self.failures]
 
-    def _report(self, stopped_by: BaseException | None) -> None:
+    def _raise_failures(self, stopped_by: BaseException | None) -> None:
         """Raise what failed, in one line with the error that stopped the run; a signal goes on, after warnings.
 
         Raises:
@@ -212,6 +252,25 @@ class _Run:
         first = [] if stopped_by is None else [str(stopped_by)]
         kind = SlamError if stopped_by is None else type(stopped_by)
         raise kind("; ".join(dict.fromkeys([*first, *lines]))) from stopped_by
+
+    def _write_last(self, files: RunFiles, summary: dict[str, Any], score: Any) -> None:
+        """Write the files that are made at the end but the summary, and add to that how good the run was."""
+        system, record, sequence = self.system, self.record, self.sequence
+        final = Trajectory.empty()
+        with self._each():
+            final = system.trajectory()
+            files.write_trajectory("trajectory_final.txt", final)
+        with self._each():
+            pairs = with_truth(record.trajectory, sequence)
+            if pairs is not None:
+                files.write_trajectory("truth.txt", pairs[1])
+        with self._each():
+            files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
+        if isinstance(system, StereoSlam) and system.landmarks is not None:
+            with self._each():
+                files.write_old_landmarks(system.atlas, system.landmarks.ids)
+        with self._each():
+            summary |= results_of(sequence, system, record, final, score)
 
     def _write_copies(self) -> None:
         """The recording and the map, where they were asked for."""
@@ -242,35 +301,8 @@ class _Run:
         models, truth = options.config.models, sequence.ground_truth
         return Recording(sequence.name, sequence.rig, models, tuple(self.tape), truth, kind=sequence.kind)
 
-    def _finish(self, files: RunFiles, ended: str, score: ObjectScore | None) -> dict[str, Any]:
-        """Write the last files, each whether or not another fails, and return the summary."""
-        summary = self._head(ended)
-        system, record, sequence = self.system, self.record, self.sequence
-        if record.stamps:
-            final = Trajectory.empty()
-            with self._each():
-                final = system.trajectory()
-                files.write_trajectory("trajectory_final.txt", final)
-            with self._each():
-                pairs = with_truth(record.trajectory, sequence)
-                if pairs is not None:
-                    files.write_trajectory("truth.txt", pairs[1])
-            with self._each():
-                files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
-            if isinstance(system, StereoSlam) and system.landmarks is not None:
-                with self._each():
-                    files.write_old_landmarks(system.atlas, system.landmarks.ids)
-            with self._each():
-                summary.update(results_of(sequence, system, record, final, score))
-        summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
-        summary["configuration"] = self.options.config.to_json()
-        summary["versions"] = versions()
-        with self._each():
-            files.write_json("summary.json", summary)
-        return summary
-
     def _head(self, ended: str) -> dict[str, Any]:
-        """The summary's first part: what was run, how it ended, and whether the camera was tracked."""
+        """The part of the summary that is known of every run: what was run, how it ended, and the tracking."""
         options, record, sequence = self.options, self.record, self.sequence
         warnings = getattr(self.system, "warnings", ())
         driving = options.origin.get("kind") == "driving"
@@ -291,11 +323,8 @@ class _Run:
         }
 
     def _names(self) -> dict[str, Any]:
-        options, sequence = self.options, self.sequence
-        return {
-            "sequence": sequence.name, "format": sequence.format, "frontend": options.frontend,
-            "backend": options.backend,
-        }  # fmt: skip
+        names = {"sequence": self.sequence.name, "format": self.sequence.format}
+        return names | {"frontend": self.options.frontend, "backend": self.options.backend}
 
     def _config(self) -> dict[str, Any]:
         """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
@@ -309,49 +338,3 @@ class _Run:
             "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
             "versions": versions(),
         }
-
-
-def _place(step: int | None, record: RunRecord) -> int | str:
-    """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
-    if step is None:
-        return ""
-    return record.numbers[step] if step >= 0 else "map"
-
-
-def _processed(
-    system: StereoSlam, reading: _Reading, watches: tuple[Watch, ...], overlap: bool, record: RunRecord
-) -> Iterator[tuple[int, FrameResult]]:
-    """Each frame's number and what the system did with it."""
-    for frame, result in system.run(reading, overlap):
-        result.milliseconds["read"] = reading.milliseconds.pop(frame.index)  # type: ignore[index]
-        if reading.live is not None:
-            record.ages.append(reading.live.age(frame))
-        if frame.right is None:
-            record.without_right.append(len(record.statuses))
-        record.depths.append(median_depth(result.features, system.rig))
-        yield frame.index, result
-        for watch in watches:
-            watch(frame, result, system)
-
-
-class _Reading:
-    """Frames, and the wall time that reading each took [ms] by its index; nothing in a live run, which waits for them.
-
-    Args:
-        frames: to be read.
-        live: where they come from in a live run; else None.
-    """
-
-    def __init__(self, frames: Iterator[StereoFrame], live: LiveFrames | None = None) -> None:
-        self._frames = frames
-        self.live = live
-        self.milliseconds: dict[int, float] = {}
-
-    def __iter__(self) -> Iterator[StereoFrame]:
-        while True:
-            start = time.perf_counter()
-            frame = next(self._frames, None)
-            if frame is None:
-                return
-            self.milliseconds[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
-            yield frame

@@ -21,21 +21,13 @@ _PARTS = ("frontend", "backend")  # sections whose settings are those of a class
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting.
+    """One setting."""
 
-    Attributes:
-        key: as ``--set`` takes it, such as ``"map.grid"``.
-        owner: the front end or back end that has it; empty for settings that all runs have.
-        defaults: by kind of motion.
-        unit: empty for words, counts and ratios.
-        text: what it means.
-    """
-
-    key: str
-    owner: str
-    defaults: dict[str, Any]
-    unit: str
-    text: str
+    key: str  # as ``--set`` takes it, such as ``"map.max_landmarks"``
+    owner: str  # the front end or back end that has it; empty for settings that all runs have
+    defaults: dict[str, Any]  # by kind of motion
+    unit: str  # empty for words, counts and ratios
+    text: str  # what it means
 
 
 def settings() -> Iterator[Setting]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
+from pathlib import Path
 
 from slam.data import FrameResult
 from slam.registry import ONLINE
 from slam.runtime.compile_clock import compile_clock
+from slam.runtime.cores import available_cores
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
@@ -41,17 +47,59 @@ def warm_up(*backends: str, until: threading.Event | None = None) -> float:
         >>> seconds = slam.warm_up("ekf")
     """
     before = compile_clock.seconds()
-    for _ in chain.from_iterable(_frames(backend) for backend in backends or ONLINE):
+    for _ in chain.from_iterable(chain(_with_images(name), _with_bodies(name)) for name in backends or ONLINE):
         if until is not None and until.is_set():
             break
     return compile_clock.seconds() - before
 
 
-def _frames(backend: str) -> Iterator[FrameResult]:
-    """All frames of the scenes, processed."""
+def _with_images(backend: str) -> Iterator[FrameResult]:
     for scene in _SCENES:
         sequence = open_sequence(scene)
         yield from (result for _, result in StereoSlam(sequence.rig, backend=backend).run(sequence))
+
+
+def _with_bodies(backend: str) -> Iterator[FrameResult]:
     world = open_sequence(_BODIES)
     system = StereoSlam(world.rig, None, backend, kind=world.kind)
     yield from (system.process_features(seen.features) for seen in world.observe())  # type: ignore[attr-defined]
+
+
+@contextmanager
+def compiled_in_background(backend: str) -> Iterator[None]:
+    """Where nothing is compiled yet, a second process compiles the kernels of back end and moving objects meanwhile.
+
+    Numba compiles one function at a time in a process, and the first frame waits for the front end's kernels anyway.
+    What the second process has made is loaded from Numba's cache; what is not there in time is compiled here. It ends
+    with the block, or when this process is killed: its standard input ends then.
+    """
+    from slam.objects.scene_kernels import window_tests
+
+    folder = window_tests.stats.cache_path
+    cold = folder is not None and not any(Path(folder).glob("scene_kernels.window_tests-*.nbi"))
+    if available_cores() < 2 or not cold:
+        yield
+        return
+    modules = {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
+    quiet = subprocess.DEVNULL
+    process = subprocess.Popen(  # -P: no module of the working folder
+        [sys.executable, "-P", "-m", __name__, backend], stdin=subprocess.PIPE, stdout=quiet, stderr=quiet,
+        start_new_session=True, env={**os.environ, **modules},
+    )  # fmt: skip
+    try:
+        yield
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def _end_with_parent() -> None:
+    """End this process as soon as nobody holds the other end of its standard input."""
+    os.read(0, 1)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    for _ in _with_bodies(sys.argv[1]):
+        pass
