@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -27,31 +27,34 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+
+def option(help: str, metavar: str | None = None, *names: str, **more: Any) -> Any:
+    """An option of a command; without names it is called as its parameter."""
+    return typer.Option(*names, metavar=metavar, help=help, **more)
+
+
+def argument(help: str, metavar: str, show_default: bool = False) -> Any:
+    """An argument of a command."""
+    return typer.Argument(metavar=metavar, help=help, show_default=show_default)
+
+
 #: Options that several commands share.
-_OutOption = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the files.")]
+_OutOption = Annotated[Path, option("Folder for the files.", "DIR", "--out", "-o")]
 _RunOutOption = Annotated[
-    Path | None,
-    typer.Option("--out", "-o", metavar="DIR", help="Folder for the files; default: results/SEQUENCE-BACKEND-N."),
+    Path | None, option("Folder for the files; default: results/SEQUENCE-BACKEND-N.", "DIR", "--out", "-o")
 ]
-_OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that are there; never an input.")]
+_OverwriteOption = Annotated[bool, option("Replace files that are there; never an input.", None, "--overwrite")]
 _SetOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.",
-    ),
+    option("A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.", "KEY=VALUE", "--set"),
 ]
-_BackendOption = Annotated[str | None, typer.Option(metavar="NAME", help="Back end, see `slam list`; default: ekf.")]
-_FramesOption = Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames, B left out.")]
-_QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")]
-_PictureOption = Annotated[bool, typer.Option("--picture/--no-picture", help="Leave a picture of the run.")]
-_FormatOption = Annotated[
-    str | None, typer.Option(metavar="FORMAT", help="Format; default: found out from the folder.")
-]
+_BackendOption = Annotated[str | None, option("Back end, see `slam list`; default: ekf.", "NAME")]
+_FramesOption = Annotated[str | None, option("Range of frames, B left out.", "A:B")]
+_QuietOption = Annotated[bool, option("No progress, no table.", None, "--quiet", "-q")]
+_PictureOption = Annotated[bool, option("Leave a picture of the run.", None, "--picture/--no-picture")]
+_FormatOption = Annotated[str | None, option("Format; default: found out from the folder.", "FORMAT")]
 _MaskOption = Annotated[
-    str | None,
-    typer.Option(metavar="FILE[,FILE]", help="Image that is black where a camera sees its own car; left, right."),
+    str | None, option("Image that is black where a camera sees its own car; left, right.", "FILE[,FILE]")
 ]
 
 
@@ -81,7 +84,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def common_options(
     version: Annotated[
-        bool, typer.Option("--version", help="Show the version and exit.", callback=_print_version, is_eager=True)
+        bool, option("Show the version and exit.", None, "--version", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     """Options of the command itself."""
@@ -91,54 +94,37 @@ def common_options(
 def run_command(
     sequence: Annotated[
         str | None,
-        typer.Argument(
-            metavar="SEQUENCE",
-            help="A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
-            show_default=False,
+        argument(
+            "A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
+            "SEQUENCE",
         ),
     ] = None,
     out: _RunOutOption = None,
     config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="config.json of an earlier run, to repeat it; other options change it."),
+        Path | None, option("config.json of an earlier run, to repeat it; other options change it.", "FILE")
     ] = None,
     backend: _BackendOption = None,
-    frontend: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Front end, see `slam list`; default: surf.")
-    ] = None,
+    frontend: Annotated[str | None, option("Front end, see `slam list`; default: surf.", "NAME")] = None,
     settings: _SetOption = None,
     frames: _FramesOption = None,
-    kind: Annotated[
-        str | None, typer.Option(metavar="KIND", help="handheld or driving; default: the sequence's own.")
-    ] = None,
+    kind: Annotated[str | None, option("handheld or driving; default: the sequence's own.", "KIND")] = None,
     format: _FormatOption = None,
-    record: Annotated[
-        Path | None, typer.Option(metavar="FILE.npz", help="Record what the back end is given, for `slam replay`.")
-    ] = None,
-    prior_map: Annotated[
-        Path | None, typer.Option("--map", metavar="FILE", help="Start in the map of an earlier run.")
-    ] = None,
-    save_map: Annotated[Path | None, typer.Option("--save-map", metavar="FILE", help="Keep the map.")] = None,
-    mono: Annotated[bool, typer.Option("--mono", help="Left images alone, in a prior map.")] = False,
+    record: Annotated[Path | None, option("Record what the back end is given, for `slam replay`.", "FILE.npz")] = None,
+    prior_map: Annotated[Path | None, option("Start in the map of an earlier run.", "FILE", "--map")] = None,
+    save_map: Annotated[Path | None, option("Keep the map.", "FILE", "--save-map")] = None,
+    mono: Annotated[bool, option("Left images alone, in a prior map.", None, "--mono")] = False,
     calibration: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="What is known of the rig: from `slam calibrate`, or an earlier run."),
+        Path | None, option("What is known of the rig: from `slam calibrate`, or an earlier run.", "FILE")
     ] = None,
     mask: _MaskOption = None,
-    viewer: Annotated[
-        str | None, typer.Option(metavar="live|FILE.rrd", help="Show it in Rerun, or keep it for Rerun.")
-    ] = None,
-    draw: Annotated[
-        Path | None, typer.Option(metavar="DIR|FILE.mp4", help="Draw landmarks and objects into the frames.")
-    ] = None,
-    draw_map: Annotated[
-        bool, typer.Option("--draw-map", help="With --draw: the growing map beside each frame.")
-    ] = False,
+    viewer: Annotated[str | None, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
+    draw: Annotated[Path | None, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
+    draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
     overlap: Annotated[
-        bool, typer.Option(help="Extract the next frame's features while this one is estimated; same results.")
+        bool, option("Extract the next frame's features while this one is estimated; same results.")
     ] = True,
     live: Annotated[
-        bool, typer.Option("--live", help="Frames at their own rate; those that come too late are dropped.")
+        bool, option("Frames at their own rate; those that come too late are dropped.", None, "--live")
     ] = False,
     picture: _PictureOption = True,
     overwrite: _OverwriteOption = False,
@@ -182,7 +168,7 @@ def run_command(
 
 @app.command("replay", short_help="Feed a back end recorded measurements.")
 def replay_command(
-    recording: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Made by `slam run --record`.")],
+    recording: Annotated[Path, argument("Made by `slam run --record`.", "FILE.npz")],
     out: _RunOutOption = None,
     backend: _BackendOption = None,
     settings: _SetOption = None,
@@ -215,15 +201,12 @@ def replay_command(
 
 @app.command("plot", short_help="Draw finished runs.")
 def plot_command(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
+    folders: Annotated[list[Path], argument("Left by `slam run`.", "DIR")],
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="PNG, PDF or SVG; default: a PNG in the first folder."),
+        Path | None, option("PNG, PDF or SVG; default: a PNG in the first folder.", "FILE", "--out", "-o")
     ] = None,
-    figure: Annotated[str, typer.Option(metavar="NAME", help="summary, path, map, errors or time.")] = "summary",
-    width: Annotated[
-        float | None, typer.Option(metavar="MM", help="Width of the picture, such as 88 for a journal's column.")
-    ] = None,
+    figure: Annotated[str, option("summary, path, map, errors or time.", "NAME")] = "summary",
+    width: Annotated[float | None, option("Width of the picture, such as 88 for a journal's column.", "MM")] = None,
     overwrite: _OverwriteOption = False,
 ) -> None:
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
@@ -235,9 +218,7 @@ def plot_command(
 
 @app.command("settings", short_help="List all settings.")
 def settings_command(
-    section: Annotated[
-        str | None, typer.Argument(metavar="SECTION", help="A section, a setting, or a front end or back end.")
-    ] = None,
+    section: Annotated[str | None, argument("A section, a setting, or a front end or back end.", "SECTION")] = None,
 ) -> None:
     """List all settings with default per kind of motion, unit and meaning."""
     from slam.commands.settings import print_settings
@@ -247,31 +228,23 @@ def settings_command(
 
 @app.command("compare", short_help="Compare back ends on the same recordings.")
 def compare_command(
-    sequences: Annotated[
-        list[str], typer.Argument(metavar="SEQUENCE", help="Folders, or synthetic:NAME?key=value.", show_default=False)
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder; a comparison that was stopped in it goes on.")
-    ],
-    backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back ends; the first is the reference.")] = ",".join(
-        ONLINE
-    ),
-    frontends: Annotated[
-        str, typer.Option(metavar="A,B,...", help="Front ends; simulated: a world's own features, no images.")
-    ] = "",
+    sequences: Annotated[list[str], argument("Folders, or synthetic:NAME?key=value.", "SEQUENCE")],
+    out: Annotated[Path, option("Folder; a comparison that was stopped in it goes on.", "DIR", "--out", "-o")],
+    backends: Annotated[str, option("Back ends; the first is the reference.", "A,B,...")] = ",".join(ONLINE),
+    frontends: Annotated[str, option("Front ends; simulated: a world's own features, no images.", "A,B,...")] = "",
     variant: Annotated[
-        list[str] | None, typer.Option(metavar="VARIANT", help="A front end with settings, NAME:FRONTEND:KEY=VALUE:...")
+        list[str] | None, option("A front end with settings, NAME:FRONTEND:KEY=VALUE:...", "VARIANT")
     ] = None,
     settings: _SetOption = None,
     mask: _MaskOption = None,
-    trials: Annotated[int, typer.Option(metavar="N", min=1, help="Seeds 0 to N - 1 of every synthetic world.")] = 12,
+    trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N", min=1)] = 12,
     frames: _FramesOption = None,
-    replay: Annotated[bool, typer.Option(help="Also feed the first back end's measurements to all.")] = True,
-    workers: Annotated[int | None, typer.Option(metavar="N", help="Processes; default: the number of cores.")] = None,
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to be used.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="30 frames, 2 trials: does it work?")] = False,
+    replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
+    workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
+    scheduler: Annotated[str | None, option("A Dask scheduler to be used.", "ADDRESS")] = None,
+    quick: Annotated[bool, option("30 frames, 2 trials: does it work?", None, "--quick")] = False,
     overwrite: _OverwriteOption = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no conclusions.")] = False,
+    quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
     from slam.commands import compare as command
@@ -289,18 +262,10 @@ def compare_command(
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
 def calibrate_command(
-    sequences: Annotated[
-        list[str], typer.Argument(metavar="SEQUENCE", help="Recordings of one rig.", show_default=False)
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="For `slam run --calibration`.")] = Path(
-        "rig_errors.json"
-    ),
-    opencv: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="The corrected calibration in OpenCV's form.")
-    ] = None,
-    kalibr: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="The same in the form of Kalibr's camchain.")
-    ] = None,
+    sequences: Annotated[list[str], argument("Recordings of one rig.", "SEQUENCE")],
+    out: Annotated[Path, option("For `slam run --calibration`.", "FILE", "--out", "-o")] = Path("rig_errors.json"),
+    opencv: Annotated[Path | None, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
+    kalibr: Annotated[Path | None, option("The same in the form of Kalibr's camchain.", "FILE.yaml")] = None,
     settings: _SetOption = None,
     frames: _FramesOption = None,
     format: _FormatOption = None,
@@ -322,13 +287,11 @@ def calibrate_command(
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")
 def render_command(
-    sequence: Annotated[
-        str, typer.Argument(metavar="SEQUENCE", help="A folder, or synthetic:NAME?key=value.", show_default=False)
-    ],
+    sequence: Annotated[str, argument("A folder, or synthetic:NAME?key=value.", "SEQUENCE")],
     out: _OutOption,
     frames: _FramesOption = None,
-    truth_images: Annotated[bool, typer.Option(help="Depth and object images as well.")] = True,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    truth_images: Annotated[bool, option("Depth and object images as well.")] = True,
+    quiet: Annotated[bool, option("No progress.", None, "--quiet", "-q")] = False,
 ) -> None:
     """Write a built-in sequence as an EuRoC folder with its truth, for other programs."""
     from slam.commands.display import counting
@@ -351,8 +314,8 @@ def render_command(
 
 @app.command("view", short_help="Show a finished run in Rerun.")
 def view_command(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
-    target: Annotated[str, typer.Option("--to", metavar="live|FILE.rrd", help="A window, or a file.")] = "live",
+    folder: Annotated[Path, argument("Left by `slam run`.", "DIR")],
+    target: Annotated[str, option("A window, or a file.", "live|FILE.rrd", "--to")] = "live",
     overwrite: _OverwriteOption = False,
 ) -> None:
     """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
@@ -363,7 +326,7 @@ def view_command(
 
 @app.command("list", short_help="List back ends, sequences and formats.")
 def list_command(
-    options: Annotated[bool, typer.Option("--options", help="Also the options of the built-in sequences.")] = False,
+    options: Annotated[bool, option("Also the options of the built-in sequences.", None, "--options")] = False,
 ) -> None:
     """List back ends, front ends, built-in sequences and formats."""
     from slam.commands.display import print_listing
@@ -385,7 +348,7 @@ def warm_up_command(quiet: _QuietOption = False) -> None:
 @app.command("demo", short_help="Try three back ends on a built-in scene.")
 def demo_command(
     out: _OutOption = Path("slam_demo"),
-    frames: Annotated[int, typer.Option(metavar="N", min=10, help="Number of frames.")] = 150,
+    frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
     overwrite: _OverwriteOption = False,
     quiet: _QuietOption = False,
 ) -> None:

@@ -31,7 +31,7 @@ _PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
 
 
 def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: int = 960) -> np.ndarray:
-    """The left image of a step (BGR uint8), enlarged to about `width` [px], with landmarks, features, boxes and axes."""
+    """The left image of a step (BGR uint8), enlarged to about `width` [px], with landmarks, boxes and axes."""
     import cv2
 
     picture = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)

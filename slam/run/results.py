@@ -90,6 +90,8 @@ METRICS = (
     Metric("scale_sigma_percent", "scale sigma (claimed)", "", False, "%", 1.0, (*_HONEST, "scale sigma [%]")),
     *(Metric(key, f"NEES / 6 {where} (expected 1)", "one", main, place=(*_HONEST, name), share_of="dof")
       for key, (where, name, main) in _NEES.items()),
+    *(Metric(f"{key}_left_out", f"stretches {where} without covariance", "", False, *_PERCENT,
+             (*_HONEST, f"no covariance {where}")) for key, (where, _, _) in list(_NEES.items())[1:]),
     Metric("nis_per_dof", "NIS per degree of freedom (expected 1)", "one",
            place=(*_HONEST, "NIS per degree of freedom")),
     Metric("landmark_error_m", "landmark error, median", "lower", True, *_MM),
@@ -190,14 +192,8 @@ def _placed(metrics: Sequence[Metric], summary: Mapping[str, Any]) -> dict[str, 
 
 
 def figures(summary: Mapping[str, Any]) -> dict[str, float]:
-    """What a run's summary says, by key of `METRICS`, and ``object …`` figures; what it does not say is left out.
-
-    A NEES of which more than half of the stretches had no covariance is left out as well.
-    """
+    """What a run's summary says, by key of `METRICS`, and ``object …`` figures; what it does not say is left out."""
     found = _placed(METRICS, summary)
-    for key, (where, _, _) in _NEES.items():
-        if (summary.get("consistency", {}).get(f"no covariance {where}") or 0.0) > 0.5:
-            found.pop(key, None)
     if "scale_error_percent" in found:
         found["scale_error_percent"] = abs(found["scale_error_percent"])
     if not found.get("loops_closed", 0) + found.get("loops_refused", 0):
@@ -213,13 +209,16 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
 def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     """Whether covariances are as large as the errors, by which figure and which band; empty where no NEES is known.
 
+    A figure of which more than half of the stretches had no covariance is not judged by.
+
     Args:
         found: `figures` of a run, or their means over several.
         runs: how many. The band is that of as many independent values: it holds even if all frames of a run are as good
             as one, which errors of the rig make them.
     """
     low, high = (bound / 6 for bound in chi_square_band(6, max(runs, 1)))
-    known = {_NEES[key][0]: found[key] for key in _JUDGED if np.isfinite(found.get(key, np.nan))}
+    usable = [key for key in _JUDGED if not found.get(f"{key}_left_out", 0.0) > 0.5]
+    known = {_NEES[key][0]: found[key] for key in usable if np.isfinite(found.get(key, np.nan))}
     if not known:
         return ""
     said = {w: "are too small" if v > high else "are too large" if v < low else "hold" for w, v in known.items()}

@@ -6,14 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.commands.plot import plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import pose_errors
 from slam.run.options import RunOptions
 from slam.run.plots import KINDS
-from slam.run.run_data import RunData
+from slam.run.plots import plot_folders as plot_runs
+from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
 from slam.sequences import open_sequence
 

@@ -79,9 +79,9 @@ def test_options_of_front_ends_and_back_ends_are_there(every, role):
 
 def test_an_unknown_section(read):
     with pytest.raises(SlamError, match="did you mean 'map'"):
-        listing("mapp", 80)
+        list(listing("mapp", 80))
     with pytest.raises(SlamError, match=r"there is map\.max_landmarks"):
-        listing("max_landmarks", 80)
+        list(listing("max_landmarks", 80))
 
 
 def test_values_at_the_ends_of_ranges_are_accepted_and_beyond_refused():

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from typer.testing import CliRunner
 
 from slam.commands.cli import app
-from slam.commands.display import print_summary
 
 
 def invoke(*words, **environment):
@@ -31,14 +28,3 @@ def test_short_options_are_the_long_ones(tmp_path):
     done = invoke("run", "synthetic:desk?frames=2&width=64&height=48", "-o", str(tmp_path / "out"), "-q")
     assert (done.exit_code, done.output) == (0, "")
     assert (tmp_path / "out" / "summary.png").exists()
-
-
-def test_covariances_that_are_too_large_on_an_exact_world_say_why(capsys):
-    summary = {"sequence": "aisle", "backend": "ekf", "frames": 9, "status": {"tracked": 9}}
-    for exact in (True, False):
-        print_summary(
-            [{**summary, "consistency": {"mean NEES": 0.5, "dof": 6.0, "exact calibration": exact}}], Path("out")
-        )
-        said = " ".join(capsys.readouterr().out.split())
-        assert "covariances are too large" in said
-        assert ("this world's cameras have none" in said) == exact

@@ -14,7 +14,7 @@ from slam.compare.report import write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler
 from slam.compare.sweep import RUNS, SWEEP, sweep
 from slam.compare.tables import groups, write_tables
-from slam.compare.trial import failure, result_files, run_trial
+from slam.compare.trial import failed, run_trial
 from slam.errors import SlamError
 from slam.run.repeat import running_code
 from slam.run.results import BY_KEY
@@ -117,7 +117,7 @@ def test_a_failed_run_is_counted_never_dropped(done, tmp_path):
     trial = next(t for t in PLAN.trials_of(CLOSED_LOOP) if t.backend == "smoother")
     shutil.rmtree(out / RUNS / trial.folder)
     (out / RUNS / trial.folder).mkdir()
-    for name, content in result_files(trial, failure(ValueError("no\nway"))).items():
+    for name, content in failed(trial, ValueError("no\nway")).items():
         (out / RUNS / trial.folder / name).write_bytes(content)
     runs = sweep(PLAN, out, LocalScheduler(1))
     write_tables(PLAN, runs, out)
