@@ -21,19 +21,6 @@ from slam.sequences import open_sequence
 WORLD = "synthetic:aisle?frames=4&width=160&height=120"
 
 
-def markdown(table):
-    """The rows of a table as ``docs/files.md`` has them."""
-    rows = [f"| {_spelled(c.names)} | {c.unit or '–'} | {c.text} |" for c in table]
-    return ["| column | unit | holds |", "| --- | --- | --- |", *rows]
-
-
-def _spelled(names):
-    """Names of columns; of many the first and the last."""
-    return (
-        ", ".join(f"`{name}`" for name in names) if len(names) <= 8 else f"`{names[0]}`, `{names[1]}` … `{names[-1]}`"
-    )
-
-
 def body(id, seed):
     """A moving body with a full covariance, all of its numbers different."""
     rng = np.random.default_rng(seed)
