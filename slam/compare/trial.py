@@ -83,11 +83,7 @@ def failed(trial: Trial, error: BaseException) -> Files:
 
 
 def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
-    """All settings of a trial.
-
-    Raises:
-        ConfigurationError: a setting is unknown or out of range.
-    """
+    """All settings of a trial; raises ConfigurationError: a setting is unknown or out of range."""
     name = trial.variant.frontend
     first = _ONE_THREAD.get(name, [])
     if name == SIMULATED and isinstance(sequence, WorldSequence):  # the noise of these features is known

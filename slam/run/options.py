@@ -52,11 +52,7 @@ class RunOptions:
 
 
 def parse_frames(text: str | None) -> tuple[int, int | None]:
-    """``A:B`` (either may be left out) as a range of frames.
-
-    Raises:
-        SlamError: not of that form.
-    """
+    """``A:B`` (either may be left out) as a range of frames; raises SlamError: not of that form."""
     if text is None:
         return 0, None
     first, colon, last = text.partition(":")

@@ -51,11 +51,7 @@ class RunData:
 
     @classmethod
     def read(cls, folder: Path, name: str) -> RunData:
-        """Read the files of a finished run.
-
-        Raises:
-            SlamError: the folder does not hold a finished run.
-        """
+        """Read the files of a finished run; raises SlamError: the folder does not hold a finished run."""
         if not folder.exists():
             raise SlamError(f"{folder}: there is no such folder")
         if not (folder / "landmarks.csv").exists():
@@ -115,11 +111,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
-    """Stamp [s], id and position [m] of every row of objects.csv.
-
-    Raises:
-        SlamError: the file is missing or damaged.
-    """
+    """Stamp [s], id and position [m] of every row of objects.csv; raises SlamError: the file is missing or damaged."""
     path = folder / "objects.csv"
     try:
         return [(float(row["stamp"]), row["id"], [float(row[c]) for c in "xyz"]) for row in _rows(path)]

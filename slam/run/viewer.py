@@ -46,13 +46,16 @@ class Viewer:
     """
 
     def __init__(self, target: str, rig: StereoRig | None = None, truth: Trajectory | None = None) -> None:
-        self._rr = _rerun()
+        try:
+            self.rr = import_module("rerun")
+        except ImportError as error:
+            raise SlamError("the viewer needs Rerun: pip install 'surf-stereo-slam[viewer]'") from error
         self._target = target
-        self._recording = _open(self._rr, target)
+        self._recording = _open(self.rr, target)
         self._rig, self._truth = rig, truth
         self._start: float | None = None
         self._path: list[Array] = []
-        self._log("", self._rr.ViewCoordinates.RDF, static=True)
+        self.log("", self.rr.ViewCoordinates.RDF, static=True)
 
     def __enter__(self) -> Viewer:
         return self
@@ -67,27 +70,27 @@ class Viewer:
 
     def show(self, frame: StereoFrame, result: FrameResult, system: StereoSlam) -> None:
         """One more frame, right after its step."""
-        rr, e, pixels = self._rr, result.estimate, result.features.uv_left
+        rr, e, pixels = self.rr, result.estimate, result.features.uv_left
         if self._truth is not None and not self._path:  # placed by the first pose
             at = int(np.argmin(np.abs(self._truth.stamps - e.stamp)))
             placed = e.T_world_left @ inverse(self._truth.poses[at]) @ self._truth.poses
-            self._log("/truth", rr.LineStrips3D([placed[:, :3, 3]], colors=_TRUTH), static=True)
+            self.log("/truth", rr.LineStrips3D([placed[:, :3, 3]], colors=_TRUTH), static=True)
         self.show_pose(frame.index, e.stamp, e.T_world_left)
         image = frame.left if frame.left.ndim == 2 else frame.left[..., 2::-1]
         if image.dtype == np.uint8 and self._rig is not None:
-            self._log("/camera/image", rr.Image(image).compress(jpeg_quality=80))
+            self.log("/camera/image", rr.Image(image).compress(jpeg_quality=80))
         kinds = {
             "measured": (result.matched_features, _SEEN),
             "new": (result.added_features, _NEW),
             "moving": (result.moving_features, _MOVING),
         }
         for name, (rows, colour) in kinds.items():
-            self._log(f"/camera/image/{name}", rr.Points2D(pixels[rows], colors=colour, radii=2.0))
+            self.log(f"/camera/image/{name}", rr.Points2D(pixels[rows], colors=colour, radii=2.0))
         for moving in result.objects:
             place, box = f"/objects/{moving.id}", moving.extent
-            self._log(place, self._transform(moving.estimate.T_world_object))
+            self.log(place, self._transform(moving.estimate.T_world_object))
             boxes = rr.Boxes3D(centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=_MOVING)
-            self._log(f"{place}/box", boxes)
+            self.log(f"{place}/box", boxes)
         if result.keyframe:
             self._show_places(system)
         if result.index % _MAP_EVERY == 0:
@@ -100,45 +103,42 @@ class Viewer:
         vectors *= np.sign(np.linalg.det(vectors))[:, None, None]
         half = _SIGMAS * np.sqrt(np.maximum(values, 0))
         for name, rows, colour in (("seen", seen, _SEEN), ("not_seen", ~seen, _UNSEEN)):
-            shapes = self._rr.Ellipsoids3D(
+            shapes = self.rr.Ellipsoids3D(
                 centers=positions[rows], half_sizes=half[rows], quaternions=quaternion(vectors[rows]), colors=colour
             )
-            self._log(f"/map/{name}", shapes)
+            self.log(f"/map/{name}", shapes)
 
     def show_pose(self, number: int, stamp: float, T_world_left: Array) -> None:
         """The camera alone."""
-        rr = self._rr
+        rr = self.rr
         self._start = stamp if self._start is None else self._start
         self._recording.set_time("frame", sequence=number)
         self._recording.set_time("time", duration=stamp - self._start)
         self._path.append(T_world_left[:3, 3])
-        self._log("/camera", self._transform(T_world_left))
+        self.log("/camera", self._transform(T_world_left))
         if self._rig is not None:
             left = self._rig.left
             K = [[left.fu, 0, left.u0], [0, left.fv, left.v0], [0, 0, 1]]
             pinhole = rr.Pinhole(image_from_camera=K, resolution=[left.width, left.height], image_plane_distance=0.2)
-            self._log("/camera/image", pinhole)
-        self._log("/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
-
-    def show_object(self, name: str, position: list[float]) -> None:
-        """Where a moving object is [m]."""
-        self._log(f"/objects/{name}", self._rr.Points3D([position], colors=_MOVING, radii=0.03))
+            self.log("/camera/image", pinhole)
+        self.log("/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
 
     def _show_places(self, system: StereoSlam) -> None:
         """Keyframes, the path through them as loops have corrected it, and loops, closed and refused."""
-        rr, atlas = self._rr, system.atlas
+        rr, atlas = self.rr, system.atlas
         at = atlas.poses_in_map()[:, :3, 3]
-        self._log("/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
-        self._log("/places/path", rr.LineStrips3D([at[atlas.prior_count :]], colors=_PLACE))
+        self.log("/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
+        self.log("/places/path", rr.LineStrips3D([at[atlas.prior_count :]], colors=_PLACE))
         closed = [(loop.first, loop.second) for loop in atlas.loops]
         for name, pairs, colour in (("closed", closed, _CLOSED), ("refused", atlas.refused, _REFUSED)):
             strips = at[np.array(pairs, int).reshape(-1, 2)]
-            self._log(f"/places/loops_{name}", rr.LineStrips3D(strips, colors=colour))
+            self.log(f"/places/loops_{name}", rr.LineStrips3D(strips, colors=colour))
 
     def _transform(self, T: Array) -> Any:
-        return self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
+        return self.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
 
-    def _log(self, path: str, what: Any, static: bool = False) -> None:
+    def log(self, path: str, what: Any, static: bool = False) -> None:
+        """Show something at its place below the world."""
         self._recording.log(f"world{path}", what, static=static)
 
 
@@ -166,15 +166,8 @@ def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
             viewer.show_pose(number, float(stamp), pose)
             for seen, name, position in objects:
                 if abs(seen - stamp) < 1e-6:
-                    viewer.show_object(name, position)
+                    viewer.log(f"/objects/{name}", viewer.rr.Points3D([position], colors=_MOVING, radii=0.03))
         viewer.show_map(run.positions, run.covariances, run.seen_last)
-
-
-def _rerun() -> Any:
-    try:
-        return import_module("rerun")
-    except ImportError as error:
-        raise SlamError("the viewer needs Rerun: pip install 'surf-stereo-slam[viewer]'") from error
 
 
 def _open(rr: Any, target: str) -> Any:
