@@ -14,7 +14,7 @@ from slam.registry import ONLINE
 from slam.run.drawing import draw_objects, with_legend
 from slam.run.options import RunOptions
 from slam.run.outputs import NAMES, write_json
-from slam.run.plots import plot
+from slam.run.plots import PICTURE, plot
 from slam.run.run_data import RunData
 from slam.run.runner import run
 from slam.run.warm_up import compiled_in_background
@@ -26,8 +26,7 @@ _WHY = """The demo's cameras differ from their calibration as real ones do: by 0
 focal length, the right one turned by 0.7 mrad. Covariances count such errors;
 with exact cameras they would be too large."""
 
-#: The picture to be opened first, and the other one.
-_FIRST, _FRAME = "summary.png", "frame.png"
+_FRAME = "frame.png"
 
 
 def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -> list[dict[str, Any]]:
@@ -45,13 +44,11 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     Raises:
         SlamError: a file cannot be written, or is there already.
     """
-    own = Output(out, "--out", ["comparison.json", _FIRST, _FRAME])
+    own = Output(out, "--out", ["comparison.json", PICTURE, _FRAME])
     require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)
-
-    world = _WORLD.format(frames)
     summaries: list[dict[str, Any]] = []
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
-    sequence = open_sequence(world)
+    sequence = open_sequence(_WORLD.format(frames))
     sequence.keep_images()  # type: ignore[attr-defined]
     with compiled_in_background(ONLINE[-1]):
         for backend in ONLINE:
@@ -64,8 +61,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
 
                 summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
     write_json(out / "comparison.json", {"runs": summaries})
-    runs = [RunData.read(out / backend, backend) for backend in ONLINE]
-    plot(runs, out / _FIRST)
+    plot([RunData.read(out / backend, backend) for backend in ONLINE], out / PICTURE)
     last = shown.get(True, shown.get(False))
     if last is not None:
         (frame,) = sequence.frames(last.index, last.index + 1)
@@ -73,5 +69,5 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     if not quiet:
         print_summary(summaries, out)
         print(_WHY)
-        print(f"Open first: {out / _FIRST}; then {out / _FRAME}, the box in the image")
+        print(f"Open first: {out / PICTURE}; then {out / _FRAME}, the box in the image")
     return summaries

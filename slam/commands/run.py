@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from slam.run.options import RunOptions, parse_frames
 from slam.run.outcome import nothing_tracked
 from slam.run.plots import leave_picture
 from slam.run.recorded import Recording
-from slam.run.repeat import Origin, Repeat, changed_versions, load, versions
+from slam.run.repeat import Origin, changed_versions, load, versions
 from slam.run.runner import Watch
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live, open_sequence
@@ -53,12 +54,11 @@ def prepare(
     Arguments are those of the command line, None where it says nothing; `config` is the ``config.json`` of an earlier
     run, whose choices hold then. Raises SlamError on bad input; one line says what and where.
     """
+    start, stop, text = 0, None, sequence
     before = None if config is None else load(config, sequence, prior_map, calibration)
-    if before is not None and kind is not None:
-        raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
-    start, stop = 0, None
-    text = sequence
     if before is not None:
+        if kind is not None:
+            raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
         if sequence is None:  # a given sequence has a format of its own
             format = format or before.origin.format
         text, kind, start, stop = before.origin.sequence, before.origin.kind, before.start, before.stop
@@ -71,8 +71,15 @@ def prepare(
     if mono and prior_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
     chosen = SystemConfig.for_kind(kind, frontend, backend)
-    if before is not None:
-        chosen = _repeated(before, chosen, frontend, backend)
+    if before is not None:  # options of another front end or back end than its are the defaults
+        changed = changed_versions(before.versions, versions())
+        if changed:
+            logging.getLogger(__name__).warning("made with other versions, results may differ: %s", "; ".join(changed))
+        chosen = replace(
+            before.config,
+            frontend=before.config.frontend if frontend == before.frontend else chosen.frontend,
+            backend=before.config.backend if backend == before.backend else chosen.backend,
+        )
     require_settable(settings, chosen.to_json(), frontend)
     chosen = chosen.with_settings([*(["map.monocular=true"] if mono else []), *settings])
     if frames is not None:
@@ -132,18 +139,6 @@ def finish(summary: dict[str, Any], folder: Path, picture: bool, quiet: bool) ->
         raise typer.Exit(1)
 
 
-def _repeated(before: Repeat, default: SystemConfig, frontend: str, backend: str) -> SystemConfig:
-    """The settings of an earlier run; options of another front end or back end than its are the defaults."""
-    changed = changed_versions(before.versions, versions())
-    if changed:
-        logging.getLogger(__name__).warning("made with other versions, results may differ: %s", "; ".join(changed))
-    return replace(
-        before.config,
-        frontend=before.config.frontend if frontend == before.frontend else default.frontend,
-        backend=before.config.backend if backend == before.backend else default.backend,
-    )
-
-
 def command_line() -> str:
     """The command that is running, as it can be typed again."""
     return shlex.join(["slam", *sys.argv[1:]])
@@ -174,18 +169,17 @@ def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
 
 def _claimed(name: str) -> Path:
     """A new folder of this name and the first free number; made here, so that no other run can take it."""
-    number = 1
-    while True:
+    for number in count(1):
         folder = RESULTS / f"{name}-{number}"
         try:
             folder.mkdir(parents=True)
-            return folder
+            break
         except FileExistsError:
             if not RESULTS.is_dir():
                 raise SlamError(f"{RESULTS}: a file where the folder of all results should be; give --out") from None
-            number += 1
         except OSError as error:
             raise SlamError(f"cannot write to {folder}: {error.strerror or error}; give --out") from error
+    return folder
 
 
 def _short(text: str) -> str:

@@ -93,7 +93,7 @@ class Plan:
 
     @property
     def every(self) -> list[Trial]:
-        """All trials, mode by mode: a replay needs the closed loop."""
+        """All trials, mode by mode."""
         return [trial for mode in self.modes for trial in self.trials_of(mode)]
 
     def command(self) -> str:

@@ -119,16 +119,15 @@ def difference(metric: Metric, reference: Array, other: Array) -> Difference:
         other: the other's.
     """
     both = np.isfinite(reference) & np.isfinite(other)
-    a, b = reference[both], other[both]
-    means = (float(a.mean()), float(b.mean())) if len(a) else (float("nan"), float("nan"))
-    if metric.better == "one":
-        a, b = _dishonesty(a), _dishonesty(b)
-    d = b - a
-    low, high = interval(d)
+    values = [reference[both], other[both]]
+    compared = values
+    if metric.better == "one":  # the same for half and double
+        compared = [np.abs(np.log10(np.maximum(each, 1e-12))) for each in values]
+    d = compared[1] - compared[0]
+    first, second, mean = (float(each.mean()) if len(d) else float("nan") for each in (*values, d))
     p = sign_flip(d) if metric.better and len(d) > 1 else float("nan")
-    mean = float(d.mean()) if len(d) else float("nan")
     signs = int((d < 0).sum()), int((d > 0).sum())
-    return Difference(metric, len(d), int((~both).sum()), *means, mean, low, high, p, p, *signs)
+    return Difference(metric, len(d), int((~both).sum()), first, second, mean, *interval(d), p, p, *signs)
 
 
 def adjusted(differences: Sequence[Difference]) -> list[Difference]:
@@ -148,8 +147,7 @@ def holm(p: Array) -> Array:
 
     The smallest is multiplied by M, the next by M − 1, …; none is less than a smaller one's, none more than 1.
     """
-    order = np.argsort(p, kind="stable")
-    result = np.empty(len(p))
+    order, result = np.argsort(p, kind="stable"), np.empty(len(p))
     result[order] = np.minimum(1.0, np.maximum.accumulate((len(p) - np.arange(len(p))) * p[order]))
     return result
 
@@ -211,8 +209,3 @@ def _signs(count: int) -> Array:
     if count <= _EXACT:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
     return np.random.default_rng(_SEED).choice((-1.0, 1.0), (2**_EXACT, count))
-
-
-def _dishonesty(values: Array) -> Array:
-    """Distance from one, the same for half and double."""
-    return np.abs(np.log10(np.maximum(values, 1e-12)))

@@ -75,21 +75,27 @@ def sweep(
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
     write_json(out / SWEEP, {"plan": asdict(plan), "command": plan.command(), "versions": running_code()})
-    for mode in plan.modes:
-        jobs = {}
+    trials = {trial.folder: trial for trial in plan.every}
+
+    def keep(job: Job, files: Files | None, error: BaseException | None) -> None:
+        trial = trials[job.name]
+        files, folder = files or failed(trial, error or SlamError("nothing came back")), out / RUNS / job.name
+        with naming_folder(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / RESULT).unlink(missing_ok=True)
+            for name in sorted(files, key=lambda name: name == RESULT):  # last: what is there then is whole
+                remove_file(folder / name)
+                (folder / name).write_bytes(files[name])
+        told(trial)
+
+    for mode in plan.modes:  # a replay needs the closed loop
+        jobs = []
         for trial in plan.trials_of(mode):
             if overwrite or not _is_done(trial, out):
-                jobs[trial.folder] = trial
+                jobs.append(Job(trial.folder, run_trial, partial(_arguments, plan, out, trial)))
             else:
                 told(trial)
-
-        def keep(job: Job, files: Files | None, error: BaseException | None, jobs: dict[str, Trial] = jobs) -> None:
-            trial = jobs[job.name]
-            _keep(out / RUNS / trial.folder, files or failed(trial, error or SlamError("nothing came back")))
-            told(trial)
-
-        arguments = partial(_arguments, plan, out)
-        scheduler.run([Job(name, run_trial, partial(arguments, trial)) for name, trial in jobs.items()], keep)
+        scheduler.run(jobs, keep)
     return [read_run(trial, out) for trial in plan.every]
 
 
@@ -121,7 +127,12 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
             registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
     goes_on = not overwrite and (out / SWEEP).is_file()
     if goes_on:
-        _require_same_versions(out / SWEEP)
+        before = read_object(out / SWEEP).get("versions")
+        if not isinstance(before, dict):
+            raise SlamError(f"{out / SWEEP}: not that of a comparison")
+        changed = changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code())
+        if changed:
+            raise SlamError(f"{out}: begun with {changed[0]}: runs cannot be compared; give another --out")
     require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)
     return frames
 
@@ -134,19 +145,14 @@ def read_run(trial: Trial, out: Path) -> Run:
     """
     folder = out / RUNS / trial.folder
     result, timing = read_object(folder / RESULT), folder / TIMING
-    outcome = result.get("outcome")
-    if not isinstance(outcome, str):
+    if not isinstance(result.get("outcome"), str):
         raise SlamError(f"{folder / RESULT}: does not say how the run ended")
-    milliseconds = _figures(read_object(timing), timing) if timing.exists() else {}
-    return Run(trial, outcome, _figures(result.get("metrics"), folder / RESULT), milliseconds, folder)
-
-
-def _figures(tree: Any, file: Path) -> dict[str, float]:
-    """Numbers by name; raises SlamError where they are none."""
+    trees: tuple[Any, Any] = result.get("metrics"), read_object(timing) if timing.exists() else {}
     try:
-        return {name: float(value) for name, value in tree.items()}
+        metrics, milliseconds = ({name: float(value) for name, value in tree.items()} for tree in trees)
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise SlamError(f"{file}: its figures are no numbers by name") from error
+        raise SlamError(f"{folder / RESULT}: its figures are no numbers by name") from error
+    return Run(trial, result["outcome"], metrics, milliseconds, folder)
 
 
 def _arguments(plan: Plan, out: Path, trial: Trial) -> tuple[Trial, bytes | None]:
@@ -157,40 +163,13 @@ def _arguments(plan: Plan, out: Path, trial: Trial) -> tuple[Trial, bytes | None
     return trial, (run.folder / RECORDING).read_bytes() if run.completed else None
 
 
-def _keep(folder: Path, files: Files) -> None:
-    """Put a trial's files in their place."""
-    with naming_folder(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / RESULT).unlink(missing_ok=True)
-        for name in sorted(files, key=lambda name: name == RESULT):  # last: what is there then is whole
-            remove_file(folder / name)
-            (folder / name).write_bytes(files[name])
-
-
 def _is_done(trial: Trial, out: Path) -> bool:
-    """Whether the trial has ended before.
-
-    Raises:
-        SlamError: its folder holds a trial with other settings.
-    """
+    """Whether the trial has ended before; raises SlamError where its folder holds one with other settings."""
     path = out / RUNS / trial.folder / RESULT
-    if not path.exists():
-        return False
     try:
-        before = read_object(path).get("trial")
+        before = read_object(path).get("trial") if path.exists() else None
     except SlamError:
-        before = None
-    if before is None:
         return False
-    if before != json.loads(json.dumps(asdict(trial))):
+    if before is not None and before != json.loads(json.dumps(asdict(trial))):
         raise SlamError(f"{path.parent}: holds a run with other settings; give another --out")
-    return True
-
-
-def _require_same_versions(path: Path) -> None:
-    before = read_object(path).get("versions")
-    if not isinstance(before, dict):
-        raise SlamError(f"{path}: not that of a comparison")
-    changed = changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code())
-    if changed:
-        raise SlamError(f"{path.parent}: begun with {changed[0]}: runs cannot be compared; give another --out")
+    return before is not None

@@ -102,7 +102,7 @@ def _draw_object(picture: np.ndarray, thing: MovingObject, result: FrameResult, 
         lines.append((np.zeros(3), length * np.eye(3)[axis], colour, 4))
     for begin, end, colour, thickness in lines:
         uv = rig.left.project(transform(T_left_object, np.linspace(begin, end, _PARTS)))
-        seen = (np.abs(np.nan_to_num(uv, nan=np.inf)) < 20 * rig.width).all(axis=1)  # not behind the camera
+        seen = np.asarray((np.abs(np.nan_to_num(uv, nan=np.inf)) < 20 * rig.width).all(axis=1))  # not behind it
         for i in range(0, _PARTS - 1, 1 if measured else 2):
             if seen[i] and seen[i + 1]:
                 a, b = (_pixel(uv[j, 0], uv[j, 1], scale) for j in (i, i + 1))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from slam.data import StereoFeatures
+from slam.geometry.arrays import BoolArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED, baseline_doubt
@@ -205,7 +206,7 @@ def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
     return float(rig.triangulate(left[middle], right[middle])[0, 2])
 
 
-def _velocities(record: RunRecord) -> tuple[Array, Array, Array]:
+def _velocities(record: RunRecord) -> tuple[Array, BoolArray, Array]:
     """Velocities (N, 6) between frames in the camera's axes [rad/s, m/s], whether both were measured, times [s]."""
     measured, durations = np.array(record.measured, bool), np.diff(record.stamps)
     poses = np.array(record.poses).reshape(-1, 4, 4)
