@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from slam.compare.wording import Conclusions
 
 _console = Console()
+_COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}  # of badges, by direction
 
 
 def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
@@ -32,7 +32,7 @@ def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
 
 
 class Progress:
-    """A progress bar over frames; a context manager.
+    """A progress bar over frames, which appears with the first one; a context manager.
 
     Args:
         total: number of frames; None where there is no end.
@@ -49,33 +49,25 @@ class Progress:
     def __enter__(self) -> Progress:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._shown:
             self._bar.stop()
 
     def frame(self, result: FrameResult) -> None:
-        """Show one more frame; the bar appears with the first."""
+        """Show one more frame."""
         self._shown = True
         self._bar.start()
-        task = self._bar.tasks[0]
-        rate = f"{task.speed:.1f} Hz" if task.speed else ""
+        speed = self._bar.tasks[0].speed
         status = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
-        self._bar.update(self._task, advance=1, rate=rate, status=status)
+        self._bar.update(self._task, advance=1, rate=f"{speed:.1f} Hz" if speed else "", status=status)
 
 
 @contextmanager
 def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[int], None]]:
     """A progress bar that is told how many frames are done."""
-    bar = _bar(quiet=quiet)
-    task = bar.add_task(title, total=total)
-    with bar:
+    with _bar(quiet=quiet) as bar:
+        task = bar.add_task(title, total=total)
         yield lambda done: bar.update(task, completed=done)
-
-
-#: Colours of badges, by direction.
-_COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}
 
 
 def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str) -> None:
@@ -90,12 +82,11 @@ def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str
 
     for found in every:
         _say(found.name, "bold")
-        for text in (*found.verdict, found.failed):
-            if text:
-                _say(text)
+        for text in filter(None, (*found.verdict, found.failed)):
+            _say(text)
         table = Table.grid(padding=(0, 2))
         for line in found.headlines:
-            style = f"bold {_COLOURS[line.direction]}" if line.verdict == "certain" else _COLOURS[line.direction]
+            style = f"{'bold ' if line.verdict == 'certain' else ''}{_COLOURS[line.direction]}"
             table.add_row(f"  [{style}]{escape(line.badge)}[/]", escape(line.text))
         _console.print(table, highlight=False)
         for text in found.honesty:
@@ -112,7 +103,7 @@ def _say(text: str, style: str | None = None) -> None:
 
 
 def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
-    """A table of finished runs, a column each."""
+    """A table of finished runs, a column each, and whether their covariances hold."""
     table = Table(title=summaries[0]["sequence"], title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     for summary in summaries:
@@ -136,14 +127,13 @@ def print_listing(options: bool = False) -> None:
     table.add_row("front ends", ", ".join(registry.names("frontends")))
     table.add_row("formats", ", ".join(formats()))
     _console.print(table)
-    if not options:
-        table = Table.grid(padding=(0, 2))
-        for name in worlds.names():
-            table.add_row(f"synthetic:{name}", escape(worlds.describe(name).splitlines()[0].partition(": ")[2]))
-        _console.print("built-in sequences")
-        _console.print(table)
-        _console.print("`slam list --options` shows the options of each", highlight=False)
+    if options:
+        for text in (*(f"synthetic:{worlds.describe(name)}" for name in worlds.names()), worlds.describe_common()):
+            _say(f"\n{text}")
         return
+    table = Table.grid(padding=(0, 2))
     for name in worlds.names():
-        _say(f"\nsynthetic:{worlds.describe(name)}")
-    _say(f"\n{worlds.describe_common()}")
+        table.add_row(f"synthetic:{name}", escape(worlds.describe(name).splitlines()[0].partition(": ")[2]))
+    _console.print("built-in sequences")
+    _console.print(table)
+    _console.print("`slam list --options` shows the options of each", highlight=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, is_dataclass
+from functools import cache
 from inspect import cleandoc
 from typing import Any
 
@@ -36,11 +37,27 @@ def settings() -> Iterator[Setting]:
     for f in fields(SystemConfig):
         if f.name not in _PARTS:
             yield from _of_class({kind: getattr(config, f.name) for kind, config in configs.items()}, f.name, "")
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
-            parts = {kind: _config_of(section, name, kind) for kind in KINDS}
+            named: dict[str, Any] = {section: name}
+            parts = {}
+            for kind in KINDS:
+                options = getattr(SystemConfig.for_kind(kind, **named), section)
+                parts[kind] = getattr(registry.create(f"{section}s", name, rig, **options), "config", None)
             if all(map(is_dataclass, parts.values())):
                 yield from _of_class(parts, section, name)
+
+
+def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
+    """Settings of one configuration class, given its instances by kind of motion."""
+    first = next(iter(configs.values()))
+    for f in fields(first):
+        values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
+        if is_dataclass(getattr(first, f.name)):
+            yield from _of_class(values, key, owner)
+        elif can_be_set(key, owner):
+            yield Setting(key, owner, values, *documented(type(first)).get(f.name, ("", "")))
 
 
 def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
@@ -53,17 +70,16 @@ def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
     found: dict[str, dict[str, str]] = {}
     if not is_dataclass(config) or isinstance(config, type):
         return found
-    texts = documented(type(config))
     for f in fields(config):
         value, key = getattr(config, f.name), f"{section}.{f.name}".lstrip(".")
         if is_dataclass(value):
             found |= descriptions(value, key)
         elif section:
-            unit, text = texts.get(f.name, ("", ""))
-            found[key] = {"unit": unit, "meaning": text}
+            found[key] = dict(zip(("unit", "meaning"), documented(type(config)).get(f.name, ("", ""))))
     return found
 
 
+@cache
 def documented(kind: type) -> dict[str, tuple[str, str]]:
     """Unit and meaning of each field of a class, from the ``Attributes:`` of its docstring and of its bases'."""
     found: dict[str, tuple[str, str]] = {}
@@ -76,27 +92,6 @@ def documented(kind: type) -> dict[str, tuple[str, str]]:
                 unit = units[i] if len(units) == len(each) else units[0] if units else ""
                 found[name] = unit, plain.replace("``", "").rstrip(".")
     return found
-
-
-def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
-    """Settings of one configuration class, given its instances by kind of motion."""
-    first = next(iter(configs.values()))
-    texts = documented(type(first))
-    for f in fields(first):
-        values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
-        if is_dataclass(getattr(first, f.name)):
-            yield from _of_class(values, key, owner)
-        elif can_be_set(key, owner):
-            unit, text = texts.get(f.name, ("", ""))
-            yield Setting(key, owner, values, unit, text)
-
-
-def _config_of(section: str, name: str, kind: str) -> Any:
-    """The configuration of a front end or back end as it is made by default; None where it has none."""
-    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
-    named: dict[str, Any] = {section: name}
-    options = getattr(SystemConfig.for_kind(kind, **named), section)
-    return getattr(registry.create(f"{section}s", name, rig, **options), "config", None)
 
 
 def in_force(part: object) -> dict[str, Any] | None:

@@ -11,7 +11,6 @@ from slam.calibration.posterior import Solution
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError, SequenceError
-from slam.geometry.trajectory import Trajectory
 from slam.run.recorded import record
 from slam.run.recording import load_recording, save_recording
 from slam.run.replay import replay
@@ -142,19 +141,3 @@ def test_recordings_are_checked_when_made(recording):
     with pytest.raises(MeasurementError, match="removed"):
         first, *others = recording.frames
         replace(recording, frames=(replace(first, removed=np.array([10**6])), *others))
-
-
-@pytest.mark.slow
-def test_the_command_records_and_replays(slam_command, tmp_path):
-    file = tmp_path / "run.npz"
-    slam_command("run", "synthetic:aisle?frames=4", "--record", file, "--out", tmp_path / "first", "--quiet")
-    done = slam_command("replay", file, "--backend", "smoother", "--out", tmp_path / "second")
-    assert done.returncode == 0 and "smoother" in done.stdout, done.stderr
-    names = [{p.name for p in (tmp_path / each).iterdir()} for each in ("first", "second")]
-    assert names[0] == names[1] | {"landmarks_old.csv"}  # a replay has no keyframes
-    paths = [Trajectory.read_tum(tmp_path / each / "trajectory.txt") for each in ("first", "second")]
-    np.testing.assert_allclose(paths[0].positions, paths[1].positions, atol=0.01)
-    done = slam_command("run", "synthetic:aisle", "--record", tmp_path / "no" / "run.npz", "--out", tmp_path / "third")
-    assert done.returncode == 2 and "there is no folder" in done.stderr
-    done = slam_command("replay", tmp_path / "nothing.npz", "--out", tmp_path / "third")
-    assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1
