@@ -17,18 +17,17 @@ N, SIGMA = 120, 0.01
 NONE = np.zeros(0, np.int64)
 
 
-def sequence():
-    poses = np.tile(np.eye(4), (N, 1, 1))
-    poses[:, 2, 3] = 0.2 * np.arange(N)
-    truth = Trajectory(0.1 * np.arange(N), poses)
-    return SimpleNamespace(format="folder", ground_truth=truth, gps=None, truth_noise=TruthNoise(1e-4, 1e-3))
+STRAIGHT = np.tile(np.eye(4), (N, 1, 1))
+STRAIGHT[:, 2, 3] = 0.2 * np.arange(N)
+TRUTH = Trajectory(0.1 * np.arange(N), STRAIGHT)
+SEQUENCE = SimpleNamespace(format="folder", ground_truth=TRUTH, gps=None, truth_noise=TruthNoise(1e-4, 1e-3))
 
 
 def estimated():
     """The true path with independent errors, the first pose without any."""
-    rng, path = np.random.default_rng(0), sequence().ground_truth
-    poses = path.poses @ np.array([exp(SIGMA * rng.standard_normal(6) * (k > 0)) for k in range(N)])
-    return Trajectory(path.stamps, poses), np.array([SIGMA**2 * np.eye(6) * (k > 0) for k in range(N)])
+    rng = np.random.default_rng(0)
+    poses = STRAIGHT @ np.array([exp(SIGMA * rng.standard_normal(6) * (k > 0)) for k in range(N)])
+    return Trajectory(TRUTH.stamps, poses), np.array([SIGMA**2 * np.eye(6) * (k > 0) for k in range(N)])
 
 
 def measured(statuses):
@@ -46,19 +45,19 @@ def measured(statuses):
         ))  # fmt: skip
     summary = {"frames": N, "status": {name: record.statuses.count(name) for name in record.statuses}}
     final = Trajectory(path.stamps, poses)
-    summary |= results_of(sequence(), SimpleNamespace(landmarks=None), record, final, None)
-    return figures(summary), nees_series(record, sequence())
+    summary |= results_of(SEQUENCE, SimpleNamespace(landmarks=None), record, final, None)
+    return figures(summary), nees_series(record, SEQUENCE)
 
 
 def test_the_figures_are_those_of_the_summary():
     path, covariances = estimated()
     found, _ = measured({})
-    expected = consistency(path, covariances, sequence())
+    expected = consistency(path, covariances, SEQUENCE)
     assert found["nees_per_dof"] == pytest.approx(expected["mean NEES"] / 6)
     assert found["nees_10m_per_dof"] == pytest.approx(expected["NEES over 10 m"] / 6)
     assert "nees_100m_per_dof" not in found  # the path is too short
     assert found["scale_error_percent"] == pytest.approx(abs(expected["scale error [%]"]))
-    assert found["rpe_1s_m"] == evaluate(path, sequence())["RPE RMSE over 1 s [m]"]
+    assert found["rpe_1s_m"] == evaluate(path, SEQUENCE)["RPE RMSE over 1 s [m]"]
     assert found["nis_per_dof"] == pytest.approx(2.0)
     assert found["tracked"] == 1
     assert all(found[key] == 0 for key in UNTRACKED)
@@ -72,10 +71,10 @@ def test_frames_that_are_not_tracked_are_counted_and_left_out_of_the_accuracy():
     found, series = measured(statuses)
     path, covariances = estimated()
     rows = np.array([k not in statuses for k in range(N)])
-    alone = evaluate(path.select(rows), sequence())
+    alone = evaluate(path.select(rows), SEQUENCE)
     assert found["ate_online_m"] == found["ate_final_m"] == pytest.approx(alone["ATE RMSE [m]"])
     assert found["ate_online_m"] < 0.05
-    honest = consistency(path.select(rows), covariances[rows], sequence())["mean NEES"]
+    honest = consistency(path.select(rows), covariances[rows], SEQUENCE)["mean NEES"]
     assert found["nees_per_dof"] == pytest.approx(honest / 6)
     assert found["tracked"] == pytest.approx(97 / 120)
     assert [found[key] for key in UNTRACKED] == pytest.approx([2 / 120, 20 / 120, 1 / 120])
