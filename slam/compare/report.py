@@ -16,7 +16,7 @@ from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_and_sd, most_tests, run_rows
 from slam.files import read_object, write_text
-from slam.run.results import COMPLETED, Metric, number
+from slam.run.results import COMPLETED, UNTRACKED, Metric, number
 from slam.run.schema import STAGE_NAMES
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -89,9 +89,10 @@ def _table(group: Group) -> dict[str, Any]:
         for run in runs
         if not run.completed
     }
+    never = [key for key in UNTRACKED if not any(group.finite(backend, key).any() for backend in group.runs)]
     return {
         "title": wording.measurements(group.mode, next(iter(group.runs))),
-        "rows": [_row(group, metric) for metric in group.shown],
+        "rows": [_row(group, metric) for metric in group.metrics if metric.key not in never],
         "reasons": sorted(reasons),
     }
 

@@ -15,7 +15,7 @@ from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
 from slam.run.outputs import csv_rows
-from slam.run.results import BY_KEY, COMPLETED, METRICS, UNTRACKED, Metric, object_metric
+from slam.run.results import BY_KEY, COMPLETED, METRICS, Metric, object_metric
 
 DIFFERENCE_COLUMNS = (
     "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
@@ -48,13 +48,6 @@ class Group:
         keys = {key for runs in self.runs.values() for run in runs for key in run.metrics}
         others = [object_metric(key) for key in sorted(keys - set(BY_KEY))]
         return [COMPLETED, *(m for m in METRICS if m.key in keys), *others]
-
-    @property
-    def shown(self) -> list[Metric]:
-        """The metrics of tables for people: without the ways in which no frame was left untracked."""
-        return [
-            m for m in self.metrics if m.key not in UNTRACKED or any(self.finite(b, m.key).any() for b in self.runs)
-        ]
 
     def values(self, backend: str, key: str) -> Array:
         """A figure by trial (N,), NaN where the run failed or has none."""

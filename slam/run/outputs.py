@@ -99,11 +99,6 @@ class RunFiles(ExitStack):
             self._objects.write(things)
             self._trajectory.write(tum_line(e.stamp, e.T_world_left) if result.located else "")
 
-    def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
-        """Write a path to a file."""
-        lines = (tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses))
-        write_text(self.folder / name, "".join(lines))
-
     def write_landmarks(self, estimate: Estimate, landmarks: LandmarkTable | None, numbers: list[int]) -> None:
         """Write landmarks.csv; `numbers` are the frames' numbers by step."""
         rows: list[Sequence[Any]] = [LANDMARK_COLUMNS]
@@ -127,9 +122,10 @@ class RunFiles(ExitStack):
         lines = ([i, *(f"{x:.9g}" for x in found[i])] for i in sorted(found))
         write_text(self.folder / OLD_LANDMARKS, csv_rows([header(OLD_TABLE), *lines]))
 
-    def write_json(self, name: str, tree: dict[str, Any]) -> None:
-        """See `write_json`."""
-        write_json(self.folder / name, tree)
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a path at once or not at all; raises SlamError where it cannot be written."""
+    write_text(path, "".join(tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses)))
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:

@@ -22,7 +22,7 @@ from slam.mapping.map_io import load_map, save_map
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
-from slam.run.outputs import RunFiles
+from slam.run.outputs import RunFiles, write_json, write_trajectory
 from slam.run.recorded import RecordedFrame, Recording
 from slam.run.recording import save_recording
 from slam.run.repeat import portable, versions
@@ -179,10 +179,10 @@ class _Run:
         record, score = self.record, score_for(self.sequence)
         ended, stopped_by = "completed", None
         with RunFiles(self.options.out) as files:
-            files.write_json("config.json", self._config())
+            write_json(self.options.out / "config.json", self._config())
             with self._each():
                 frontend, backend = getattr(self.system, "frontend", None), self.system.backend
-                files.write_json("schema.json", schema(self.options.config, frontend, backend))
+                write_json(self.options.out / "schema.json", schema(self.options.config, frontend, backend))
             try:
                 for number, result in results:
                     record.add(number, result)
@@ -205,12 +205,12 @@ class _Run:
                 summary["seed"] = getattr(self.sequence, "values", {}).get("seed", 0)  # nothing else is random
                 summary |= {"configuration": self.options.config.to_json(), "versions": versions()}
                 with self._each():
-                    files.write_json("summary.json", summary)
+                    write_json(self.options.out / "summary.json", summary)
                 self._write_copies()
                 if self.failures:
                     summary["failures"] = self._said()
                     with self._each():
-                        files.write_json("summary.json", summary)
+                        write_json(self.options.out / "summary.json", summary)
                 self._raise_failures(stopped_by)
         return summary
 
@@ -259,11 +259,11 @@ class _Run:
         final = Trajectory.empty()
         with self._each():
             final = system.trajectory()
-            files.write_trajectory("trajectory_final.txt", final)
+            write_trajectory(self.options.out / "trajectory_final.txt", final)
         with self._each():
             pairs = with_truth(record.trajectory, sequence)
             if pairs is not None:
-                files.write_trajectory("truth.txt", pairs[1])
+                write_trajectory(self.options.out / "truth.txt", pairs[1])
         with self._each():
             files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
         if isinstance(system, StereoSlam) and system.landmarks is not None:
