@@ -80,7 +80,8 @@ def compare(
         seconds = sum(frames[trial.sequence] * _seconds(trial) for trial in plan.every) / count
         about = f": about {timedelta(seconds=round(seconds, -1))}" if address is None else ""
         print(f"{len(plan.every)} runs, {total} frames in all, {where}{about}")
-        print(limits or f"{plan.trials} trials are enough for certainty in all figures.", flush=True)
+        if most_tests(plan):
+            print(limits or f"{plan.trials} trials are enough for certainty in all figures.", flush=True)
     with said_before(), counting(total, "frames", quiet) as tell:  # `check` has said what opening says
 
         def ended(trial: Trial) -> None:

@@ -88,7 +88,8 @@ def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str
         for line in found.headlines:
             style = f"{'bold ' if line.verdict == 'certain' else ''}{_COLOURS[line.direction]}"
             table.add_row(f"  [{style}]{escape(line.badge)}[/]", escape(line.text))
-        _console.print(table, highlight=False)
+        if found.headlines:
+            _console.print(table, highlight=False)
         for text in found.honesty:
             _say(f"  {text}")
     used = {line.verdict for found in every for line in found.headlines}

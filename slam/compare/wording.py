@@ -133,7 +133,7 @@ def is_trifle(d: Difference) -> bool:
 
 
 def caution(trials: int, tests: int) -> str:
-    """What so many trials can show at best; empty where they are enough for certainty in each of `tests` figures.
+    """What so many trials can show at best; empty where nothing is tested, or one of so many tests can be certain.
 
     Said before the trials are run, and with the same numbers after them.
 
@@ -142,13 +142,13 @@ def caution(trials: int, tests: int) -> str:
         tests: that the plan can come to, see `slam.compare.tables.most_tests`.
     """
     enough = fewest(tests)
-    if trials >= enough:
+    if not tests or trials >= enough:
         return ""
     more = f"{enough} trials are enough for all figures (--trials {enough})."
     if trials == 1:
         return (
-            "One trial cannot tell a difference from chance. Synthetic worlds have as many trials as are asked for, "
-            f"recorded sequences have one. {more}"
+            "One trial cannot tell a difference from chance: a recorded sequence has one, synthetic worlds have as many "
+            f"as are asked for. {more}"
         )
     if trials < fewest(1):
         chance = f"chance alone does as much in {200 / 2**trials:.2g} % of such comparisons"
