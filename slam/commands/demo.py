@@ -33,16 +33,8 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     """Run the demo; returns the runs' summaries, which are also in ``summary.json`` of each run's folder.
 
     Leaves a folder per back end with the files of a run, ``comparison.json``, and the pictures ``summary.png`` and
-    ``frame.png`` (the last frame in which the box was measured).
-
-    Args:
-        out: folder for everything.
-        frames: number of frames.
-        quiet: show nothing.
-        overwrite: whether files that are there may be replaced.
-
-    Raises:
-        SlamError: a file cannot be written, or is there already.
+    ``frame.png`` (the last frame in which the box was measured). Raises SlamError where a file cannot be written, or is
+    there already and may not be replaced.
     """
     own = Output(out, "--out", ["comparison.json", PICTURE, _FRAME])
     require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)

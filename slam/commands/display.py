@@ -32,13 +32,7 @@ def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
 
 
 class Progress:
-    """A progress bar over frames, which appears with the first one; a context manager.
-
-    Args:
-        total: number of frames; None where there is no end.
-        title: shown before the bar.
-        quiet: show nothing.
-    """
+    """A progress bar over frames, without an end where `total` is None; it appears with the first one."""
 
     def __init__(self, total: int | None, title: str, quiet: bool = False) -> None:
         status = TextColumn("{task.fields[rate]} {task.fields[status]}")
@@ -71,13 +65,7 @@ def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
 
 
 def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str) -> None:
-    """What may be concluded, in the words of the report: a badge, and what it is about.
-
-    Args:
-        every: of each group.
-        caution: what so few trials can show at best; empty where they are enough.
-        reference: the back end that the others are compared with.
-    """
+    """What may be concluded of each group, in the words of the report, and what so few trials can show at best."""
     from slam.compare.wording import STRENGTH
 
     for found in every:

@@ -146,15 +146,9 @@ def command_line() -> str:
 
 @contextmanager
 def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
-    """The folder for a run; one that was made here is removed where nothing was written into it.
+    """The folder for a run: `out`, or ``results/<sequence>-<backend>-<n>`` with the first number that is free.
 
-    Args:
-        out: as asked for; None for ``results/<sequence>-<backend>-<n>`` with the first number that is free.
-        sequence: its name.
-        backend: name.
-
-    Raises:
-        SlamError: a folder cannot be made.
+    One that was made here is removed where nothing was written into it. Raises SlamError where none can be made.
     """
     if out is not None:
         yield out

@@ -23,16 +23,9 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Path:
-    """Write ``report.html``; it needs no network and no other file.
+    """Write ``report.html`` into a comparison's folder, and return its path; it needs no network and no other file.
 
-    Args:
-        plan: what was run.
-        runs: all of them, also those that failed.
-        out: folder of the comparison.
-        workers: where trials ran, in words.
-
-    Returns:
-        the file.
+    `runs` are all of the plan's, also those that failed; `workers` says in words where trials ran.
     """
     from jinja2 import Environment, FileSystemLoader
     from markupsafe import Markup

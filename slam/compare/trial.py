@@ -182,10 +182,7 @@ def _json(tree: Any) -> bytes:
 class MapRecord:
     """Associations and landmarks against a world's surfaces, lifetimes, and the size of the map.
 
-    Args:
-        sequence: what is run.
-        start: number of the first frame.
-        associations: check them against the truth, where there is one. (Replayed ones are the same for all.)
+    `start` is the number of the first frame. Associations of a replay are the same for all, and need no check.
     """
 
     def __init__(self, sequence: Sequence, start: int = 0, associations: bool = True) -> None:

@@ -147,8 +147,8 @@ def caution(trials: int, tests: int) -> str:
     more = f"{enough} trials are enough for all figures (--trials {enough})."
     if trials == 1:
         return (
-            "One trial cannot tell a difference from chance: a recorded sequence has one, synthetic worlds have as many "
-            f"as are asked for. {more}"
+            "One trial cannot tell a difference from chance: a recorded sequence has one, synthetic worlds have as "
+            f"many as are asked for. {more}"
         )
     if trials < fewest(1):
         chance = f"chance alone does as much in {200 / 2**trials:.2g} % of such comparisons"

@@ -93,18 +93,10 @@ def calibrate(
     frames: tuple[int, int | None] = (0, None),
     inputs: Sequence[Path] = (),
 ) -> Calibrated:
-    """Run recordings of one rig, and write what they say of it.
+    """Run a range of frames of recordings of one rig, and write what they say of it.
 
-    Args:
-        sequences: the recordings.
-        targets: files to write.
-        show: the progress of each.
-        settings: as ``--set`` takes them.
-        frames: the first of each, and the one after the last; None for all.
-        inputs: files and folders that must not be replaced.
-
-    Raises:
-        SlamError: bad input; one line says what and where.
+    `settings` are as ``--set`` takes them; `inputs` are files and folders that must not be replaced. Raises SlamError on
+    bad input, before anything is run.
     """
     rig = sequences[0].rig
     for sequence in sequences:

@@ -71,13 +71,10 @@ class RunFiles(ExitStack):
             self.enter_context(opened.pop_all())
 
     def write_frame(self, number: int, result: FrameResult, loop: int | str = "", refused: int | str = "") -> None:
-        """Append one frame to trajectory.txt, frames.csv and objects.csv.
+        """Append one frame, `number` in its sequence, to trajectory.txt, frames.csv and objects.csv.
 
-        Args:
-            number: of the frame in its sequence.
-            result: of its step.
-            loop: number of the frame whose place it shows again, where it closed a loop, or ``map``.
-            refused: the same of a place that it only seemed to show again.
+        `loop` is the number of the frame whose place it shows again, where it closed a loop, or ``map``; `refused` the
+        same of a place that it only seemed to show again.
         """
         e, r, features = result.estimate, result.report, result.features
         sigmas = [float("nan")] * 4

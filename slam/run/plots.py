@@ -51,17 +51,10 @@ _METADATA: dict[str, dict[str, Any]] = {
 def plot_folders(
     folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None, overwrite: bool = False
 ) -> list[tuple[Path, str]]:
-    """Draw finished runs, those of one sequence in one picture; returns files and captions.
+    """Draw finished runs, those of one sequence in one picture, as `plot` does; returns files and captions.
 
-    Args:
-        folders: of the runs.
-        out: PNG, PDF or SVG; None for a PNG in the first folder of each sequence.
-        kind: one of `KINDS`.
-        width: of the pictures [mm]; None for what suits a screen.
-        overwrite: whether files that are there may be replaced.
-
-    Raises:
-        SlamError: a folder is none of a finished run, or a file cannot be written.
+    Without `out`, a PNG goes to the first folder of each sequence. Raises SlamError where a folder is none of a finished
+    run, or a file cannot be written.
     """
     with noting_inputs() as inputs:
         groups = _read(folders)
@@ -82,11 +75,7 @@ def leave_picture(folder: Path) -> None:
 
 
 def _read(folders: Sequence[Path]) -> list[list[RunData]]:
-    """Finished runs by sequence, in the order given; each has the shortest name that tells it from the others.
-
-    Raises:
-        SlamError: a folder does not hold a finished run.
-    """
+    """Finished runs by sequence, in the order given; each has the shortest name that tells it from the others."""
     found: dict[str, list[RunData]] = {}
     for folder in folders:
         run = RunData.read(folder, folder.resolve().name)

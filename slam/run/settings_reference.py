@@ -61,12 +61,7 @@ def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Set
 
 
 def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
-    """Unit and meaning of each setting of a configuration, by key; nested configurations included.
-
-    Args:
-        config: a dataclass with its fields described under ``Attributes:``; nothing comes of another object.
-        section: its name, in front of each key.
-    """
+    """Unit and meaning of each setting of a configuration below `section`, by key; nothing of an object that is none."""
     found: dict[str, dict[str, str]] = {}
     if not is_dataclass(config) or isinstance(config, type):
         return found

@@ -150,13 +150,7 @@ def outputs(target: str, option: str) -> list[Output]:
 def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
     """Show a finished run from its files: path, objects, and the map at its end; images are not among them.
 
-    Args:
-        folder: of the run.
-        target: as of `Viewer`.
-        overwrite: whether a file that is there may be replaced.
-
-    Raises:
-        SlamError: the folder does not hold a finished run, or see `Viewer`.
+    Raises SlamError where the folder does not hold a finished run, and as `Viewer` does.
     """
     with noting_inputs() as inputs:
         run, objects = RunData.read(folder, folder.name), read_objects(folder)
