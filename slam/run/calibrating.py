@@ -95,8 +95,8 @@ def calibrate(
 ) -> Calibrated:
     """Run a range of frames of recordings of one rig, and write what they say of it.
 
-    `settings` are as ``--set`` takes them; `inputs` are files and folders that must not be replaced. Raises SlamError on
-    bad input, before anything is run.
+    `settings` are as ``--set`` takes them; `inputs` are files and folders that must not be replaced. Raises SlamError
+    on bad input, before anything is run.
     """
     rig = sequences[0].rig
     for sequence in sequences:

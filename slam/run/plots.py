@@ -53,8 +53,8 @@ def plot_folders(
 ) -> list[tuple[Path, str]]:
     """Draw finished runs, those of one sequence in one picture, as `plot` does; returns files and captions.
 
-    Without `out`, a PNG goes to the first folder of each sequence. Raises SlamError where a folder is none of a finished
-    run, or a file cannot be written.
+    Without `out`, a PNG goes to the first folder of each sequence. Raises SlamError where a folder is none of a
+    finished run, or a file cannot be written.
     """
     with noting_inputs() as inputs:
         groups = _read(folders)

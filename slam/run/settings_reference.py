@@ -61,7 +61,7 @@ def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Set
 
 
 def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
-    """Unit and meaning of each setting of a configuration below `section`, by key; nothing of an object that is none."""
+    """Unit and meaning of each setting of a configuration below `section`, by key; nothing of another object."""
     found: dict[str, dict[str, str]] = {}
     if not is_dataclass(config) or isinstance(config, type):
         return found

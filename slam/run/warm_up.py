@@ -71,7 +71,7 @@ def compiled_in_background(backend: str) -> Iterator[None]:
 
     Numba compiles one function at a time in a process, and the first frame waits for the front end's kernels anyway.
     What the second process has made is loaded from Numba's cache; what is not there in time is compiled here. It ends
-    with the block, or when this process is killed: its standard input ends then.
+    with the block, or when it is done.
     """
     from slam.objects.scene_kernels import window_tests
 
@@ -80,26 +80,17 @@ def compiled_in_background(backend: str) -> Iterator[None]:
     if available_cores() < 2 or not cold:
         yield
         return
-    modules = {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
-    quiet = subprocess.DEVNULL
-    process = subprocess.Popen(  # -P: no module of the working folder
-        [sys.executable, "-P", "-m", __name__, backend], stdin=subprocess.PIPE, stdout=quiet, stderr=quiet,
-        start_new_session=True, env={**os.environ, **modules},
-    )  # fmt: skip
+    command = [sys.executable, "-P", "-m", __name__, backend]  # -P: no module of the working folder
+    paths, nowhere = os.pathsep.join(filter(None, sys.path)), subprocess.DEVNULL
+    environment = {**os.environ, "PYTHONPATH": paths}
+    process = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=environment)
     try:
         yield
     finally:
         process.kill()
-        process.communicate()
-
-
-def _end_with_parent() -> None:
-    """End this process as soon as nobody holds the other end of its standard input."""
-    os.read(0, 1)
-    os._exit(1)
+        process.wait()
 
 
 if __name__ == "__main__":
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     for _ in _with_bodies(sys.argv[1]):
         pass

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 
 import pytest
 
@@ -16,22 +14,8 @@ def test_it_runs_where_it_is_of_use_and_ends_with_the_block(monkeypatch, tmp_pat
     started, popen = [], subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", lambda *a, **b: started.append(popen(*a, **b)) or started[-1])
     monkeypatch.setattr(warm_up, "available_cores", lambda: cores)
-    if cold:
-        monkeypatch.setattr(warm_up.Path, "glob", lambda *_: iter(()))
-    else:
-        monkeypatch.setattr(warm_up.Path, "glob", lambda *_: iter([tmp_path]))
+    monkeypatch.setattr(warm_up.Path, "glob", lambda *_: iter(() if cold else [tmp_path]))
     with pytest.raises(KeyboardInterrupt), warm_up.compiled_in_background("ekf"):
         assert len(started) == count
         raise KeyboardInterrupt
     assert all(process.poll() is not None for process in started)
-
-
-def test_it_ends_when_its_parent_is_killed():
-    """Its standard input ends then."""
-    command = [sys.executable, "-P", "-m", "slam.run.warm_up", "ekf"]
-    modules = {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
-    with subprocess.Popen(command, stdin=subprocess.PIPE, env={**os.environ, **modules}) as process:
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(0.1)
-        process.stdin.close()
-        assert process.wait(30) in (0, 1)
