@@ -73,10 +73,10 @@ def compiled_in_background(backend: str) -> Iterator[None]:
     What the second process has made is loaded from Numba's cache; what is not there in time is compiled here. It ends
     with the block, or when it is done.
     """
-    from slam.objects.scene_kernels import window_tests
+    from slam.objects.scene_kernels import groups_apart
 
-    folder = window_tests.stats.cache_path
-    cold = folder is not None and not any(Path(folder).glob("scene_kernels.window_tests-*.nbi"))
+    folder = groups_apart.stats.cache_path
+    cold = folder is not None and not any(Path(folder).glob("scene_kernels.groups_apart-*.nbi"))
     if available_cores() < 2 or not cold:
         yield
         return
