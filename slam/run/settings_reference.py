@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, is_dataclass
-from functools import cache
 from inspect import cleandoc
 from typing import Any
 
@@ -52,12 +51,13 @@ def settings() -> Iterator[Setting]:
 def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
     """Settings of one configuration class, given its instances by kind of motion."""
     first = next(iter(configs.values()))
+    texts = documented(type(first))
     for f in fields(first):
         values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
         if is_dataclass(getattr(first, f.name)):
             yield from _of_class(values, key, owner)
         elif can_be_set(key, owner):
-            yield Setting(key, owner, values, *documented(type(first)).get(f.name, ("", "")))
+            yield Setting(key, owner, values, *texts.get(f.name, ("", "")))
 
 
 def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
@@ -65,16 +65,16 @@ def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
     found: dict[str, dict[str, str]] = {}
     if not is_dataclass(config) or isinstance(config, type):
         return found
+    texts = documented(type(config))
     for f in fields(config):
         value, key = getattr(config, f.name), f"{section}.{f.name}".lstrip(".")
         if is_dataclass(value):
             found |= descriptions(value, key)
         elif section:
-            found[key] = dict(zip(("unit", "meaning"), documented(type(config)).get(f.name, ("", ""))))
+            found[key] = dict(zip(("unit", "meaning"), texts.get(f.name, ("", ""))))
     return found
 
 
-@cache
 def documented(kind: type) -> dict[str, tuple[str, str]]:
     """Unit and meaning of each field of a class, from the ``Attributes:`` of its docstring and of its bases'."""
     found: dict[str, tuple[str, str]] = {}
