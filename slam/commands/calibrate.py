@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam.commands.display import Progress
+from slam.commands.display import progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import ConfigurationError
@@ -38,10 +38,8 @@ def calibrate(
         SlamError: bad input; one line says what and where.
     """
 
-    @contextmanager
-    def show(sequence: StereoSequence, count: int) -> Iterator[Callable[[FrameResult], None]]:
-        with Progress(count, f"…{sequence.name[-14:]}", quiet) as progress:
-            yield progress.frame
+    def show(sequence: StereoSequence, count: int) -> AbstractContextManager[Callable[[FrameResult], None]]:
+        return progress(count, f"…{sequence.name[-14:]}", quiet)
 
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:

@@ -131,7 +131,7 @@ def run_command(
     quiet: _QuietOption = False,
 ) -> None:
     """Run one sequence through one back end."""
-    from slam.commands.display import Progress
+    from slam.commands.display import progress
     from slam.commands.run import finish, frame_count, prepare, run_folder, shown, title, watches
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
@@ -149,7 +149,7 @@ def run_command(
         opened, options, origin = prepare(
             sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
         )
-    progress = Progress(frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet)
+    shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
@@ -161,7 +161,7 @@ def run_command(
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
-        end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress).frame, folder, until))
+        end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress(*shown_as)), folder, until))
         summary = run(opened, options, end_of_frame, watches=seen, until=until)
     finish(summary, folder, picture, quiet)
 
@@ -177,7 +177,7 @@ def replay_command(
     quiet: _QuietOption = False,
 ) -> None:
     """Give a back end the same measurements that another one was given."""
-    from slam.commands.display import Progress
+    from slam.commands.display import progress
     from slam.commands.run import command_line, finish, run_folder, title
     from slam.config import SystemConfig
     from slam.outputs import require_outputs
@@ -190,11 +190,11 @@ def replay_command(
     default = SystemConfig.for_kind(loaded.kind, None, name)
     require_settable(settings or [], default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings or [])
-    progress = Progress(len(loaded), title(loaded, name), quiet)
     with run_folder(out, loaded.name, name) as folder:
         options = RunOptions(name, "recording", config, folder, origin={"command": command_line()})
         require_outputs(options.outputs, [recording], overwrite)
-        with progress, whole_frames(progress.frame, folder) as end_of_frame:
+        shown_as = len(loaded), title(loaded, name), quiet
+        with progress(*shown_as) as tell, whole_frames(tell, folder) as end_of_frame:
             summary = run_recording(loaded, options, end_of_frame)
     finish(summary, folder, picture, quiet)
 
@@ -306,8 +306,8 @@ def render_command(
         opened = require_world(open_sequence(sequence))
     require_outputs([Output(out, "--out", [f"{FOLDER}/"])], inputs, overwrite=None)
     start, stop = parse_frames(frames)
-    with counting(frame_count(opened, start, stop), f"{opened.name} · render", quiet) as progress:
-        root = write_euroc(opened, out, start, stop, progress, truth_images)
+    with counting(frame_count(opened, start, stop), f"{opened.name} · render", quiet) as tell:
+        root = write_euroc(opened, out, start, stop, tell, truth_images)
     if not quiet:
         print(f"Files: {root}")
 

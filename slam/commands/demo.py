@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from slam.commands.display import Progress, print_summary
+from slam.commands.display import print_summary, progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.files import write_png
@@ -45,10 +46,10 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     with compiled_in_background(ONLINE[-1]):
         for backend in ONLINE:
             config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-            with Progress(len(sequence), f"aisle · {backend}", quiet) as progress:
+            with progress(len(sequence), f"aisle · {backend}", quiet) as tell:
 
-                def seen(result: FrameResult, progress: Progress = progress) -> None:
-                    progress.frame(result)
+                def seen(result: FrameResult, tell: Callable[[FrameResult], None] = tell) -> None:
+                    tell(result)
                     shown[any(thing.estimate.measured for thing in result.objects)] = result
 
                 summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))

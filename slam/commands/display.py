@@ -31,29 +31,24 @@ def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
     return RichProgress(*shown, TimeRemainingColumn(), console=Console(stderr=True), disable=quiet, **options)
 
 
-class Progress:
+@contextmanager
+def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[FrameResult], None]]:
     """A progress bar over frames, without an end where `total` is None; it appears with the first one."""
+    status = TextColumn("{task.fields[rate]} {task.fields[status]}")
+    bar = _bar(status, quiet=quiet, get_time=working_time)
+    task = bar.add_task(title, total=total, rate="", status="")
 
-    def __init__(self, total: int | None, title: str, quiet: bool = False) -> None:
-        status = TextColumn("{task.fields[rate]} {task.fields[status]}")
-        self._bar = _bar(status, quiet=quiet, get_time=working_time)
-        self._shown = False
-        self._task = self._bar.add_task(title, total=total, rate="", status="")
+    def frame(result: FrameResult) -> None:
+        bar.start()
+        speed = bar.tasks[0].speed
+        said = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
+        bar.update(task, advance=1, rate=f"{speed:.1f} Hz" if speed else "", status=said)
 
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._shown:
-            self._bar.stop()
-
-    def frame(self, result: FrameResult) -> None:
-        """Show one more frame."""
-        self._shown = True
-        self._bar.start()
-        speed = self._bar.tasks[0].speed
-        status = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
-        self._bar.update(self._task, advance=1, rate=f"{speed:.1f} Hz" if speed else "", status=status)
+    try:
+        yield frame
+    finally:
+        if bar.live.is_started:
+            bar.stop()
 
 
 @contextmanager
