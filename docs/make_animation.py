@@ -13,8 +13,7 @@ import numpy as np
 from PIL import Image
 
 import slam
-from slam.run.drawing import draw_objects
-from slam.run.growing_map import GrowingMap
+from slam.run.drawing import GrowingMap, draw_objects
 
 FILE = Path(__file__).parent / "images" / "street.webp"
 WORLD = "synthetic:street?colour=1&width=640&height=320"

@@ -20,13 +20,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import recordings, script_options
 from experiments.tables import picture, show
-from slam.compare.collect import Lifetimes
+from slam.compare.trial import Lifetimes
 from slam.config import SystemConfig
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
-from slam.run.figures import widths
 from slam.run.options import RunOptions
+from slam.run.panels import widths
 from slam.run.runner import run
 from slam.sequences import open_sequence
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from slam.errors import ConfigurationError
-from slam.naming import unknown
+from slam.naming import suggestion, unknown
 
 _FREE = ("frontend", "backend")  # their options are checked by the front end or back end itself
 
@@ -71,7 +71,8 @@ def require_settable(settings: Iterable[str], tree: Mapping[str, Any], frontend:
     for key in (text.partition("=")[0].strip() for text in settings):
         own = key.startswith("frontend.") and frontend in SETTABLE
         if (key in known or own) and not can_be_set(key, frontend if own else ""):
-            raise ConfigurationError(f"setting {key}: cannot be set; `slam settings` lists those that can")
+            near = suggestion(key.rpartition(".")[2], SETTABLE[frontend]) if own else ""
+            raise ConfigurationError(f"setting {key}: cannot be set{near}; `slam settings` lists those that can")
 
 
 def _listed(settings: Any) -> list[Any]:
@@ -91,22 +92,28 @@ def _value(text: str) -> Any:
 
 def _set(tree: dict[str, Any], path: list[str], value: Any, setting: str) -> None:
     """Set one leaf of the tree; every key on the way must exist, except options of front end and back end."""
-    node = tree
+    node, prefix = tree, ""
     for key in path[:-1]:
         if not isinstance(node.get(key), dict):
-            raise ConfigurationError(f"setting {setting!r}: {_unknown('section', key, node, tree, path)}")
-        node = node[key]
+            raise ConfigurationError(f"setting {setting!r}: {_unknown('section', key, prefix, tree, path)}")
+        node, prefix = node[key], f"{prefix}{key}."
     leaf = path[-1]
     if isinstance(node.get(leaf), dict):
         raise ConfigurationError(f"setting {setting!r}: {leaf!r} is a section; set {'.'.join(path)}.KEY=VALUE")
     if len(path) < 2 or (path[0] not in _FREE and leaf not in node):
-        raise ConfigurationError(f"setting {setting!r}: {_unknown('key', leaf, node, tree, path)}")
+        raise ConfigurationError(f"setting {setting!r}: {_unknown('key', leaf, prefix, tree, path)}")
     node[leaf] = value
 
 
-def _unknown(what: str, name: str, known: dict[str, Any], tree: dict[str, Any], path: list[str]) -> str:
-    """The line for an unknown name; a key that another section has is suggested with its section."""
-    elsewhere = [dotted for dotted in leaves(tree) if dotted.rpartition(".")[2] == path[-1]]
+def _unknown(what: str, name: str, prefix: str, tree: dict[str, Any], path: list[str]) -> str:
+    """The line for an unknown name below `prefix`; a key that another section has is suggested with its section.
+
+    Only what users can set is named.
+    """
+    settable = [key for key in leaves(tree) if can_be_set(key) and key.partition(".")[0] not in _FREE]
+    below = [key.removeprefix(prefix).partition(".")[0] for key in settable if key.startswith(prefix)]
+    known = list(dict.fromkeys([*below, *([] if prefix else _FREE)]))
+    elsewhere = [key for key in settable if key.rpartition(".")[2] == path[-1]]
     if not elsewhere:
         return unknown(what, name, known)
     return f"unknown {what} {name!r} (did you mean {' or '.join(map(repr, elsewhere))}?); known: {', '.join(known)}"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam.commands.display import Progress
+from slam.commands.display import progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import ConfigurationError
@@ -38,10 +38,8 @@ def calibrate(
         SlamError: bad input; one line says what and where.
     """
 
-    @contextmanager
-    def show(sequence: StereoSequence, count: int) -> Iterator[Callable[[FrameResult], None]]:
-        with Progress(count, f"…{sequence.name[-14:]}", quiet) as progress:
-            yield progress.frame
+    def show(sequence: StereoSequence, count: int) -> AbstractContextManager[Callable[[FrameResult], None]]:
+        return progress(count, f"…{sequence.name[-14:]}", quiet)
 
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
@@ -66,24 +64,20 @@ def _print(done: Calibrated) -> None:
     table = Table(title="corrections: mean ± standard deviation", show_lines=False)
     table.add_column("parameter")
     table.add_column("unit")
-    table.add_column("all", justify="right", no_wrap=True)
-    for number in range(1, len(shown) + 1):
-        table.add_column(f"({number})", justify="right", no_wrap=True)
+    for name in ("all", *(f"({number})" for number in range(1, len(shown) + 1))):
+        table.add_column(name, justify="right", no_wrap=True)
     if done.agreed is not None:
         table.add_column("apart", justify="right")
-    for row, name in enumerate(joint.names):
+    for row, (name, (factor, unit)) in enumerate(zip(joint.names, done.units)):
         beliefs = [joint, *(one.posterior for one in shown)]
-        factor, unit = done.units[row]
         cells = [f"{factor * p.mean[row]:.2f} ± {factor * p.sigma[row]:.2f}" for p in beliefs]
-        table.add_row(name, unit, *cells, *([] if done.agreed is None else [_sigmas(done.agreed.largest[row])]))
+        if done.agreed is not None:
+            apart = done.agreed.largest[row]
+            cells.append(f"{apart:.1f} σ" if np.isfinite(apart) else "–")
+        table.add_row(name, unit, *cells)
     console.print(table)
     for number, one in enumerate(done.found, 1):
         tells = "" if one.evidence is not None else ": no motion that shows anything, left out"
         console.print(f"({number}) {one.name}: {one.frames} frames, {one.pairs} pairs of views{tells}", markup=False)
     if done.agreed is not None:
         console.print(done.agreed.words, markup=False)
-
-
-def _sigmas(difference: float) -> str:
-    """A difference in standard deviations; a dash where there is none."""
-    return f"{difference:.1f} σ" if np.isfinite(difference) else "–"

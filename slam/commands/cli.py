@@ -10,20 +10,14 @@ from contextlib import ExitStack
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from slam.commands import options as of
 from slam.commands.error_exit import one_line_errors
 from slam.commands.signals import catch_signals, leaving, whole_frames
 from slam.registry import ONLINE
 from slam.runtime.memory import require_address_space
-
-if TYPE_CHECKING:
-    from slam.run.recorded import Recording
-    from slam.run.runner import Watch
-    from slam.sequences import Sequence
 
 app = typer.Typer(
     help="Stereo SLAM with modified SURF features and interchangeable back ends.",
@@ -32,6 +26,36 @@ app = typer.Typer(
     rich_markup_mode=None,  # boxes clip what does not fit
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def option(help: str, metavar: str | None = None, *names: str, **more: Any) -> Any:
+    """An option of a command; without names it is called as its parameter."""
+    return typer.Option(*names, metavar=metavar, help=help, **more)
+
+
+def argument(help: str, metavar: str, show_default: bool = False) -> Any:
+    """An argument of a command."""
+    return typer.Argument(metavar=metavar, help=help, show_default=show_default)
+
+
+#: Options that several commands share.
+_OutOption = Annotated[Path, option("Folder for the files.", "DIR", "--out", "-o")]
+_RunOutOption = Annotated[
+    Path | None, option("Folder for the files; default: results/SEQUENCE-BACKEND-N.", "DIR", "--out", "-o")
+]
+_OverwriteOption = Annotated[bool, option("Replace files that are there; never an input.", None, "--overwrite")]
+_SetOption = Annotated[
+    list[str] | None,
+    option("A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.", "KEY=VALUE", "--set"),
+]
+_BackendOption = Annotated[str | None, option("Back end, see `slam list`; default: ekf.", "NAME")]
+_FramesOption = Annotated[str | None, option("Range of frames, B left out.", "A:B")]
+_QuietOption = Annotated[bool, option("No progress, no table.", None, "--quiet", "-q")]
+_PictureOption = Annotated[bool, option("Leave a picture of the run.", None, "--picture/--no-picture")]
+_FormatOption = Annotated[str | None, option("Format; default: found out from the folder.", "FORMAT")]
+_MaskOption = Annotated[
+    str | None, option("Image that is black where a camera sees its own car; left, right.", "FILE[,FILE]")
+]
 
 
 def main() -> None:
@@ -60,7 +84,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def common_options(
     version: Annotated[
-        bool, typer.Option("--version", help="Show the version and exit.", callback=_print_version, is_eager=True)
+        bool, option("Show the version and exit.", None, "--version", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     """Options of the command itself."""
@@ -68,38 +92,52 @@ def common_options(
 
 @app.command("run", short_help="Run one sequence through one back end.")
 def run_command(
-    sequence: of.OptionalSequence = None,
-    out: of.RunOutOption = None,
-    config: of.ConfigOption = None,
-    backend: of.BackendOption = None,
-    frontend: of.FrontendOption = None,
-    settings: of.SetOption = None,
-    frames: of.FramesOption = None,
-    kind: of.KindOption = None,
-    format: of.FormatOption = None,
-    record: of.RecordOption = None,
-    prior_map: of.MapOption = None,
-    save_map: of.SaveMapOption = None,
-    mono: of.MonoOption = False,
-    calibration: of.CalibrationOption = None,
-    mask: of.MaskOption = None,
-    viewer: of.ViewerOption = None,
-    draw: of.DrawOption = None,
-    draw_map: of.DrawMapOption = False,
-    overlap: of.OverlapOption = True,
-    live: of.LiveOption = False,
-    picture: of.PictureOption = True,
-    overwrite: of.OverwriteOption = False,
-    quiet: of.QuietOption = False,
+    sequence: Annotated[
+        str | None,
+        argument(
+            "A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
+            "SEQUENCE",
+        ),
+    ] = None,
+    out: _RunOutOption = None,
+    config: Annotated[
+        Path | None, option("config.json of an earlier run, to repeat it; other options change it.", "FILE")
+    ] = None,
+    backend: _BackendOption = None,
+    frontend: Annotated[str | None, option("Front end, see `slam list`; default: surf.", "NAME")] = None,
+    settings: _SetOption = None,
+    frames: _FramesOption = None,
+    kind: Annotated[str | None, option("handheld or driving; default: the sequence's own.", "KIND")] = None,
+    format: _FormatOption = None,
+    record: Annotated[Path | None, option("Record what the back end is given, for `slam replay`.", "FILE.npz")] = None,
+    prior_map: Annotated[Path | None, option("Start in the map of an earlier run.", "FILE", "--map")] = None,
+    save_map: Annotated[Path | None, option("Keep the map.", "FILE", "--save-map")] = None,
+    mono: Annotated[bool, option("Left images alone, in a prior map.", None, "--mono")] = False,
+    calibration: Annotated[
+        Path | None, option("What is known of the rig: from `slam calibrate`, or an earlier run.", "FILE")
+    ] = None,
+    mask: _MaskOption = None,
+    viewer: Annotated[str | None, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
+    draw: Annotated[Path | None, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
+    draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
+    overlap: Annotated[
+        bool, option("Extract the next frame's features while this one is estimated; same results.")
+    ] = True,
+    live: Annotated[
+        bool, option("Frames at their own rate; those that come too late are dropped.", None, "--live")
+    ] = False,
+    picture: _PictureOption = True,
+    overwrite: _OverwriteOption = False,
+    quiet: _QuietOption = False,
 ) -> None:
     """Run one sequence through one back end."""
-    from slam.commands.background_compilation import compiled_in_background
-    from slam.commands.display import Progress
-    from slam.commands.run import prepare, run_folder, shown
+    from slam.commands.display import progress
+    from slam.commands.run import finish, frame_count, prepare, run_folder, shown, title, watches
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
     from slam.run.runner import run
+    from slam.run.warm_up import compiled_in_background
     from slam.sequences import is_live, with_mask
 
     sequence = None if sequence is None else with_mask(sequence, mask)
@@ -111,7 +149,7 @@ def run_command(
         opened, options, origin = prepare(
             sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
         )
-    progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
+    shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
@@ -119,42 +157,28 @@ def run_command(
         if options.config.objects.mode != "off":
             stack.enter_context(compiled_in_background(options.backend))
         options = replace(options, origin=origin.to_json(folder))
-        watches = _watches(stack, opened, viewer, draw, draw_map)
+        seen = watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
-        end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress).frame, folder, until))
-        summary = run(opened, options, end_of_frame, watches=watches, until=until)
-    _finish(summary, folder, picture, quiet)
-
-
-def _watches(stack: ExitStack, opened: Sequence, viewer: str | None, draw: Path | None, draw_map: bool) -> list[Watch]:
-    """What is shown of every frame: the viewer, and pictures in a folder or a video."""
-    watches: list[Watch] = []
-    if viewer is not None:
-        from slam.run.viewer import Viewer
-
-        watches.append(stack.enter_context(Viewer(viewer, opened.rig, opened.ground_truth)).show)
-    if draw is not None:
-        from slam.run.drawing import FramePictures
-
-        watches.append(stack.enter_context(FramePictures(draw, draw_map)).show)
-    return watches
+        end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress(*shown_as)), folder, until))
+        summary = run(opened, options, end_of_frame, watches=seen, until=until)
+    finish(summary, folder, picture, quiet)
 
 
 @app.command("replay", short_help="Feed a back end recorded measurements.")
 def replay_command(
-    recording: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Made by `slam run --record`.")],
-    out: of.RunOutOption = None,
-    backend: of.BackendOption = None,
-    settings: of.SetOption = None,
-    picture: of.PictureOption = True,
-    overwrite: of.OverwriteOption = False,
-    quiet: of.QuietOption = False,
+    recording: Annotated[Path, argument("Made by `slam run --record`.", "FILE.npz")],
+    out: _RunOutOption = None,
+    backend: _BackendOption = None,
+    settings: _SetOption = None,
+    picture: _PictureOption = True,
+    overwrite: _OverwriteOption = False,
+    quiet: _QuietOption = False,
 ) -> None:
     """Give a back end the same measurements that another one was given."""
-    from slam.commands.display import Progress
-    from slam.commands.run import command_line, run_folder
+    from slam.commands.display import progress
+    from slam.commands.run import command_line, finish, run_folder, title
     from slam.config import SystemConfig
     from slam.outputs import require_outputs
     from slam.run.options import RunOptions
@@ -166,40 +190,35 @@ def replay_command(
     default = SystemConfig.for_kind(loaded.kind, None, name)
     require_settable(settings or [], default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings or [])
-    progress = Progress(len(loaded), _title(loaded, name), quiet)
     with run_folder(out, loaded.name, name) as folder:
         options = RunOptions(name, "recording", config, folder, origin={"command": command_line()})
         require_outputs(options.outputs, [recording], overwrite)
-        with progress, whole_frames(progress.frame, folder) as end_of_frame:
+        shown_as = len(loaded), title(loaded, name), quiet
+        with progress(*shown_as) as tell, whole_frames(tell, folder) as end_of_frame:
             summary = run_recording(loaded, options, end_of_frame)
-    _finish(summary, folder, picture, quiet)
+    finish(summary, folder, picture, quiet)
 
 
 @app.command("plot", short_help="Draw finished runs.")
 def plot_command(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
+    folders: Annotated[list[Path], argument("Left by `slam run`.", "DIR")],
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="PNG, PDF or SVG; default: a PNG in the first folder."),
+        Path | None, option("PNG, PDF or SVG; default: a PNG in the first folder.", "FILE", "--out", "-o")
     ] = None,
-    figure: Annotated[str, typer.Option(metavar="NAME", help="summary, path, map, errors or time.")] = "summary",
-    width: Annotated[
-        float | None, typer.Option(metavar="MM", help="Width of the picture, such as 88 for a journal's column.")
-    ] = None,
-    overwrite: of.OverwriteOption = False,
+    figure: Annotated[str, option("summary, path, map, errors or time.", "NAME")] = "summary",
+    width: Annotated[float | None, option("Width of the picture, such as 88 for a journal's column.", "MM")] = None,
+    overwrite: _OverwriteOption = False,
 ) -> None:
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
-    from slam.commands.plot import plot_runs
+    from slam.run.plots import plot_folders
 
-    for file, caption in plot_runs(folders, out, figure, width, overwrite):
+    for file, caption in plot_folders(folders, out, figure, width, overwrite):
         print(f"{file}: {caption}")
 
 
 @app.command("settings", short_help="List all settings.")
 def settings_command(
-    section: Annotated[
-        str | None, typer.Argument(metavar="SECTION", help="A section, a setting, or a front end or back end.")
-    ] = None,
+    section: Annotated[str | None, argument("A section, a setting, or a front end or back end.", "SECTION")] = None,
 ) -> None:
     """List all settings with default per kind of motion, unit and meaning."""
     from slam.commands.settings import print_settings
@@ -209,31 +228,23 @@ def settings_command(
 
 @app.command("compare", short_help="Compare back ends on the same recordings.")
 def compare_command(
-    sequences: Annotated[
-        list[str], typer.Argument(metavar="SEQUENCE", help="Folders, or synthetic:NAME?key=value.", show_default=False)
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder; a comparison that was stopped in it goes on.")
-    ],
-    backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back ends; the first is the reference.")] = ",".join(
-        ONLINE
-    ),
-    frontends: Annotated[
-        str, typer.Option(metavar="A,B,...", help="Front ends; simulated: a world's own features, no images.")
-    ] = "",
+    sequences: Annotated[list[str], argument("Folders, or synthetic:NAME?key=value.", "SEQUENCE")],
+    out: Annotated[Path, option("Folder; a comparison that was stopped in it goes on.", "DIR", "--out", "-o")],
+    backends: Annotated[str, option("Back ends; the first is the reference.", "A,B,...")] = ",".join(ONLINE),
+    frontends: Annotated[str, option("Front ends; simulated: a world's own features, no images.", "A,B,...")] = "",
     variant: Annotated[
-        list[str] | None, typer.Option(metavar="VARIANT", help="A front end with settings, NAME:FRONTEND:KEY=VALUE:...")
+        list[str] | None, option("A front end with settings, NAME:FRONTEND:KEY=VALUE:...", "VARIANT")
     ] = None,
-    settings: of.SetOption = None,
-    mask: of.MaskOption = None,
-    trials: Annotated[int, typer.Option(metavar="N", min=1, help="Seeds 0 to N - 1 of every synthetic world.")] = 12,
-    frames: of.FramesOption = None,
-    replay: Annotated[bool, typer.Option(help="Also feed the first back end's measurements to all.")] = True,
-    workers: Annotated[int | None, typer.Option(metavar="N", help="Processes; default: the number of cores.")] = None,
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to be used.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="30 frames, 2 trials: does it work?")] = False,
-    overwrite: of.OverwriteOption = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no conclusions.")] = False,
+    settings: _SetOption = None,
+    mask: _MaskOption = None,
+    trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N", min=1)] = 12,
+    frames: _FramesOption = None,
+    replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
+    workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
+    scheduler: Annotated[str | None, option("A Dask scheduler to be used.", "ADDRESS")] = None,
+    quick: Annotated[bool, option("30 frames, 2 trials: does it work?", None, "--quick")] = False,
+    overwrite: _OverwriteOption = False,
+    quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
     from slam.commands import compare as command
@@ -251,24 +262,16 @@ def compare_command(
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
 def calibrate_command(
-    sequences: Annotated[
-        list[str], typer.Argument(metavar="SEQUENCE", help="Recordings of one rig.", show_default=False)
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="For `slam run --calibration`.")] = Path(
-        "rig_errors.json"
-    ),
-    opencv: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="The corrected calibration in OpenCV's form.")
-    ] = None,
-    kalibr: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="The same in the form of Kalibr's camchain.")
-    ] = None,
-    settings: of.SetOption = None,
-    frames: of.FramesOption = None,
-    format: of.FormatOption = None,
-    mask: of.MaskOption = None,
-    overwrite: of.OverwriteOption = False,
-    quiet: of.QuietOption = False,
+    sequences: Annotated[list[str], argument("Recordings of one rig.", "SEQUENCE")],
+    out: Annotated[Path, option("For `slam run --calibration`.", "FILE", "--out", "-o")] = Path("rig_errors.json"),
+    opencv: Annotated[Path | None, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
+    kalibr: Annotated[Path | None, option("The same in the form of Kalibr's camchain.", "FILE.yaml")] = None,
+    settings: _SetOption = None,
+    frames: _FramesOption = None,
+    format: _FormatOption = None,
+    mask: _MaskOption = None,
+    overwrite: _OverwriteOption = False,
+    quiet: _QuietOption = False,
 ) -> None:
     """Find what a rig's calibration is off by, from all its recordings together, and whether they agree."""
     from slam.commands.calibrate import calibrate
@@ -284,14 +287,15 @@ def calibrate_command(
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")
 def render_command(
-    sequence: of.SequenceArgument,
-    out: of.OutOption,
-    frames: of.FramesOption = None,
-    truth_images: Annotated[bool, typer.Option(help="Depth and object images as well.")] = True,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    sequence: Annotated[str, argument("A folder, or synthetic:NAME?key=value.", "SEQUENCE")],
+    out: _OutOption,
+    frames: _FramesOption = None,
+    truth_images: Annotated[bool, option("Depth and object images as well.")] = True,
+    quiet: Annotated[bool, option("No progress.", None, "--quiet", "-q")] = False,
 ) -> None:
     """Write a built-in sequence as an EuRoC folder with its truth, for other programs."""
     from slam.commands.display import counting
+    from slam.commands.run import frame_count
     from slam.files import noting_inputs
     from slam.outputs import Output, require_outputs
     from slam.run.options import parse_frames
@@ -302,17 +306,17 @@ def render_command(
         opened = require_world(open_sequence(sequence))
     require_outputs([Output(out, "--out", [f"{FOLDER}/"])], inputs, overwrite=None)
     start, stop = parse_frames(frames)
-    with counting(_frame_count(opened, start, stop), f"{opened.name} · render", quiet) as progress:
-        root = write_euroc(opened, out, start, stop, progress, truth_images)
+    with counting(frame_count(opened, start, stop), f"{opened.name} · render", quiet) as tell:
+        root = write_euroc(opened, out, start, stop, tell, truth_images)
     if not quiet:
         print(f"Files: {root}")
 
 
 @app.command("view", short_help="Show a finished run in Rerun.")
 def view_command(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
-    target: Annotated[str, typer.Option("--to", metavar="live|FILE.rrd", help="A window, or a file.")] = "live",
-    overwrite: of.OverwriteOption = False,
+    folder: Annotated[Path, argument("Left by `slam run`.", "DIR")],
+    target: Annotated[str, option("A window, or a file.", "live|FILE.rrd", "--to")] = "live",
+    overwrite: _OverwriteOption = False,
 ) -> None:
     """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
     from slam.run.viewer import view_run
@@ -322,7 +326,7 @@ def view_command(
 
 @app.command("list", short_help="List back ends, sequences and formats.")
 def list_command(
-    options: Annotated[bool, typer.Option("--options", help="Also the options of the built-in sequences.")] = False,
+    options: Annotated[bool, option("Also the options of the built-in sequences.", None, "--options")] = False,
 ) -> None:
     """List back ends, front ends, built-in sequences and formats."""
     from slam.commands.display import print_listing
@@ -331,10 +335,9 @@ def list_command(
 
 
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
-def warm_up_command(quiet: of.QuietOption = False) -> None:
+def warm_up_command(quiet: _QuietOption = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
-    from slam.commands.background_compilation import compiled_in_background
-    from slam.run.warm_up import warm_up
+    from slam.run.warm_up import compiled_in_background, warm_up
 
     with compiled_in_background(ONLINE[-1]):
         seconds = warm_up()
@@ -344,49 +347,12 @@ def warm_up_command(quiet: of.QuietOption = False) -> None:
 
 @app.command("demo", short_help="Try three back ends on a built-in scene.")
 def demo_command(
-    out: of.OutOption = Path("slam_demo"),
-    frames: Annotated[int, typer.Option(metavar="N", min=10, help="Number of frames.")] = 150,
-    overwrite: of.OverwriteOption = False,
-    quiet: of.QuietOption = False,
+    out: _OutOption = Path("slam_demo"),
+    frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
+    overwrite: _OverwriteOption = False,
+    quiet: _QuietOption = False,
 ) -> None:
     """Run three back ends on a built-in scene, compare them, and draw pictures."""
     from slam.commands.demo import demo
 
     demo(out, frames, quiet, overwrite)
-
-
-def _title(sequence: Sequence | Recording, backend: str) -> str:
-    """A short name for a progress bar: of a world its name alone."""
-    name = sequence.name.partition("?")[0]
-    return f"{name if len(name) <= 12 else f'…{name[-11:]}'} · {backend}"
-
-
-def _finish(summary: dict[str, Any], folder: Path, picture: bool, quiet: bool) -> None:
-    """Leave the picture of a run and print its table, and a line where many frames were not tracked.
-
-    The exit status is 1 where none was.
-    """
-    from slam.commands.display import print_summary
-    from slam.commands.plot import leave_picture
-    from slam.run.outcome import nothing_tracked
-
-    if not summary["frames"]:
-        print(f"slam: the run ended before its first frame; files: {folder}", file=sys.stderr)
-        return
-    if picture:
-        leave_picture(folder)
-    if not quiet:
-        print_summary([summary], folder)
-    if summary["tracking"]:
-        print(f"slam: {summary['tracking']}", file=sys.stderr)
-    if nothing_tracked(summary):
-        raise typer.Exit(1)
-
-
-def _frame_count(sequence: Sequence, start: int, stop: int | None) -> int | None:
-    """Number of frames in a range; None for those of a camera without an end."""
-    from slam.sequences import is_live
-
-    if is_live(sequence):
-        return None if stop is None else stop - start
-    return len(range(start, len(sequence) if stop is None else min(stop, len(sequence))))

@@ -8,11 +8,11 @@ from datetime import timedelta
 from pathlib import Path
 
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
-from slam.compare.report import cautions, conclusions, write_report
+from slam.compare.report import write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
 from slam.compare.sweep import Run, check, sweep
-from slam.compare.tables import groups, write_tables
-from slam.compare.wording import beforehand
+from slam.compare.tables import groups, most_tests, write_tables
+from slam.compare.wording import caution, conclusions
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.runtime.cores import available_cores
@@ -23,23 +23,18 @@ _QUICK_FRAMES, _QUICK_TRIALS = 30, 2
 _MOST_WORKERS = 1024
 
 
-def _seconds(trial: Trial) -> float:
-    """About what a frame takes [s]: more where there are images, which worlds have to render."""
-    return 0.12 if trial.mode == CLOSED_LOOP and trial.variant.frontend != SIMULATED else 0.03
-
-
 def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Sequence[str]) -> tuple[Variant, ...]:
     """Front ends by name and variants by their texts; `settings` hold for all.
 
     Raises:
         ConfigurationError: a variant is not of its form, or has a setting that users cannot set.
     """
-    named = [Variant(name, name, tuple(settings)) for name in frontends]
-    every = (*named, *(parse_variant(text, tuple(settings)) for text in variants))
-    every = every or (Variant("surf", "surf", tuple(settings)),)
+    every = [Variant(name, name, tuple(settings)) for name in frontends]
+    every += [parse_variant(text, tuple(settings)) for text in variants]
+    every = every or [Variant("surf", "surf", tuple(settings))]
     for variant in every:
         require_settable(variant.settings, SystemConfig().to_json(), variant.frontend)
-    return every
+    return tuple(every)
 
 
 def quick(plan: Plan) -> Plan:
@@ -76,19 +71,19 @@ def compare(
         wanted = "at least one worker" if workers < 1 else f"at most {_MOST_WORKERS} workers"
         raise ConfigurationError(f"comparison: there must be {wanted}, got {workers}")
     count = workers or available_cores()
+    scheduler: Scheduler = LocalScheduler(count) if address is None else DaskScheduler(address)
     where = f"{count} at a time on this machine" if address is None else f"on the Dask cluster at {address}"
     frames = check(plan, out, overwrite)  # before there is a progress bar
-    planned = [frames[trial.sequence] for mode in plan.modes for trial in plan.trials_of(mode)]
+    total, done = sum(frames[trial.sequence] for trial in plan.every), 0
+    limits = caution(plan.trials if any(map(is_world, plan.sequences)) else 1, most_tests(plan))
     if not quiet:
-        seconds = sum(frames[t.sequence] * _seconds(t) for mode in plan.modes for t in plan.trials_of(mode))
-        about = (
-            timedelta(seconds=round(seconds / count, -1)) if address is None else "a time that depends on the cluster"
-        )
-        print(f"{len(planned)} runs, {sum(planned)} frames in all, {where}: about {about}")
-        print(beforehand(plan.trials if any(map(is_world, plan.sequences)) else 1), flush=True)
-    scheduler: Scheduler = LocalScheduler(count) if address is None else DaskScheduler(address)
-    done = 0
-    with said_before(), counting(sum(planned), "frames", quiet) as tell:  # `check` has said what opening says
+        heavy = [t.mode == CLOSED_LOOP and t.variant.frontend != SIMULATED for t in plan.every]  # images are rendered
+        seconds = sum(frames[t.sequence] * (0.12 if h else 0.03) for t, h in zip(plan.every, heavy)) / count
+        about = f": about {timedelta(seconds=round(seconds, -1))}" if address is None else ""
+        print(f"{len(plan.every)} runs, {total} frames in all, {where}{about}")
+        if most_tests(plan):
+            print(limits or f"{plan.trials} trials are enough for certainty in all figures.", flush=True)
+    with said_before(), counting(total, "frames", quiet) as tell:  # `check` has said what opening says
 
         def ended(trial: Trial) -> None:
             nonlocal done
@@ -99,8 +94,6 @@ def compare(
     write_tables(plan, runs, out)
     report = write_report(plan, runs, out, where)
     if not quiet:
-        every = groups(plan, runs)
-        print_conclusions(conclusions(every), cautions(every), plan.backends[0])
-        failed = sum(not run.completed for run in runs)
-        print(f"{len(runs)} runs, {failed} failed. Report: {report}")
+        print_conclusions(list(map(conclusions, groups(plan, runs))), limits, plan.backends[0])
+        print(f"{len(runs)} runs, {sum(not run.completed for run in runs)} failed. Report: {report}")
     return runs

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from slam.commands.background_compilation import compiled_in_background
-from slam.commands.display import Progress, print_summary
+from slam.commands.display import print_summary, progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.files import write_png
@@ -15,9 +15,10 @@ from slam.registry import ONLINE
 from slam.run.drawing import draw_objects, with_legend
 from slam.run.options import RunOptions
 from slam.run.outputs import NAMES, write_json
-from slam.run.plots import plot
+from slam.run.plots import PICTURE, plot
 from slam.run.run_data import RunData
 from slam.run.runner import run
+from slam.run.warm_up import compiled_in_background
 from slam.sequences import open_sequence
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.
@@ -26,46 +27,34 @@ _WHY = """The demo's cameras differ from their calibration as real ones do: by 0
 focal length, the right one turned by 0.7 mrad. Covariances count such errors;
 with exact cameras they would be too large."""
 
-#: The picture to be opened first, and the other one.
-_FIRST, _FRAME = "summary.png", "frame.png"
+_FRAME = "frame.png"
 
 
 def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -> list[dict[str, Any]]:
     """Run the demo; returns the runs' summaries, which are also in ``summary.json`` of each run's folder.
 
     Leaves a folder per back end with the files of a run, ``comparison.json``, and the pictures ``summary.png`` and
-    ``frame.png`` (the last frame in which the box was measured).
-
-    Args:
-        out: folder for everything.
-        frames: number of frames.
-        quiet: show nothing.
-        overwrite: whether files that are there may be replaced.
-
-    Raises:
-        SlamError: a file cannot be written, or is there already.
+    ``frame.png`` (the last frame in which the box was measured). Raises SlamError where a file cannot be written, or is
+    there already and may not be replaced.
     """
-    own = Output(out, "--out", ["comparison.json", _FIRST, _FRAME])
+    own = Output(out, "--out", ["comparison.json", PICTURE, _FRAME])
     require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)
-
-    world = _WORLD.format(frames)
     summaries: list[dict[str, Any]] = []
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
-    sequence = open_sequence(world)
+    sequence = open_sequence(_WORLD.format(frames))
     sequence.keep_images()  # type: ignore[attr-defined]
     with compiled_in_background(ONLINE[-1]):
         for backend in ONLINE:
             config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-            with Progress(len(sequence), f"aisle · {backend}", quiet) as progress:
+            with progress(len(sequence), f"aisle · {backend}", quiet) as tell:
 
-                def seen(result: FrameResult, progress: Progress = progress) -> None:
-                    progress.frame(result)
+                def seen(result: FrameResult, tell: Callable[[FrameResult], None] = tell) -> None:
+                    tell(result)
                     shown[any(thing.estimate.measured for thing in result.objects)] = result
 
                 summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
     write_json(out / "comparison.json", {"runs": summaries})
-    runs = [RunData.read(out / backend, backend) for backend in ONLINE]
-    plot(runs, out / _FIRST)
+    plot([RunData.read(out / backend, backend) for backend in ONLINE], out / PICTURE)
     last = shown.get(True, shown.get(False))
     if last is not None:
         (frame,) = sequence.frames(last.index, last.index + 1)
@@ -73,5 +62,5 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     if not quiet:
         print_summary(summaries, out)
         print(_WHY)
-        print(f"Open first: {out / _FIRST}; then {out / _FRAME}, the box in the image")
+        print(f"Open first: {out / PICTURE}; then {out / _FRAME}, the box in the image")
     return summaries

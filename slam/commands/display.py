@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
@@ -16,95 +15,68 @@ from rich.progress import Progress as RichProgress
 from rich.table import Table
 
 from slam.data import FrameResult
-from slam.evaluation.consistency import verdict
-from slam.run.results import rows
+from slam.run.results import rows, verdict_of_run
 from slam.runtime.compile_clock import working_time
 
 if TYPE_CHECKING:
-    from slam.compare.report import Conclusions
+    from slam.compare.wording import Conclusions
 
 _console = Console()
+_COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}  # of badges, by direction
 
 
 def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
     """A progress bar on standard error that fits into 80 columns."""
-    shown = (BarColumn(bar_width=10), MofNCompleteColumn(), *columns, TimeRemainingColumn())
-    first = TextColumn("{task.description}")
-    return RichProgress(first, *shown, console=Console(stderr=True), disable=quiet, **options)
+    shown = (TextColumn("{task.description}"), BarColumn(bar_width=10), MofNCompleteColumn(), *columns)
+    return RichProgress(*shown, TimeRemainingColumn(), console=Console(stderr=True), disable=quiet, **options)
 
 
-class Progress:
-    """A progress bar over frames; a context manager.
+@contextmanager
+def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[FrameResult], None]]:
+    """A progress bar over frames, without an end where `total` is None; it appears with the first one."""
+    status = TextColumn("{task.fields[rate]} {task.fields[status]}")
+    bar = _bar(status, quiet=quiet, get_time=working_time)
+    task = bar.add_task(title, total=total, rate="", status="")
 
-    Args:
-        total: number of frames; None where there is no end.
-        title: shown before the bar.
-        quiet: show nothing.
-    """
+    def frame(result: FrameResult) -> None:
+        bar.start()
+        speed = bar.tasks[0].speed
+        said = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
+        bar.update(task, advance=1, rate=f"{speed:.1f} Hz" if speed else "", status=said)
 
-    def __init__(self, total: int | None, title: str, quiet: bool = False) -> None:
-        status = TextColumn("{task.fields[rate]} {task.fields[status]}")
-        self._bar = _bar(status, quiet=quiet, get_time=working_time)
-        self._shown = False
-        self._task = self._bar.add_task(title, total=total, rate="", status="")
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._shown:
-            self._bar.stop()
-
-    def frame(self, result: FrameResult) -> None:
-        """Show one more frame; the bar appears with the first."""
-        self._shown = True
-        self._bar.start()
-        task = self._bar.tasks[0]
-        rate = f"{task.speed:.1f} Hz" if task.speed else ""
-        status = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
-        self._bar.update(self._task, advance=1, rate=rate, status=status)
+    try:
+        yield frame
+    finally:
+        if bar.live.is_started:
+            bar.stop()
 
 
 @contextmanager
 def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[int], None]]:
     """A progress bar that is told how many frames are done."""
-    bar = _bar(quiet=quiet)
-    task = bar.add_task(title, total=total)
-    with bar:
+    with _bar(quiet=quiet) as bar:
+        task = bar.add_task(title, total=total)
         yield lambda done: bar.update(task, completed=done)
 
 
-#: Colours of badges, by direction.
-_COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}
-
-
 def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str) -> None:
-    """What may be concluded, in the words of the report: a badge, and what it is about.
+    """What may be concluded of each group, in the words of the report, and what so few trials can show at best."""
+    from slam.compare.wording import STRENGTH
 
-    Args:
-        every: of each group.
-        caution: what so few trials can show at best; empty where they are enough.
-        reference: the back end that the others are compared with.
-    """
-    from slam.compare.wording import STRENGTH, WORDS
-
-    used = {line.verdict for found in every for line in found.headlines}
     for found in every:
         _say(found.name, "bold")
-        for text in (*found.verdict, found.failed):
-            if text:
-                _say(text)
+        for text in filter(None, (*found.verdict, found.failed)):
+            _say(text)
         table = Table.grid(padding=(0, 2))
         for line in found.headlines:
-            style = f"bold {_COLOURS[line.direction]}" if WORDS[line.verdict] == "certain" else _COLOURS[line.direction]
+            style = f"{'bold ' if line.verdict == 'certain' else ''}{_COLOURS[line.direction]}"
             table.add_row(f"  [{style}]{escape(line.badge)}[/]", escape(line.text))
-        _console.print(table, highlight=False)
+        if found.headlines:
+            _console.print(table, highlight=False)
         for text in found.honesty:
             _say(f"  {text}")
-    meanings = [meaning for verdict, meaning in STRENGTH.items() if verdict in used]
-    if meanings:
+    used = {line.verdict for found in every for line in found.headlines}
+    if meanings := [meaning for verdict, meaning in STRENGTH.items() if verdict in used]:
         _say(f"Better or worse than {reference}: {'; '.join(meanings)}.")
     if caution:
         _say(caution)
@@ -115,7 +87,7 @@ def _say(text: str, style: str | None = None) -> None:
 
 
 def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
-    """A table of finished runs, a column each."""
+    """A table of finished runs, a column each, and whether their covariances hold."""
     table = Table(title=summaries[0]["sequence"], title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     for summary in summaries:
@@ -124,7 +96,7 @@ def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
         table.add_row(escape(label), *values)
     _console.print(table)
     for summary in summaries:
-        if words := verdict(summary.get("consistency", {})):
+        if words := verdict_of_run(summary):
             _say(f"{summary['backend']}: {words}")
     _say(f"Files: {out}")
 
@@ -139,14 +111,13 @@ def print_listing(options: bool = False) -> None:
     table.add_row("front ends", ", ".join(registry.names("frontends")))
     table.add_row("formats", ", ".join(formats()))
     _console.print(table)
-    if not options:
-        table = Table.grid(padding=(0, 2))
-        for name in worlds.names():
-            table.add_row(f"synthetic:{name}", escape(worlds.describe(name).splitlines()[0].partition(": ")[2]))
-        _console.print("built-in sequences")
-        _console.print(table)
-        _console.print("`slam list --options` shows the options of each", highlight=False)
+    if options:
+        for text in (*(f"synthetic:{worlds.describe(name)}" for name in worlds.names()), worlds.describe_common()):
+            _say(f"\n{text}")
         return
+    table = Table.grid(padding=(0, 2))
     for name in worlds.names():
-        _say(f"\nsynthetic:{worlds.describe(name)}")
-    _say(f"\n{worlds.describe_common()}")
+        table.add_row(f"synthetic:{name}", escape(worlds.describe(name).splitlines()[0].partition(": ")[2]))
+    _console.print("built-in sequences")
+    _console.print(table)
+    _console.print("`slam list --options` shows the options of each", highlight=False)

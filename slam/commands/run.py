@@ -7,19 +7,28 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from typing import Any
 
+import typer
+
+from slam.commands.display import print_summary
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
 from slam.run import drawing
 from slam.run import viewer as viewing
 from slam.run.options import RunOptions, parse_frames
-from slam.run.repeat import Origin, Repeat, changed_versions, load, versions
+from slam.run.outcome import nothing_tracked
+from slam.run.plots import leave_picture
+from slam.run.recorded import Recording
+from slam.run.repeat import Origin, changed_versions, load, versions
+from slam.run.runner import Watch
 from slam.sequences import Sequence as StereoSequence
-from slam.sequences import open_sequence
+from slam.sequences import is_live, open_sequence
 from slam.settings import require_settable
 
 _BACKEND, _FRONTEND = "ekf", "surf"
@@ -45,12 +54,11 @@ def prepare(
     Arguments are those of the command line, None where it says nothing; `config` is the ``config.json`` of an earlier
     run, whose choices hold then. Raises SlamError on bad input; one line says what and where.
     """
+    start, stop, text = 0, None, sequence
     before = None if config is None else load(config, sequence, prior_map, calibration)
-    if before is not None and kind is not None:
-        raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
-    start, stop = 0, None
-    text = sequence
     if before is not None:
+        if kind is not None:
+            raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
         if sequence is None:  # a given sequence has a format of its own
             format = format or before.origin.format
         text, kind, start, stop = before.origin.sequence, before.origin.kind, before.start, before.stop
@@ -63,8 +71,15 @@ def prepare(
     if mono and prior_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
     chosen = SystemConfig.for_kind(kind, frontend, backend)
-    if before is not None:
-        chosen = _repeated(before, chosen, frontend, backend)
+    if before is not None:  # options of another front end or back end than its are the defaults
+        changed = changed_versions(before.versions, versions())
+        if changed:
+            logging.getLogger(__name__).warning("made with other versions, results may differ: %s", "; ".join(changed))
+        chosen = replace(
+            before.config,
+            frontend=before.config.frontend if frontend == before.frontend else chosen.frontend,
+            backend=before.config.backend if backend == before.backend else chosen.backend,
+        )
     require_settable(settings, chosen.to_json(), frontend)
     chosen = chosen.with_settings([*(["map.monocular=true"] if mono else []), *settings])
     if frames is not None:
@@ -81,16 +96,47 @@ def shown(draw: Path | None, viewer: str | None) -> list[Output]:
     return pictures + ([] if viewer is None else viewing.outputs(viewer, "--viewer"))
 
 
-def _repeated(before: Repeat, default: SystemConfig, frontend: str, backend: str) -> SystemConfig:
-    """The settings of an earlier run; options of another front end or back end than its are the defaults."""
-    changed = changed_versions(before.versions, versions())
-    if changed:
-        logging.getLogger(__name__).warning("made with other versions, results may differ: %s", changed)
-    return replace(
-        before.config,
-        frontend=before.config.frontend if frontend == before.frontend else default.frontend,
-        backend=before.config.backend if backend == before.backend else default.backend,
-    )
+def watches(
+    stack: ExitStack, opened: StereoSequence, viewer: str | None, draw: Path | None, draw_map: bool
+) -> list[Watch]:
+    """What is shown of every frame: the viewer, and pictures in a folder or a video; the stack closes them."""
+    found: list[Watch] = []
+    if viewer is not None:
+        found.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
+    if draw is not None:
+        found.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
+    return found
+
+
+def title(sequence: StereoSequence | Recording, backend: str) -> str:
+    """A short name for a progress bar: of a world its name alone."""
+    name = sequence.name.partition("?")[0]
+    return f"{name if len(name) <= 12 else f'…{name[-11:]}'} · {backend}"
+
+
+def frame_count(sequence: StereoSequence, start: int, stop: int | None) -> int | None:
+    """Number of frames in a range; None for those of a camera without an end."""
+    if is_live(sequence):
+        return None if stop is None else stop - start
+    return len(range(len(sequence))[start:stop])
+
+
+def finish(summary: dict[str, Any], folder: Path, picture: bool, quiet: bool) -> None:
+    """Leave the picture of a run and print its table, and a line where many frames were not tracked.
+
+    The exit status is 1 where none was.
+    """
+    if not summary["frames"]:
+        print(f"slam: the run ended before its first frame; files: {folder}", file=sys.stderr)
+        return
+    if picture:
+        leave_picture(folder)
+    if not quiet:
+        print_summary([summary], folder)
+    if summary["tracking"]:
+        print(f"slam: {summary['tracking']}", file=sys.stderr)
+    if nothing_tracked(summary):
+        raise typer.Exit(1)
 
 
 def command_line() -> str:
@@ -100,15 +146,9 @@ def command_line() -> str:
 
 @contextmanager
 def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
-    """The folder for a run; one that was made here is removed where nothing was written into it.
+    """The folder for a run: `out`, or ``results/<sequence>-<backend>-<n>`` with the first number that is free.
 
-    Args:
-        out: as asked for; None for ``results/<sequence>-<backend>-<n>`` with the first number that is free.
-        sequence: its name.
-        backend: name.
-
-    Raises:
-        SlamError: a folder cannot be made.
+    One that was made here is removed where nothing was written into it. Raises SlamError where none can be made.
     """
     if out is not None:
         yield out
@@ -123,18 +163,17 @@ def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
 
 def _claimed(name: str) -> Path:
     """A new folder of this name and the first free number; made here, so that no other run can take it."""
-    number = 1
-    while True:
+    for number in count(1):
         folder = RESULTS / f"{name}-{number}"
         try:
             folder.mkdir(parents=True)
-            return folder
+            break
         except FileExistsError:
             if not RESULTS.is_dir():
                 raise SlamError(f"{RESULTS}: a file where the folder of all results should be; give --out") from None
-            number += 1
         except OSError as error:
             raise SlamError(f"cannot write to {folder}: {error.strerror or error}; give --out") from error
+    return folder
 
 
 def _short(text: str) -> str:

@@ -22,46 +22,34 @@ def print_settings(wanted: str | None) -> None:
     Raises:
         UnknownNameError: there is no such section or setting.
     """
-    print(listing(wanted, min(get_terminal_size().columns, _WIDEST)))
+    print("\n".join(listing(wanted, min(get_terminal_size().columns, _WIDEST))))
 
 
-def listing(wanted: str | None, width: int) -> str:
-    """The text of `print_settings` in lines of at most `width` characters."""
+def listing(wanted: str | None, width: int) -> Iterator[str]:
+    """The lines of `print_settings`, of at most `width` characters."""
     every = list(settings())
     chosen = [s for s in every if wanted is None or wanted in (s.key, s.owner) or s.key.startswith(f"{wanted}.")]
     if not chosen:
         names = dict.fromkeys(name for s in every for name in (s.key.partition(".")[0], s.owner) if name)
-        keys = {s.key for s in every} | {s.key.rpartition(".")[2] for s in every}
+        same = dict.fromkeys(s.key for s in every if s.key.rpartition(".")[2] == wanted)
         line = unknown("section or setting", wanted or "", names)
-        same = [s.key for s in every if wanted in keys and s.key.rpartition(".")[2] == wanted]
-        raise UnknownNameError(f"{line}; there is {', '.join(dict.fromkeys(same))}" if same else line)
-    lines: list[str] = []
-    title = ""
-    for setting in chosen:
-        if _title(setting) != title:
-            title = _title(setting)
-            lines += ["", *wrap(title, width)]
-        lines += [*_entry(setting, width)]
-    note = "Change one with --set KEY=VALUE."
-    return "\n".join([*lines[1:], "", *wrap(note, width)])
+        raise UnknownNameError(f"{line}; there is {', '.join(same)}" if same else line)
+    titles = [_title(setting) for setting in chosen]
+    for setting, title, before in zip(chosen, titles, [None, *titles]):
+        if title != before:
+            yield from ([] if before is None else [""])
+            yield from wrap(title, width)
+        (_, first), *others = setting.defaults.items()
+        line = f"  {setting.key} = {_typed(first)}{setting.unit and f' {setting.unit}'}"
+        yield line + "".join(f"; {kind}: {_typed(value)}" for kind, value in others if value != first)
+        yield from wrap(setting.text, width, initial_indent="      ", subsequent_indent="      ")
+    yield from ("", "Change one with --set KEY=VALUE.")
 
 
 def _title(setting: Setting) -> str:
     """What a section is for; of a front end's or back end's, whose it is."""
     section = setting.key.partition(".")[0]
-    if setting.owner:
-        return f"{section}: options of {setting.owner}"
-    return f"{section}: {documented(SystemConfig)[section][1]}"
-
-
-def _entry(setting: Setting, width: int) -> Iterator[str]:
-    """The lines of one setting."""
-    unit = f" {setting.unit}" if setting.unit else ""
-    first, *others = setting.defaults.items()
-    line = f"  {setting.key} = {_typed(first[1])}{unit}"
-    line += "".join(f"; {kind}: {_typed(value)}" for kind, value in others if value != first[1])
-    yield line
-    yield from wrap(setting.text, width, initial_indent="      ", subsequent_indent="      ")
+    return f"{section}: {f'options of {setting.owner}' if setting.owner else documented(SystemConfig)[section][1]}"
 
 
 def _typed(value: Any) -> str:

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 #: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
+_pending: list[int] = []  # a signal that waits for the end of a frame
+_in_frames = False
+_until: threading.Event | None = None  # ends the frames of a live run
+
 
 class Stopped(BaseException):
-    """Asked to end by a signal; no handler of errors catches it, and files are completed on the way out.
+    """Asked to end by a signal; no handler of errors catches it, and files are completed on the way out."""
 
-    Attributes:
-        leaves: what there is of the work, in words; empty where nothing is to be said.
-    """
-
-    leaves = ""
+    leaves = ""  # what there is of the work, in words; empty where nothing is to be said
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -39,21 +39,6 @@ def catch_signals() -> None:
             signal.signal(number, _stop)
 
 
-@contextmanager
-def leaving(text: str) -> Iterator[None]:
-    """Work of which a signal leaves something: `text` says what."""
-    try:
-        yield
-    except Stopped as stopped:
-        stopped.leaves = text
-        raise
-
-
-_pending: list[int] = []  # a signal that waits for the end of a frame
-_in_frames = False
-_until: threading.Event | None = None  # ends the frames of a live run
-
-
 def _stop(number: int, frame: object) -> None:
     """Stop at once; while frames are worked on, after the present one, so that all files agree. Twice: at once.
 
@@ -66,6 +51,16 @@ def _stop(number: int, frame: object) -> None:
         if number == signal.SIGINT:
             return
     _pending.append(number)
+
+
+@contextmanager
+def leaving(text: str) -> Iterator[None]:
+    """Work of which a signal leaves something: `text` says what."""
+    try:
+        yield
+    except Stopped as stopped:
+        stopped.leaves = text
+        raise
 
 
 @contextmanager

@@ -1,145 +1,112 @@
-"""The pictures of a comparison, for its report as SVG texts."""
+"""The pictures of a comparison, for its report."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slam.compare.collect import SERIES_COLUMNS
 from slam.compare.plan import is_world
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
-from slam.compare.trial import SERIES
+from slam.compare.trial import SERIES, SERIES_COLUMNS
 from slam.errors import SlamError
 from slam.evaluation.metrics import chi_square_band
 from slam.files import read_numbers
 from slam.geometry.se3 import Array
-from slam.run.figures import place_of_truth, well_known
+from slam.run.panels import backend_colours
 from slam.run.plots import drawn
 from slam.run.results import Metric
-from slam.run.run_data import RunData
-from slam.run.style import backend_colours
+from slam.run.run_data import RunData, place_of_truth, well_known
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _MOST_TICKS = 15
 _WIDTH = 132.0  # [mm] about that of a phone: text stays readable where the picture fills the screen
+_MOST_LANDMARKS, _MOST_POSES = 700, 600  # of a run in the map that can be turned
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A picture with what stands below it.
-
-    Attributes:
-        name: short, for a file.
-        title: a few words.
-        caption: a sentence or two, without the measurements, which all pictures of a group share.
-        draw: makes it.
-    """
-
-    name: str
-    title: str
-    caption: str
-    draw: Callable[[], Figure]
-
-
-def pictures(group: Group) -> list[Picture]:
-    """The pictures of a group, as far as there is truth; none where every run failed."""
-    shown = example(group)
+def pictures(group: Group) -> Iterator[tuple[str, str, Figure]]:
+    """The pictures of a group with title and caption, as far as there is truth; none where every run failed."""
+    shown = _example(group)
     if not shown:
-        return []
+        return
     runs = [RunData.read(run.folder, backend) for backend, run in shown.items()]
     trial = next(iter(shown.values())).trial
     of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
     known = {metric.key: metric for metric in group.metrics}
     main = known.get("ate_online_m") or known.get("gps_m")
-    found = [Picture("paths", "Paths from above", f"Paths from above{of_seed}.", partial(drawn, runs, "path", _WIDTH))]
     if main is not None and group.trials > 1:
         text = f"{main.label}, of every trial; lines join the back ends' runs on the same recording."
-        found.insert(0, Picture("trials", main.label, text, partial(draw_pairs, group, main)))
+        yield main.label, text, _draw_pairs(group, main)
+    yield "Paths from above", f"Paths from above{of_seed}.", drawn(runs, "path", _WIDTH)
     if "nees_per_dof" in known:
         text = f"Error of the position{of_seed}, and the ±3σ that each back end claims (shaded)."
-        found.append(Picture("errors", "Error over time", text, partial(drawn, runs, "errors", _WIDTH)))
+        yield "Error over time", text, drawn(runs, "errors", _WIDTH)
         text = (
             "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
             "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
         )
-        found.append(Picture("nees", "NEES over time", text, partial(draw_nees, group)))
+        yield "NEES over time", text, _draw_nees(group)
     text = f"Time per frame by stage{of_seed}, one thread; it depends on the machine."
-    return [*found, Picture("time", "Time per stage", text, partial(drawn, runs, "time", _WIDTH))]
+    yield "Time per stage", text, drawn(runs, "time", _WIDTH)
 
 
-def colours(group: Group) -> dict[str, str]:
-    """A colour per back end."""
+def _colours(group: Group) -> dict[str, str]:
     return dict(zip(group.runs, backend_colours(list(group.runs))))
 
 
-def example(group: Group) -> dict[str, Run]:
+def _example(group: Group) -> dict[str, Run]:
     """The first trial that every back end completed; else the first completed of each."""
-    for k in range(group.trials):
-        runs = {backend: group.runs[backend][k] for backend in group.runs}
-        if all(run.completed for run in runs.values()):
-            return runs
+    for runs in zip(*group.runs.values()):
+        if all(run.completed for run in runs):
+            return dict(zip(group.runs, runs))
     firsts = {backend: next((r for r in runs if r.completed), None) for backend, runs in group.runs.items()}
     return {backend: run for backend, run in firsts.items() if run is not None}
 
 
-def read_series(run: Run) -> dict[str, Array]:
-    """A run's columns of `SERIES_COLUMNS`.
-
-    Raises:
-        SlamError: the file cannot be read, or has no row.
-    """
-    rows = read_numbers(run.folder / SERIES, len(SERIES_COLUMNS))
-    if not len(rows):
-        raise SlamError(f"{run.folder / SERIES}: has no row")
-    return dict(zip(SERIES_COLUMNS, rows.T))
-
-
-def draw_pairs(group: Group, metric: Metric) -> Figure:
+def _draw_pairs(group: Group, metric: Metric) -> Figure:
     """Each trial's values, those of the back ends side by side and joined: whether the differences are of one sign."""
     figure, axis = _axes(2.6)
     values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
     backends, trials = values.shape
     x = np.arange(trials) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
     axis.plot(x, values, color="0.7", lw=1, zorder=1)
-    for at, value, (name, colour) in zip(x, values, colours(group).items()):
+    for at, value, (name, colour) in zip(x, values, _colours(group).items()):
         axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
     axis.set_xlim(-0.5, trials - 0.5)
     axis.set_xticks(range(0, trials, -(-trials // _MOST_TICKS)))
     axis.set(xlabel="seed", ylabel=metric.title)
     low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
     axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
-    _legend_above(axis)
+    _legend_above(axis, 4)
     return figure
 
 
-def draw_nees(group: Group) -> Figure:
+def _draw_nees(group: Group) -> Figure:
     """NEES / 6 over time, mean over the trials whose pose was measured, with the 95 % band of as many trials."""
     from matplotlib.ticker import LogLocator
 
     figure, axis = _axes(2.8)
     fewest = group.trials
     for name, runs in group.runs.items():
-        every = [read_series(run) for run in runs if run.completed]
+        every = [_series(run) for run in runs if run.completed]
         if not every:
             continue
         fewest = min(fewest, len(every))
-        length = min(len(s["nees"]) for s in every)
-        nees = np.ma.masked_invalid([s["nees"][1:length] for s in every])
-        t = (every[0]["stamp"] - every[0]["stamp"][0])[1:length]
-        axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=colours(group)[name], lw=1.2, label=name)
+        length = min(map(len, every))
+        nees = np.ma.masked_invalid([rows[1:length, 1] for rows in every])
+        t = (every[0][:, 0] - every[0][0, 0])[1:length]
+        axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=_colours(group)[name], lw=1.2, label=name)
     axis.axhline(1, color="0.3", lw=0.8, ls="--", label="expected")
     low, high = chi_square_band(6, fewest)
-    axis.axhspan(
-        low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % band if consistent, mean of {_count(fewest)}"
-    )
+    band = f"95 % band if consistent, mean of {fewest} trial{'s' if fewest > 1 else ''}"
+    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=band)
     axis.set_yscale("log")
     bottom, top = axis.get_ylim()
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top > 10 * bottom else (0.6, 0.8, 1, 1.5, 2, 3, 4)))
@@ -150,63 +117,68 @@ def draw_nees(group: Group) -> Figure:
     return figure
 
 
-def map_data(group: Group, most: int = 700) -> dict[str, Any]:
+def _series(run: Run) -> Array:
+    """A run's rows of `SERIES_COLUMNS`; raises SlamError where the file cannot be read, or has no row."""
+    rows = read_numbers(run.folder / SERIES, len(SERIES_COLUMNS))
+    if not len(rows):
+        raise SlamError(f"{run.folder / SERIES}: has no row")
+    return rows
+
+
+def map_data(group: Group) -> dict[str, Any]:
     """The first trial's maps and paths for the picture in 3D that can be turned."""
-    runs = [RunData.read(run.folder, backend) for backend, run in example(group).items()]
+    runs = [RunData.read(run.folder, backend) for backend, run in _example(group).items()]
     truth: Array = np.zeros((0, 3))
-    if runs and runs[0].truth is not None:
+    if runs[0].truth is not None:
         T = place_of_truth(runs[0], runs[0].truth)
         truth = runs[0].truth.positions @ T[:3, :3].T + T[:3, 3]
     layers = []
     for run in runs:
-        rows = well_known(run)[-most:]
+        rows = well_known(run)[-_MOST_LANDMARKS:]
         values, vectors = np.linalg.eigh(run.covariances[rows])
         axes = 2 * np.sqrt(np.maximum(values, 0))[:, None, :] * vectors  # of the 2σ ellipsoids
-        points, shapes = _round(run.positions[rows]), _round(np.swapaxes(axes, 1, 2).reshape(-1, 9))
-        path = _round(run.online.positions[:: max(1, len(run.online) // 600)])
-        layers.append({"name": run.name, "colour": colours(group)[run.name], "path": path, "points": points,
-                       "axes": shapes})  # fmt: skip
-    return {"layers": layers, "truth": _round(truth[:: max(1, len(truth) // 600)])}
+        layers.append(
+            {
+                "name": run.name,
+                "colour": _colours(group)[run.name],
+                "path": _rounded(run.online.positions[:: max(1, len(run.online) // _MOST_POSES)]),
+                "points": _rounded(run.positions[rows]),
+                "axes": _rounded(np.swapaxes(axes, 1, 2).reshape(-1, 9)),
+            }
+        )
+    return {"layers": layers, "truth": _rounded(truth[:: max(1, len(truth) // _MOST_POSES)])}
 
 
-def _round(rows: Array) -> list[list[float]]:
+def _rounded(rows: Array) -> list[list[float]]:
     return [[round(float(x), 4) for x in row] for row in rows]
 
 
-_STYLE: Mapping[str, Any] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "slam",
-    "font.size": 9,
-    "font.family": "sans-serif",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-}
-
-
-def _count(trials: int) -> str:
-    return "1 trial" if trials == 1 else f"{trials} trials"
-
-
-def _legend_above(axis: Any, columns: int = 4) -> None:
+def _legend_above(axis: Axes, columns: int) -> None:
     """A legend that hides nothing."""
     axis.legend(frameon=False, fontsize=8, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)
 
 
-def _axes(height: float) -> tuple[Any, Any]:
-    """A figure of one panel, apart from pyplot's global state."""
+def _style() -> AbstractContextManager[None]:
     from matplotlib import rc_context
+
+    return rc_context(
+        {"svg.fonttype": "none", "svg.hashsalt": "slam", "font.size": 9, "font.family": "sans-serif",
+         "axes.spines.top": False, "axes.spines.right": False}
+    )  # fmt: skip
+
+
+def _axes(height: float) -> tuple[Figure, Axes]:
+    """A figure of one panel, apart from pyplot's global state."""
     from matplotlib.figure import Figure
 
-    with rc_context(dict(_STYLE)):
+    with _style():
         figure = Figure((_WIDTH / 25.4, height), layout="constrained")
         return figure, figure.subplots()
 
 
 def as_svg(figure: Figure) -> str:
     """A picture as SVG, the same for the same data."""
-    from matplotlib import rc_context
-
     text = io.StringIO()
-    with rc_context(dict(_STYLE)):
+    with _style():
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import re
+import shlex
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 from slam.errors import ConfigurationError
 
@@ -60,20 +60,16 @@ class Plan:
     replay: bool = True
 
     def __post_init__(self) -> None:
-        for what, names in (
-            ("sequence", self.sequences),
-            ("back end", self.backends),
-            ("variant", tuple(v.name for v in self.variants)),
-        ):
-            if not names:
+        names = {"sequence": self.sequences, "back end": self.backends, "variant": [v.name for v in self.variants]}
+        for what, every in names.items():
+            if not every:
                 raise ConfigurationError(f"comparison: no {what} is given")
-            twice = next((name for name in names if names.count(name) > 1), None)
+            twice = next((name for name in every if every.count(name) > 1), None)
             if twice is not None:
                 raise ConfigurationError(f"comparison: {what} {twice!r} is given twice")
-        if self.trials < 1:
-            raise ConfigurationError(f"comparison: there must be at least one trial, got {self.trials}")
-        if self.trials > _MOST_TRIALS:
-            raise ConfigurationError(f"comparison: at most {_MOST_TRIALS} trials, got {self.trials}")
+        if not 1 <= self.trials <= _MOST_TRIALS:
+            wanted = "at least one trial" if self.trials < 1 else f"at most {_MOST_TRIALS} trials"
+            raise ConfigurationError(f"comparison: there must be {wanted}, got {self.trials}")
         for sequence in self.sequences:
             if sequence.startswith("camera:"):
                 raise ConfigurationError(f"{sequence}: a camera gives each back end other frames; compare recordings")
@@ -95,14 +91,13 @@ class Plan:
         """Closed loop, and replay where it is asked for."""
         return (CLOSED_LOOP, REPLAY) if self.replay else (CLOSED_LOOP,)
 
-    def to_json(self) -> dict[str, Any]:
-        """The plan as plain types."""
-        return asdict(self)
+    @property
+    def every(self) -> list[Trial]:
+        """All trials, mode by mode."""
+        return [trial for mode in self.modes for trial in self.trials_of(mode)]
 
     def command(self) -> str:
         """The command that runs the plan again."""
-        from shlex import join
-
         words = ["slam", "compare", *self.sequences, "--backends", ",".join(self.backends)]
         for variant in self.variants:
             if variant != Variant("surf"):
@@ -110,7 +105,7 @@ class Plan:
         words += ["--trials", str(self.trials)]
         if self.start or self.stop is not None:
             words += ["--frames", f"{self.start or ''}:{'' if self.stop is None else self.stop}"]
-        return join([*words, *([] if self.replay else ["--no-replay"])])
+        return shlex.join([*words, *([] if self.replay else ["--no-replay"])])
 
 
 @dataclass(frozen=True)
@@ -144,8 +139,8 @@ class Trial:
     @property
     def folder(self) -> str:
         """Where its files go, below the comparison's ``runs``."""
-        parts = (short_name(self.sequence), short_name(self.variant.name), f"seed_{self.seed}")
-        return "/".join((*parts, short_name(self.backend), self.mode.replace(" ", "_")))
+        names = (_short_name(self.sequence), _short_name(self.variant.name), f"seed_{self.seed}")
+        return "/".join((*names, _short_name(self.backend), self.mode.replace(" ", "_")))
 
 
 def is_world(sequence: str) -> bool:
@@ -153,7 +148,7 @@ def is_world(sequence: str) -> bool:
     return sequence.startswith(SYNTHETIC)
 
 
-def short_name(text: str) -> str:
+def _short_name(text: str) -> str:
     """A file name for a text: readable, and its own even where only odd characters or a long path tell two apart."""
     plain = re.sub(r"[^A-Za-z0-9.]+", "_", text.removeprefix(SYNTHETIC)).strip("_")
     if plain == text.removeprefix(SYNTHETIC) and len(plain) <= 60:
@@ -167,14 +162,13 @@ def parse_variant(text: str, common: tuple[str, ...] = ()) -> Variant:
     Raises:
         ConfigurationError: not of that form.
     """
-    name, _, rest = text.partition(":")
-    parts = [part for part in rest.split(":") if part]
-    frontend = parts.pop(0) if parts and "=" not in parts[0] else "surf"
-    if not name or any("=" not in part for part in parts):
+    name, *parts = [part for part in text.split(":") if part] or [""]
+    frontend = parts.pop(0) if parts and "=" not in parts[0] else ""
+    if not name or text.startswith(":") or "=" in name or any("=" not in part for part in parts):
         raise ConfigurationError(f"variant {text!r} is not of the form NAME:FRONTEND:KEY=VALUE:…")
-    if not rest.strip(":"):
+    if not frontend and not parts:
         raise ConfigurationError(
             f"variant {text!r} names no front end and no setting: write NAME:FRONTEND:KEY=VALUE:…, "
             f"such as {name}:surf:frontend.descriptor=16"
         )
-    return Variant(name, frontend, (*common, *parts))
+    return Variant(name, frontend or "surf", (*common, *parts))

@@ -80,31 +80,22 @@ def _in_pool(waiting: deque[Job], workers: int, deliver: Deliver) -> list[Job]:
     No more jobs are submitted than there are workers: so those submitted are those that were running.
     """
     running: dict[Future[Any], Job] = {}
+    lost: list[Job] = []
     with _pool(workers) as pool:
-        try:
-            while waiting or running:
-                while waiting and len(running) < workers:
+        while (waiting and not lost) or running:
+            try:
+                while waiting and not lost and len(running) < workers:
                     running[pool.submit(waiting[0].function, *waiting[0].arguments())] = waiting[0]
                     waiting.popleft()
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    error = future.exception()
-                    if isinstance(error, BrokenProcessPool):
-                        raise error
-                    deliver(running.pop(future), None if error else future.result(), error)
-        except BrokenProcessPool:
-            return _undelivered(running, deliver)
-    return []
-
-
-def _undelivered(running: dict[Future[Any], Job], deliver: Deliver) -> list[Job]:
-    """The jobs that a broken pool has lost; those that had ended just before are delivered."""
-    lost = []
-    for future, job in running.items():
-        error = future.exception()
-        if isinstance(error, BrokenProcessPool):
-            lost.append(job)
-        else:
-            deliver(job, None if error else future.result(), error)
+            except BrokenProcessPool:  # between two jobs
+                if not running:
+                    break
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                job, error = running.pop(future), future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    lost.append(job)
+                else:
+                    deliver(job, None if error else future.result(), error)
     return lost
 
 
@@ -114,8 +105,7 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     before = {process.pid for process in multiprocessing.active_children()}
     kept = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, _begin_worker)
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin_worker)
     try:
         yield pool
     except BaseException:
@@ -129,9 +119,8 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         for name, value in kept.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
+            os.environ.pop(name, None)
+            if value is not None:
                 os.environ[name] = value
 
 
@@ -164,7 +153,10 @@ class DaskScheduler:
 
     def run(self, jobs: Iterable[Job], deliver: Deliver) -> None:
         """See `Scheduler`. Raises SlamError where dask.distributed is missing, or nobody answers, or no longer."""
-        distributed = _distributed()
+        try:
+            distributed = importlib.import_module("distributed")
+        except ImportError as error:
+            raise SlamError("--scheduler needs dask.distributed: pip install 'surf-stereo-slam[cluster]'") from error
         try:
             client = distributed.Client(self.address, timeout=self.patience)
         except (OSError, ValueError) as error:
@@ -196,10 +188,3 @@ class DaskScheduler:
                 f"the Dask scheduler at {self.address} has gone: {error or type(error).__name__}; "
                 "with a new one the same command goes on"
             ) from error
-
-
-def _distributed() -> Any:
-    try:
-        return importlib.import_module("distributed")
-    except ImportError as error:
-        raise SlamError("--scheduler needs dask.distributed: pip install 'surf-stereo-slam[cluster]'") from error

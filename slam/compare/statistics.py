@@ -119,16 +119,15 @@ def difference(metric: Metric, reference: Array, other: Array) -> Difference:
         other: the other's.
     """
     both = np.isfinite(reference) & np.isfinite(other)
-    a, b = reference[both], other[both]
-    means = (float(a.mean()), float(b.mean())) if len(a) else (float("nan"), float("nan"))
-    if metric.better == "one":
-        a, b = _dishonesty(a), _dishonesty(b)
-    d = b - a
-    low, high = interval(d)
+    values = [reference[both], other[both]]
+    compared = values
+    if metric.better == "one":  # the same for half and double
+        compared = [np.abs(np.log10(np.maximum(each, 1e-12))) for each in values]
+    d = compared[1] - compared[0]
+    first, second, mean = (float(each.mean()) if len(d) else float("nan") for each in (*values, d))
     p = sign_flip(d) if metric.better and len(d) > 1 else float("nan")
-    mean = float(d.mean()) if len(d) else float("nan")
     signs = int((d < 0).sum()), int((d > 0).sum())
-    return Difference(metric, len(d), int((~both).sum()), *means, mean, low, high, p, p, *signs)
+    return Difference(metric, len(d), int((~both).sum()), first, second, mean, *interval(d), p, p, *signs)
 
 
 def adjusted(differences: Sequence[Difference]) -> list[Difference]:
@@ -148,8 +147,7 @@ def holm(p: Array) -> Array:
 
     The smallest is multiplied by M, the next by M − 1, …; none is less than a smaller one's, none more than 1.
     """
-    order = np.argsort(p, kind="stable")
-    result = np.empty(len(p))
+    order, result = np.argsort(p, kind="stable"), np.empty(len(p))
     result[order] = np.minimum(1.0, np.maximum.accumulate((len(p) - np.arange(len(p))) * p[order]))
     return result
 
@@ -157,6 +155,11 @@ def holm(p: Array) -> Array:
 def fewest(tests: int) -> int:
     """Trials that it takes for one of so many tests to be certain: p is at least 2 / 2ᴺ, and Holm's factor `tests`."""
     return int(np.ceil(np.log2(2 * max(tests, 1) / ALPHA)))
+
+
+def certain_of(trials: int) -> int:
+    """The most tests of which one can be certain with so many trials, see `fewest`."""
+    return int(ALPHA * 2 ** min(trials - 1, 60))
 
 
 #: Values from which on a mean has a confidence interval.
@@ -176,14 +179,12 @@ def interval(values: Array) -> tuple[float, float]:
 def _bootstrap(values: tuple[float, ...]) -> tuple[float, float]:
     from scipy.stats import bootstrap
 
+    options = {"confidence_level": LEVEL, "n_resamples": _RESAMPLES}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # BCa says so where it is not defined; then percentiles are taken
         for method in ("BCa", "percentile"):
-            result = bootstrap(
-                (np.array(values),), np.mean, confidence_level=LEVEL, n_resamples=_RESAMPLES, method=method,
-                rng=np.random.default_rng(_SEED),
-            )  # fmt: skip
-            low, high = result.confidence_interval
+            rng = np.random.default_rng(_SEED)
+            low, high = bootstrap((np.array(values),), np.mean, method=method, rng=rng, **options).confidence_interval
             if np.isfinite(low) and np.isfinite(high):
                 break
     return float(low), float(high)
@@ -208,8 +209,3 @@ def _signs(count: int) -> Array:
     if count <= _EXACT:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
     return np.random.default_rng(_SEED).choice((-1.0, 1.0), (2**_EXACT, count))
-
-
-def _dishonesty(values: Array) -> Array:
-    """Distance from one, the same for half and double."""
-    return np.abs(np.log10(np.maximum(values, 1e-12)))

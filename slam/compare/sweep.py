@@ -8,40 +8,27 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from slam import registry
-from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Trial
+from slam.compare.plan import CLOSED_LOOP, REPLAY, SIMULATED, Plan, Trial
 from slam.compare.scheduler import Job, Scheduler
-from slam.compare.trial import (
-    COMPLETED,
-    RECORDING,
-    RESULT,
-    TIMING,
-    Files,
-    config_of,
-    failure,
-    frontend_of,
-    result_files,
-    run_trial,
-)
+from slam.compare.trial import COMPLETED, RECORDING, RESULT, TIMING, Files, config_of, failed, run_trial
 from slam.errors import SlamError
 from slam.files import noting_inputs, read_object, remove_file
 from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder, write_json
-from slam.run.repeat import running_code
+from slam.run.repeat import changed_versions, running_code
 from slam.sequences import open_sequence
 from slam.sequences.faults import said_before
 
 RUNS, SWEEP = "runs", "sweep.json"
 
 #: What a comparison leaves in its folder.
-NAMES = (
-    SWEEP, f"{RUNS}/", "runs.csv", "means.csv", "differences.csv", "timings.csv", "report.html",
-)  # fmt: skip
+NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "means.csv", "differences.csv", "timings.csv", "report.html")
 
 
 @dataclass(frozen=True)
@@ -84,22 +71,32 @@ def sweep(
         SlamError: a sequence, name or setting is bad (nothing is run then), or the folder holds something else.
     """
     check(plan, out, overwrite)
+    told = on_done or (lambda trial: None)
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_json(out / SWEEP, {"plan": plan.to_json(), "command": plan.command(), "versions": running_code()})
-    for mode in plan.modes:
-        jobs = {}
+    write_json(out / SWEEP, {"plan": asdict(plan), "command": plan.command(), "versions": running_code()})
+    trials = {trial.folder: trial for trial in plan.every}
+
+    def keep(job: Job, files: Files | None, error: BaseException | None) -> None:
+        trial = trials[job.name]
+        files, folder = files or failed(trial, error or SlamError("nothing came back")), out / RUNS / job.name
+        with naming_folder(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / RESULT).unlink(missing_ok=True)
+            for name in sorted(files, key=lambda name: name == RESULT):  # last: what is there then is whole
+                remove_file(folder / name)
+                (folder / name).write_bytes(files[name])
+        told(trial)
+
+    for mode in plan.modes:  # a replay needs the closed loop
+        jobs = []
         for trial in plan.trials_of(mode):
-            if not overwrite and _is_done(trial, out):
-                if on_done is not None:
-                    on_done(trial)
+            if overwrite or not _is_done(trial, out):
+                jobs.append(Job(trial.folder, run_trial, partial(_arguments, plan, out, trial)))
             else:
-                jobs[trial.folder] = trial
-        scheduler.run(
-            [Job(name, run_trial, partial(_arguments, plan, trial, out)) for name, trial in jobs.items()],
-            partial(_keep, jobs, out, on_done),
-        )
-    return [read_run(trial, out) for mode in plan.modes for trial in plan.trials_of(mode)]
+                told(trial)
+        scheduler.run(jobs, keep)
+    return [read_run(trial, out) for trial in plan.every]
 
 
 def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
@@ -116,28 +113,27 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
     Raises:
         SlamError: something cannot work.
     """
+    frames: dict[str, int] = {}
     with noting_inputs() as inputs:
-        frames = _tried(plan)
+        for trial in plan.trials_of(CLOSED_LOOP):
+            if trial.seed:
+                continue
+            with said_before() if trial.sequence in frames else nullcontext():
+                sequence = open_sequence(trial.source)
+            frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
+            config = config_of(trial, sequence)
+            if trial.variant.frontend != SIMULATED:
+                registry.create("frontends", trial.variant.frontend, sequence.rig, **config.frontend)
+            registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
     goes_on = not overwrite and (out / SWEEP).is_file()
     if goes_on:
-        _require_same_versions(out / SWEEP)
+        before = read_object(out / SWEEP).get("versions")
+        if not isinstance(before, dict):
+            raise SlamError(f"{out / SWEEP}: not that of a comparison")
+        changed = changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code())
+        if changed:
+            raise SlamError(f"{out}: begun with {changed[0]}: runs cannot be compared; give another --out")
     require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)
-    return frames
-
-
-def _tried(plan: Plan) -> dict[str, int]:
-    """Number of frames of a run by sequence; raises SlamError for what cannot work."""
-    frames: dict[str, int] = {}
-    for trial in plan.trials_of(CLOSED_LOOP):
-        if trial.seed:
-            continue
-        with said_before() if trial.sequence in frames else nullcontext():
-            sequence = open_sequence(trial.source)
-        frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
-        config = config_of(trial, sequence)
-        if frontend_of(trial, sequence) is None:
-            registry.create("frontends", trial.variant.frontend, sequence.rig, **config.frontend)
-        registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
     return frames
 
 
@@ -149,81 +145,31 @@ def read_run(trial: Trial, out: Path) -> Run:
     """
     folder = out / RUNS / trial.folder
     result, timing = read_object(folder / RESULT), folder / TIMING
-    outcome = result.get("outcome")
-    if not isinstance(outcome, str):
+    if not isinstance(result.get("outcome"), str):
         raise SlamError(f"{folder / RESULT}: does not say how the run ended")
-    milliseconds = _figures(read_object(timing), timing) if timing.exists() else {}
-    return Run(trial, outcome, _figures(result.get("metrics"), folder / RESULT), milliseconds, folder)
-
-
-def _figures(tree: Any, file: Path) -> dict[str, float]:
-    """Numbers by name; raises SlamError where they are none."""
+    trees: tuple[Any, Any] = result.get("metrics"), read_object(timing) if timing.exists() else {}
     try:
-        return {name: float(value) for name, value in tree.items()}
+        metrics, milliseconds = ({name: float(value) for name, value in tree.items()} for tree in trees)
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise SlamError(f"{file}: its figures are no numbers by name") from error
+        raise SlamError(f"{folder / RESULT}: its figures are no numbers by name") from error
+    return Run(trial, result["outcome"], metrics, milliseconds, folder)
 
 
-def _arguments(plan: Plan, trial: Trial, out: Path) -> tuple[Trial, bytes | None]:
+def _arguments(plan: Plan, out: Path, trial: Trial) -> tuple[Trial, bytes | None]:
     """A trial, and for a replay the measurements of the first back end's closed loop."""
     if trial.mode != REPLAY:
         return trial, None
-    first = Trial(trial.sequence, trial.variant, plan.backends[0], trial.seed, CLOSED_LOOP, trial.start, trial.stop)
-    run = read_run(first, out)
+    run = read_run(replace(trial, backend=plan.backends[0], mode=CLOSED_LOOP), out)
     return trial, (run.folder / RECORDING).read_bytes() if run.completed else None
 
 
-def _keep(
-    jobs: dict[str, Trial],
-    out: Path,
-    on_done: Callable[[Trial], None] | None,
-    job: Job,
-    files: Files | None,
-    error: BaseException | None,
-) -> None:
-    """Put a trial's files in their place; one that raised is a failed run, with its reason."""
-    trial = jobs[job.name]
-    if files is None:
-        files = result_files(trial, failure(error or SlamError("nothing came back")))
-    folder = out / RUNS / trial.folder
-    with naming_folder(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / RESULT).unlink(missing_ok=True)
-        for name in sorted(files, key=lambda name: name == RESULT):  # last: what is there then is whole
-            remove_file(folder / name)
-            (folder / name).write_bytes(files[name])
-    if on_done is not None:
-        on_done(trial)
-
-
 def _is_done(trial: Trial, out: Path) -> bool:
-    """Whether the trial has ended before.
-
-    Raises:
-        SlamError: its folder holds a trial with other settings.
-    """
+    """Whether the trial has ended before; raises SlamError where its folder holds one with other settings."""
     path = out / RUNS / trial.folder / RESULT
-    if not path.exists():
-        return False
     try:
-        before = read_object(path).get("trial")
+        before = read_object(path).get("trial") if path.exists() else None
     except SlamError:
         return False
-    if before is None:
-        return False
-    if before != json.loads(json.dumps(asdict(trial))):
+    if before is not None and before != json.loads(json.dumps(asdict(trial))):
         raise SlamError(f"{path.parent}: holds a run with other settings; give another --out")
-    return True
-
-
-def _require_same_versions(path: Path) -> None:
-    before = read_object(path).get("versions")
-    if not isinstance(before, dict):
-        raise SlamError(f"{path}: not that of a comparison")
-    now = running_code()
-    changed = [name for name, version in now.items() if before.get(name) != version]
-    if changed:
-        raise SlamError(
-            f"{path.parent}: begun with {changed[0]} {before.get(changed[0])}, now {now[changed[0]]}: runs cannot be "
-            "compared; give another --out"
-        )
+    return before is not None

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +15,27 @@ from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
 from slam.run.outputs import csv_rows
-from slam.run.results import BY_KEY, COMPLETED, METRICS, UNTRACKED, Metric, object_metric
+from slam.run.results import BY_KEY, COMPLETED, METRICS, Metric, object_metric
+
+DIFFERENCE_COLUMNS = (
+    "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
+    "difference", "low", "high", "p", "p_holm", "other_lower", "other_higher", "verdict",
+)  # fmt: skip
+MEAN_COLUMNS = (
+    "sequence", "variant", "mode", "backend", "figure", "runs", "failed", "mean", "sd", "low", "high", "min", "max",
+)  # fmt: skip
+RUN_COLUMNS = ("sequence", "variant", "frontend", "mode", "seed", "backend", "outcome")
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that are compared with each other: one sequence, variant and mode.
-
-    Attributes:
-        sequence, variant, mode: what they share.
-        runs: by back end, each in the order of seeds.
-        compared: each other back end against the first, by key of the figure and by name; see `groups`.
-    """
+    """Runs that are compared with each other: one sequence, variant and mode."""
 
     sequence: str
     variant: Variant
     mode: str
-    runs: dict[str, list[Run]]
-    compared: dict[str, dict[str, Difference]] = field(default_factory=dict)
+    runs: dict[str, list[Run]]  # by back end, each in the order of seeds
+    compared: dict[str, dict[str, Difference]] = field(default_factory=dict)  # by key of the figure and by back end
 
     @property
     def trials(self) -> int:
@@ -44,13 +48,6 @@ class Group:
         keys = {key for runs in self.runs.values() for run in runs for key in run.metrics}
         others = [object_metric(key) for key in sorted(keys - set(BY_KEY))]
         return [COMPLETED, *(m for m in METRICS if m.key in keys), *others]
-
-    @property
-    def shown(self) -> list[Metric]:
-        """The metrics of tables for people: without the ways in which no frame was left untracked."""
-        return [
-            m for m in self.metrics if m.key not in UNTRACKED or any(self.finite(b, m.key).any() for b in self.runs)
-        ]
 
     def values(self, backend: str, key: str) -> Array:
         """A figure by trial (N,), NaN where the run failed or has none."""
@@ -75,14 +72,9 @@ class Group:
 def groups(plan: Plan, runs: Sequence[Run]) -> list[Group]:
     """The runs, sorted by what they share, in the plan's order, and compared: the tests of all are one family."""
     found = []
-    for sequence in plan.sequences:
-        for variant in plan.variants:
-            for mode in plan.modes:
-                own = [
-                    r for r in runs if (r.trial.sequence, r.trial.variant, r.trial.mode) == (sequence, variant, mode)
-                ]
-                by_name = {b: [r for r in own if r.trial.backend == b] for b in plan.backends}
-                found.append(Group(sequence, variant, mode, by_name))
+    for head in product(plan.sequences, plan.variants, plan.modes):
+        own = [run for run in runs if (run.trial.sequence, run.trial.variant, run.trial.mode) == head]
+        found.append(Group(*head, {b: [run for run in own if run.trial.backend == b] for b in plan.backends}))
     places = [(group, m, other) for group in found for m in group.metrics for other in plan.backends[1:]]
     alone = [difference(m, group.values(plan.backends[0], m.key), group.values(b, m.key)) for group, m, b in places]
     for (group, m, other), d in zip(places, adjusted(alone)):
@@ -97,46 +89,46 @@ def count_tests(every: Sequence[Group]) -> int:
     return tests or sum(d.better is not None for d in found)
 
 
-DIFFERENCE_COLUMNS = (
-    "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
-    "difference", "low", "high", "p", "p_holm", "other_lower", "other_higher", "verdict",
-)  # fmt: skip
-MEAN_COLUMNS = (
-    "sequence", "variant", "mode", "backend", "figure", "runs", "failed", "mean", "sd", "low", "high", "min", "max",
-)  # fmt: skip
-RUN_COLUMNS = ("sequence", "variant", "frontend", "mode", "seed", "backend", "outcome")
+def most_tests(plan: Plan) -> int:
+    """Tests of a plan if all figures that have a better are known, and vary: its trials should be enough for them."""
+    figures = sum(bool(metric.better) for metric in (COMPLETED, *METRICS))
+    return len(plan.sequences) * len(plan.variants) * len(plan.modes) * (len(plan.backends) - 1) * figures
 
 
 def write_tables(plan: Plan, runs: Sequence[Run], out: Path) -> None:
     """Write runs.csv, means.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
-    own = sorted({key for run in runs for key in run.metrics} - set(BY_KEY))
-    keys = [*BY_KEY, *own]
-    _write(out / "runs.csv", (*RUN_COLUMNS, *keys), ((*run_head(r), *_cells(r, keys)) for r in runs))
-    every = groups(plan, runs)
-    _write(out / "means.csv", MEAN_COLUMNS, (row for group in every for row in _mean_rows(group)))
-    _write(out / "differences.csv", DIFFERENCE_COLUMNS, (row for group in every for row in _difference_rows(group)))
+    keys = [*BY_KEY, *sorted({key for run in runs for key in run.metrics} - set(BY_KEY))]
     stages = list(dict.fromkeys(stage for run in runs for stage in run.milliseconds))
-    rows = ((*run_head(r), *(_number(r.milliseconds.get(s)) for s in stages)) for r in runs)
-    _write(out / "timings.csv", (*RUN_COLUMNS, *(f"ms_{stage}" for stage in stages)), rows)
+    times = [*RUN_COLUMNS, *(f"ms_{stage}" for stage in stages)]
+    every = groups(plan, runs)
+    for name, columns, rows in (
+        ("runs", (*RUN_COLUMNS, *keys), run_rows(runs, keys, _number)),
+        ("means", MEAN_COLUMNS, [row for group in every for row in _mean_rows(group)]),
+        ("differences", DIFFERENCE_COLUMNS, [row for group in every for row in _difference_rows(group)]),
+        ("timings", times, [(*_head(r), *(_number(r.milliseconds.get(s, np.nan)) for s in stages)) for r in runs]),
+    ):
+        write_text(out / f"{name}.csv", csv_rows([columns, *rows]))
 
 
-def run_head(run: Run) -> tuple[str, ...]:
+def run_rows(runs: Sequence[Run], keys: Iterable[str], text: Callable[[float], str]) -> list[tuple[str, ...]]:
+    """A row per run: `RUN_COLUMNS`, and its figures by their keys, as `text` writes them."""
+    return [(*_head(run), *(text(run.metrics.get(key, np.nan)) for key in keys)) for run in runs]
+
+
+def _head(run: Run) -> tuple[str, ...]:
     """Cells of `RUN_COLUMNS`."""
     t = run.trial
     return t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
-
-
-def _cells(run: Run, keys: Sequence[str]) -> list[str]:
-    return [_number(run.metrics.get(key)) for key in keys]
 
 
 def _mean_rows(group: Group) -> Iterable[tuple[object, ...]]:
     for metric in group.metrics:
         for backend in group.runs:
             values = group.finite(backend, metric.key)
-            figures = (*mean_figures(values), *((values.min(), values.max()) if len(values) else (np.nan,) * 2))
+            ends = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
             head = (group.sequence, group.variant.name, group.mode, backend, metric.key)
-            yield (*head, len(values), group.failures(backend), *map(_number, figures))
+            figures = map(_number, (*mean_and_sd(values), *interval(values), *ends))
+            yield (*head, len(values), group.failures(backend), *figures)
 
 
 def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:
@@ -148,18 +140,12 @@ def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:
             yield (*head, *figures, d.lower, d.higher, d.verdict.value)
 
 
-def mean_figures(values: Array) -> tuple[float, float, float, float]:
-    """Mean, standard deviation, and the bounds of the mean's confidence interval, of values (N,); NaN where unknown."""
+def mean_and_sd(values: Array) -> tuple[float, float]:
+    """Mean and standard deviation of values (N,); NaN where unknown."""
     mean = float(values.mean()) if len(values) else float("nan")
-    sd = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
-    return mean, sd, *interval(values)
+    return mean, float(values.std(ddof=1)) if len(values) > 1 else float("nan")
 
 
-def _number(value: float | None) -> str:
+def _number(value: float) -> str:
     """A number for a CSV cell; empty where there is none."""
-    return f"{value:.9g}" if value is not None and np.isfinite(value) else ""
-
-
-def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table at once or not at all."""
-    write_text(path, csv_rows([columns, *rows]))
+    return f"{value:.9g}" if np.isfinite(value) else ""

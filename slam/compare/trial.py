@@ -7,23 +7,30 @@ import io
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from slam.compare.collect import SERIES_COLUMNS, Collector, Measured
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Trial
-from slam.compare.simulated import SimulatedFrontend, WithoutImages
 from slam.config import SystemConfig
+from slam.data import FrameResult, StereoFeatures, StereoFrame
 from slam.errors import SlamError
-from slam.geometry.trajectory import Trajectory
+from slam.evaluation.association_truth import SurfacePoints
+from slam.evaluation.consistency import stretch_nees
+from slam.evaluation.summary import with_truth
+from slam.files import read_text
+from slam.geometry.se3 import Array, nearest_rotation
+from slam.geometry.stamps import frame_range, pair
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.interfaces import Frontend
 from slam.run.options import RunOptions
 from slam.run.recording import load_recording
+from slam.run.results import figures
 from slam.run.runner import run, run_recording
+from slam.run.summary import RunRecord
 from slam.sequences import Sequence, open_sequence
 from slam.sequences.faults import said_before
 from slam.worlds import WorldSequence
@@ -34,11 +41,20 @@ Files = dict[str, bytes]
 RESULT, TIMING, SERIES, RECORDING = "result.json", "timing.json", "series.csv", "recording.npz"
 COMPLETED = "completed"
 
+#: Columns of `SERIES`: time of a frame [s], and NEES of its pose since the start; NaN where it was not measured.
+SERIES_COLUMNS = ("stamp", "nees")
+
 #: Settings under which a front end has one thread; what it finds does not depend on it.
 _ONE_THREAD = {"surf": ["frontend.threads=1"]}
 
 #: Settings without which a run could not be recorded: landmarks that return are no observations.
 _RECORDED = ["atlas.give_back=false"]
+
+_RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associated [px]
+_SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
+
+
+# ---------------------------------------------------------------------------------------------------- running it
 
 
 def run_trial(trial: Trial, recording: bytes | None = None) -> Files:
@@ -53,51 +69,27 @@ def run_trial(trial: Trial, recording: bytes | None = None) -> Files:
     """
     with TemporaryDirectory(prefix="slam_trial_") as folder, one_thread():
         out = Path(folder)
-        measured, outcome = None, COMPLETED
         try:
-            measured = _closed_loop(trial, out) if trial.mode == CLOSED_LOOP else _replay(trial, recording, out)
+            found = _run(trial, recording, out)
         except SlamError as error:
-            outcome = failure(error)
-        files = {path.name: path.read_bytes() for path in sorted(out.iterdir()) if path.is_file()}
-    return {**files, **result_files(trial, outcome, measured)}
+            found = failed(trial, error)
+        return {path.name: path.read_bytes() for path in sorted(out.iterdir()) if path.is_file()} | found
 
 
-def failure(error: BaseException) -> str:
-    """The outcome of a run that an exception ended."""
-    return f"failed: {type(error).__name__}: {' '.join(str(error).split())}"
-
-
-def result_files(trial: Trial, outcome: str, measured: Measured | None = None) -> Files:
-    """What the tables are made of; a run that failed has its outcome and no figures."""
-    result = {"trial": asdict(trial), "outcome": outcome, "metrics": {} if measured is None else measured.metrics}
-    files = {RESULT: _json(result)}
-    if measured is not None:
-        files[TIMING] = _json(measured.milliseconds)
-        files[SERIES] = _table(measured.series)
-    return files
+def failed(trial: Trial, error: BaseException) -> Files:
+    """What is kept of a run that an exception ended: its outcome, and no figures."""
+    outcome = f"failed: {type(error).__name__}: {' '.join(str(error).split())}"
+    return {RESULT: _json({"trial": asdict(trial), "outcome": outcome, "metrics": {}})}
 
 
 def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
-    """All settings of a trial.
-
-    Raises:
-        ConfigurationError: a setting is unknown or out of range.
-    """
+    """All settings of a trial; raises ConfigurationError: a setting is unknown or out of range."""
     name = trial.variant.frontend
     first = _ONE_THREAD.get(name, [])
     if name == SIMULATED and isinstance(sequence, WorldSequence):  # the noise of these features is known
         first = [f"models.pixel_sigma={sequence.values['sigma']}"] if sequence.values["sigma"] else []
     settings = [*_RECORDED, *first, *trial.variant.settings]
     return SystemConfig.for_kind(sequence.kind, name, trial.backend).with_settings(settings)
-
-
-def frontend_of(trial: Trial, sequence: Sequence) -> Frontend | None:
-    """The front end as an object where it has no name in the registry; None where it has."""
-    if trial.variant.frontend != SIMULATED:
-        return None
-    if not isinstance(sequence, WorldSequence):
-        raise SlamError(f"{sequence.name}: front end {SIMULATED!r} is for synthetic worlds alone")
-    return SimulatedFrontend(sequence)
 
 
 @contextmanager
@@ -114,50 +106,173 @@ def one_thread() -> Iterator[None]:
         yield
 
 
-def _closed_loop(trial: Trial, out: Path) -> Measured:
-    """The system on the sequence; what it gave its back end is recorded."""
-    with said_before():
-        sequence = open_sequence(trial.source)
-    config, frontend = config_of(trial, sequence), frontend_of(trial, sequence)
-    record = out / RECORDING
-    options = RunOptions(trial.backend, trial.variant.frontend, config, out, trial.start, trial.stop, record)
-    collector = Collector(sequence, trial.start)
-    shown: Any = sequence if frontend is None else WithoutImages(cast(WorldSequence, sequence))
-    summary = run(shown, options, collector.add, frontend=frontend)
-    return _measured(collector, out, summary)
+@dataclass(frozen=True)
+class SimulatedFrontend:
+    """A `Frontend` that takes features straight from a world's landmarks, with its noise, misses and outliers."""
+
+    world: WorldSequence
+
+    def extract(self, frame: StereoFrame) -> StereoFeatures:
+        """Features of the frame of this number; its images are not looked at."""
+        return self.world.observations(frame.index)
 
 
-def _replay(trial: Trial, recording: bytes | None, out: Path) -> Measured:
-    """A back end alone on recorded measurements; raises SlamError where the run to be replayed has left none."""
-    if recording is None:
+class WithoutImages:
+    """A world's recording whose frames have images of one black pixel; all else is that of the recording."""
+
+    def __init__(self, recording: WorldSequence) -> None:
+        self._recording = recording
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._recording, name)
+
+    def __len__(self) -> int:
+        return len(self._recording)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
+        """Numbers and stamps of frames."""
+        nothing = np.zeros((1, 1), np.uint8)
+        for k in range(*frame_range(start, stop, len(self))):
+            yield StereoFrame(k, float(self._recording.stamps[k]), nothing, None)
+
+
+def _run(trial: Trial, recording: bytes | None, out: Path) -> Files:
+    """The whole system on the sequence, whose measurements are recorded; or a back end alone on recorded ones."""
+    closed, record = trial.mode == CLOSED_LOOP, RunRecord()
+    if not closed and recording is None:
         raise SlamError(f"{trial.source}: the run to be replayed has failed, there are no measurements")
-    path = out / RECORDING
-    path.write_bytes(recording)
-    loaded = load_recording(path)
-    path.unlink()
     with said_before():
         sequence = open_sequence(trial.source)
-    options = RunOptions(trial.backend, trial.variant.frontend, config_of(trial, sequence), out)
-    collector = Collector(sequence, trial.start, score=False)
-    return _measured(collector, out, run_recording(loaded, options, collector.add))
-
-
-def _measured(collector: Collector, out: Path, summary: dict[str, Any]) -> Measured:
-    """The figures of a run that has left its files in `out`."""
+    collected = MapRecord(sequence, trial.start, closed)
+    names = trial.backend, trial.variant.frontend, config_of(trial, sequence), out
+    if recording is not None:
+        path = out / RECORDING
+        path.write_bytes(recording)
+        loaded = load_recording(path)
+        path.unlink()
+        summary = run_recording(loaded, RunOptions(*names), collected.add, record)
+    else:
+        frontend: Frontend | None = None
+        shown: Any = sequence
+        if trial.variant.frontend == SIMULATED:
+            assert isinstance(sequence, WorldSequence)  # `Plan` takes nothing else
+            frontend, shown = SimulatedFrontend(sequence), WithoutImages(sequence)
+        options = RunOptions(*names, trial.start, trial.stop, out / RECORDING)
+        summary = run(shown, options, collected.add, frontend, record=record)
     if not summary["frames"]:
         raise SlamError("the run has no frame")
-    final = Trajectory.read_tum(out / "trajectory_final.txt")
-    with (out / "landmarks.csv").open(encoding="utf-8", newline="") as file:
-        rows = [(int(row["id"]), float(row["x"]), float(row["y"]), float(row["z"])) for row in csv.DictReader(file)]
-    ids, positions = np.array([row[0] for row in rows], np.int64), np.array([row[1:] for row in rows], float)
-    return collector.finish(final, ids, positions.reshape(-1, 3), summary)
+    metrics = figures(summary) | collected.figures(record, out)
+    metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
+    times = summary.get("milliseconds", {})
+    milliseconds = {stage: value for stage, value in times.get("median", {}).items() if value}
+    milliseconds |= {"total": times["median_total"]} if times else {}
+    text = io.StringIO()
+    np.savetxt(text, nees_series(record, sequence), "%.9g", ",", header=",".join(SERIES_COLUMNS), comments="")
+    result = {"trial": asdict(trial), "outcome": COMPLETED, "metrics": metrics}
+    return {RESULT: _json(result), TIMING: _json(milliseconds), SERIES: text.getvalue().encode()}
 
 
 def _json(tree: Any) -> bytes:
     return (json.dumps(tree, indent=2) + "\n").encode()
 
 
-def _table(rows: np.ndarray) -> bytes:
-    text = io.StringIO()
-    np.savetxt(text, rows, "%.9g", ",", header=",".join(SERIES_COLUMNS), comments="")
-    return text.getvalue().encode()
+# --------------------------------------------------------------------------------- what only a comparison measures
+
+
+class MapRecord:
+    """Associations and landmarks against a world's surfaces, lifetimes, and the size of the map.
+
+    `start` is the number of the first frame. Associations of a replay are the same for all, and need no check.
+    """
+
+    def __init__(self, sequence: Sequence, start: int = 0, associations: bool = True) -> None:
+        self._sequence, self._start, self._associations = sequence, start, associations
+        self._truth = SurfacePoints(sequence) if sequence.format == "synthetic" else None
+        self._lifetimes = Lifetimes()
+        self._sizes: list[int] = []
+        self._right: list[bool] = []
+
+    def add(self, result: FrameResult) -> None:
+        """One more frame."""
+        number, features = self._start + result.index, result.features
+        if self._truth is not None:
+            if self._associations:
+                errors = self._truth.errors(number, result.matched, features.uv_left[result.matched_features])
+                self._right += (errors[np.isfinite(errors)] < _RIGHT).tolist()
+            self._truth.add(number, result.added, features.uv_left[result.added_features])
+        self._lifetimes.add(result)
+        self._sizes.append(result.map_size)
+
+    def figures(self, record: RunRecord, out: Path) -> dict[str, float]:
+        """The figures of a run that is finished and has left its files in `out`."""
+        found = self._lifetimes.figures() | self._landmark_errors(record, out)
+        if self._right:
+            found["association_precision"] = float(np.mean(self._right))
+        if self._sizes:
+            found["map_size"] = float(np.mean(self._sizes))
+        return found
+
+    def _landmark_errors(self, record: RunRecord, out: Path) -> dict[str, float]:
+        """Distances of the map's landmarks from the surface points they are, after the alignment of the poses.
+
+        They are turned by the poses' orientations: positions of a camera that hardly moves leave the turn open, which
+        moves what is far away.
+        """
+        final = Trajectory.read_tum(out / "trajectory_final.txt")
+        tracked = record.trajectory.select(np.array(record.measured, bool))
+        pairs = with_truth(final.select(pair(final.stamps, tracked.stamps, _SAME) >= 0), self._sequence)
+        rows = list(csv.DictReader(io.StringIO(read_text(out / "landmarks.csv"), newline="")))
+        if self._truth is None or pairs is None or not rows:
+            return {}
+        own, true = pairs
+        R = nearest_rotation((true.poses[:, :3, :3] @ np.swapaxes(own.poses[:, :3, :3], 1, 2)).mean(axis=0))
+        t = (true.positions - own.positions @ R.T).mean(axis=0)
+        positions = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
+        ids = np.array([int(row["id"]) for row in rows], np.int64)
+        errors = np.linalg.norm(positions @ R.T + t - self._truth.positions(ids), axis=1)
+        errors = errors[np.isfinite(errors)]
+        if not len(errors):
+            return {}
+        return {"landmark_error_m": float(np.median(errors)), "landmark_error_90_m": float(np.quantile(errors, 0.9))}
+
+
+class Lifetimes:
+    """How long landmarks stay in the map; those still in it have lived until the last frame."""
+
+    def __init__(self) -> None:
+        self._first: dict[int, int] = {}
+        self._ended: list[int] = []
+        self._last = 0
+
+    def add(self, result: FrameResult) -> None:
+        """One more frame."""
+        self._last = result.index
+        for i in (*result.added.tolist(), *result.returned.tolist()):
+            self._first.setdefault(i, result.index)
+        for i in result.erased.tolist():
+            if i in self._first:  # else one of an old place, by which a kidnapped camera was found
+                self._ended.append(result.index - self._first.pop(i))
+
+    def figures(self) -> dict[str, float]:
+        """Median and mean in frames; none where there was no landmark."""
+        lived = [*self._ended, *(self._last - first for first in self._first.values())]
+        if not lived:
+            return {}
+        return {"lifetime_frames": float(np.median(lived)), "lifetime_mean_frames": float(np.mean(lived))}
+
+
+def nees_series(record: RunRecord, sequence: Sequence) -> Array:
+    """`SERIES_COLUMNS` of every frame that has a pose (N, 2), relative to the first measured pose."""
+    online, measured = record.trajectory, np.array(record.measured, bool)
+    rows = np.column_stack([online.stamps, np.full(len(online), np.nan)])
+    pairs = with_truth(online.select(measured), sequence) if len(online) else None
+    if pairs is None:
+        return rows
+    own, true = pairs
+    at = np.searchsorted(online.stamps, own.stamps)
+    if at[0] == np.flatnonzero(measured)[0]:
+        noise = getattr(sequence, "truth_noise", TruthNoise())
+        first, others = np.zeros(len(at) - 1, np.intp), np.arange(1, len(at))
+        covariances, common = np.array(record.covariances)[at], [record.common[row] for row in at]
+        rows[at[1:], 1] = stretch_nees(own, true, covariances, noise, first, others, common)
+    return rows

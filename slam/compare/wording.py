@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from slam.compare.plan import REPLAY
-from slam.compare.statistics import ALPHA, FEWEST, HINT_ALPHA, LEVEL, Difference, Verdict, fewest
-from slam.evaluation.metrics import chi_square_band
-from slam.run.results import Metric
+from slam.compare.statistics import ALPHA, HINT_ALPHA, Difference, Verdict, certain_of, fewest
+from slam.compare.tables import Group, mean_and_sd
+from slam.run.results import number, verdict
 
-#: A verdict as a badge has it, in the report and on the terminal.
-WORDS = {
-    Verdict.CERTAIN: "certain", Verdict.LIKELY: "likely", Verdict.HINT: "a hint", Verdict.OPEN: "open",
-    Verdict.EQUAL: "equal", Verdict.SINGLE: "one trial", Verdict.NONE: "no pair", Verdict.UNTESTED: "",
-}  # fmt: skip
+#: Verdicts that a badge has other words for than their own.
+_WORDS = {Verdict.HINT: "a hint", Verdict.SINGLE: "one trial", Verdict.NONE: "no pair", Verdict.UNTESTED: ""}
 
-#: What a badge means.
+#: What a badge means that says better or worse.
 STRENGTH = {
     Verdict.CERTAIN: f"certain (Holm-adjusted p ≤ {ALPHA:g})",
     Verdict.LIKELY: f"likely (p ≤ {ALPHA:g}, not after Holm's adjustment)",
@@ -30,25 +27,14 @@ _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
 _MISSING = 0.5  # of what the smaller of two shares lacks: with a larger difference, nearly all is not as good as all
 _FACTOR = 3.0  # between two means, from which on it is said as a factor
 
-#: Figures that say whether covariances hold, the best first: drift does not add up over stretches.
-_HONESTY = {
-    "nees_10m_per_dof": "over 10 m of path", "nees_1m_per_dof": "over 1 m of path", "nees_per_dof": "from the start",
-}  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a headline.
+    """A line of a headline."""
 
-    Attributes:
-        text: who, and which figures; the badge says the rest.
-        direction: "better" or "worse", of the other back end against the reference; empty where neither.
-        verdict: how sure that is.
-    """
-
-    text: str
-    direction: str
-    verdict: Verdict
+    text: str  # who, and which figures; the badge says the rest
+    direction: str  # "better" or "worse", of the other back end against the reference; empty where neither
+    verdict: Verdict  # how sure that is
 
     @property
     def badge(self) -> str:
@@ -56,9 +42,42 @@ class Line:
         return badge(self.verdict, self.direction)
 
 
-def badge(verdict: Verdict, direction: str) -> str:
+@dataclass(frozen=True)
+class Conclusions:
+    """What can be said of a group, in the report and on the terminal."""
+
+    name: str  # of the group
+    verdict: list[str]  # which back end is better in what, a sentence for each but the reference
+    failed: str  # which runs failed; empty where none did
+    headlines: list[Line]  # what is certain, likely and a hint, and which main figures are open
+    honesty: list[str]  # one per back end, on its covariances
+
+
+def conclusions(group: Group) -> Conclusions:
+    """What can be said of a group."""
+    first, *others = group.runs
+    own = {other: [group.differences(metric)[other] for metric in group.metrics] for other in others}
+    counts = [f"{n} of {group.trials} of {b}" for b in group.runs if (n := group.failures(b))]
+    failed = (
+        f"Runs failed, {', '.join(counts)}: a trial in which either failed is no pair, and the other figures speak of "
+        "the pairs alone."
+    )
+    means = {b: {m.key: mean_and_sd(group.finite(b, m.key))[0] for m in group.metrics} for b in group.runs}
+    honesty = {b: verdict(means[b], group.trials - group.failures(b)) for b in group.runs}
+    variant = "" if group.variant.name == "surf" else f", {group.variant.name}"
+    return Conclusions(
+        f"{group.sequence}{variant}, {group.mode}",
+        [in_short(differences, first, other) for other, differences in own.items()],
+        failed if counts else "",
+        [line for other, differences in own.items() for line in headline(differences, other)],
+        [f"{backend}: {text}." for backend, text in honesty.items() if text],
+    )
+
+
+def badge(sure: Verdict, direction: str) -> str:
     """A verdict in two words: direction and strength."""
-    return f"{direction}: {WORDS[verdict]}" if direction else WORDS[verdict]
+    word = _WORDS.get(sure, sure.value)
+    return f"{direction}: {word}" if direction else word
 
 
 def direction(d: Difference) -> str:
@@ -71,21 +90,22 @@ def direction(d: Difference) -> str:
 def headline(differences: Sequence[Difference], other: str) -> list[Line]:
     """What the other back end does better and worse than the reference, the surest first, and what remains open.
 
-    All that is certain, likely, or a hint is named, in both directions; of the rest the main figures.
+    All that is certain, likely, or a hint is named, in both directions; of the rest the main figures, but for those
+    that are perfect in every run.
     """
     lines = []
     tested = [d for d in differences if direction(d) and (d.metric.main or d.verdict is not Verdict.SINGLE)]
-    for verdict in STRENGTH:
+    for sure in STRENGTH:
         for way in ("better", "worse"):
-            own = [d for d in tested if d.verdict is verdict and direction(d) == way and not is_trifle(d)]
-            if own:
-                lines.append(Line(f"{other}: {'; '.join(map(_brief, own))}", way, verdict))
-    if trifles := [_name(d.metric) for d in tested if is_trifle(d)]:
+            if own := [d for d in tested if (d.verdict, direction(d)) == (sure, way) and not is_trifle(d)]:
+                lines.append(Line(f"{other}: {'; '.join(map(_brief, own))}", way, sure))
+    if trifles := [_name(d) for d in tested if is_trifle(d)]:
         lines.append(Line(f"{other}: less than {100 * _TRIFLE:g} % apart: {', '.join(trifles)}", "", Verdict.EQUAL))
-    rest = [d for d in differences if worth_saying(d)]
-    for verdict, of in ((Verdict.OPEN, (Verdict.OPEN, Verdict.EQUAL)), (Verdict.NONE, (Verdict.NONE,))):
-        if names := [_name(d.metric) for d in rest if d.verdict in of]:
-            lines.append(Line(f"{other}: {', '.join(names)}", "", verdict))
+    perfect = [d.metric.better == "higher" and d.reference == 1 and d.verdict is Verdict.EQUAL for d in differences]
+    rest = [d for d, ideal in zip(differences, perfect) if d.metric.main and not ideal]
+    for kept, of in ((Verdict.OPEN, (Verdict.OPEN, Verdict.EQUAL)), (Verdict.NONE, (Verdict.NONE,))):
+        if names := [_name(d) for d in rest if d.verdict in of]:
+            lines.append(Line(f"{other}: {', '.join(names)}", "", kept))
     return lines or [Line(f"{other}: errors (the true path is not known)", "", Verdict.NONE)]
 
 
@@ -95,7 +115,7 @@ def in_short(differences: Sequence[Difference], reference: str, other: str) -> s
     told = [d for d in differences if d.metric.main and d.verdict in sure and not is_trifle(d)]
     parts = []
     for better, first, second in ((True, other, reference), (False, reference, other)):
-        if names := [f"{_name(d.metric)} ({WORDS[d.verdict]})" for d in told if d.better is better]:
+        if names := [f"{_name(d)} ({d.verdict.value})" for d in told if d.better is better]:
             parts.append(f"{first} is better than {second} in {', '.join(names)}")
     return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
 
@@ -112,77 +132,31 @@ def is_trifle(d: Difference) -> bool:
     return bool(apart < _TRIFLE * larger or same)
 
 
-def worth_saying(d: Difference) -> bool:
-    """Whether a summary speaks of it whatever its verdict: not of what has the same ideal value in every run."""
-    perfect = d.metric.better == "higher" and d.reference == 1
-    return d.metric.main and not (perfect and d.verdict is Verdict.EQUAL)
+def caution(trials: int, tests: int) -> str:
+    """What so many trials can show at best; empty where nothing is tested, or one of so many tests can be certain.
 
-
-def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
-    """Whether the covariances hold, a sentence per back end: what its mean NEES is, and what is to be expected.
-
-    Args:
-        values: mean NEES over the runs by key of the figure and by back end; NaN where there is none.
-        runs: how many. The band holds even if all frames of a run are as good as one.
-    """
-    low, high = (bound / 6 for bound in chi_square_band(6, max(runs, 1)))
-    lines = []
-    for backend in next(iter(values.values()), {}):
-        key = next((k for k in _HONESTY if np.isfinite(values.get(k, {}).get(backend, np.nan))), None)
-        if key is None:
-            continue
-        value = values[key][backend]
-        claim = "consistent" if low <= value <= high else "overconfident" if value > high else "too cautious"
-        lines.append(
-            f"{backend}: {claim}. NEES / 6 {_HONESTY[key]} is {_digits(value)}, expected 1, {low:.2f} to {high:.2f} by "
-            f"chance ({round(100 * LEVEL)} %): errors are {_digits(np.sqrt(value))} times as large as the covariances "
-            "claim."
-        )
-    return lines
-
-
-def failures(runs: dict[str, int], trials: int) -> str:
-    """Which back ends failed how often; empty where none did."""
-    counts = [f"{n} of {trials} of {name}" for name, n in runs.items() if n]
-    if not counts:
-        return ""
-    return (
-        f"Runs failed, {', '.join(counts)}: a trial in which either failed is no pair, and the other figures speak of "
-        "the pairs alone."
-    )
-
-
-def beforehand(trials: int) -> str:
-    """What so many trials can show, before they are run."""
-    tests = int(ALPHA * 2 ** min(trials - 1, 30))
-    if tests < 1:
-        return caution(trials)
-    return f"With {trials} trials a difference that has the same sign in all is certain where up to {tests} are tested."
-
-
-def caution(trials: int, tests: int = 1) -> str:
-    """What so many trials can show at best; empty where they are enough to be certain of something.
+    Said before the trials are run, and with the same numbers after them.
 
     Args:
         trials: of the sequence that has most.
-        tests: that p is adjusted for.
+        tests: that the plan can come to, see `slam.compare.tables.most_tests`.
     """
     enough = fewest(tests)
-    if trials >= enough:
+    if not tests or trials >= enough:
         return ""
+    more = f"{enough} trials are enough for all figures (--trials {enough})."
     if trials == 1:
         return (
-            "One trial cannot tell a difference from chance: synthetic worlds have as many as are asked for (--trials, "
-            f"{enough} or more), a recorded sequence has one."
+            "One trial cannot tell a difference from chance: a recorded sequence has one, synthetic worlds have as "
+            f"many as are asked for. {more}"
         )
-    least, what = 2 / 2**trials, "nothing can be certain"
     if trials < fewest(1):
-        why = f"even where all agree, chance alone does as much in {100 * least:.2g} % of such comparisons"
-    else:
-        why = f"even where all agree, p is {least:.2g}, and {tests} tests multiply it (Holm)"
-        what = "differences can be likely at best, not certain"
-    intervals = f" Intervals of a mean are given from {FEWEST} trials on." if trials < FEWEST else ""
-    return f"With {trials} trials {what}: {why}. It takes {enough} or more (--trials).{intervals}"
+        chance = f"chance alone does as much in {200 / 2**trials:.2g} % of such comparisons"
+        return f"With {trials} trials nothing can be certain: even where all agree, {chance}. {more}"
+    return (
+        f"With {trials} trials a difference that has the same sign in all is certain where up to {certain_of(trials)} "
+        f"figures are tested. {more}"
+    )
 
 
 def measurements(mode: str, reference: str) -> str:
@@ -204,30 +178,17 @@ def shown(value: float, like: float | None = None) -> str:
     return f"{value:.{digits}f}".replace("-", "−")
 
 
-def shown_mean(d: Difference) -> str:
-    """The mean difference for people; of figures that should be one, the ratio of the factors by which they are off."""
+def shown_difference(d: Difference) -> tuple[str, str]:
+    """The mean difference and its interval for people, with the digits that the wider bound needs; a dash for none.
+
+    Of figures that should be one it is the ratio of the factors by which they are off.
+    """
+    bounds = (d.low, d.high) if np.isfinite(d.low) else ()
     if d.metric.better == "one" and np.isfinite(d.mean):
-        return f"× {10**d.mean:.3f}"
-    return shown(d.metric.scale * d.mean, _widest(d)) if np.isfinite(d.low) else d.metric.show(d.mean)
-
-
-def shown_interval(d: Difference) -> str:
-    """The bounds of its interval, with as many digits as the larger one needs; a dash where there is none."""
-    if not np.isfinite(d.low):
-        return "–"
-    if d.metric.better == "one":
-        return f"{10**d.low:.3f} … {10**d.high:.3f}"
-    return " … ".join(shown(d.metric.scale * bound, _widest(d)) for bound in (d.low, d.high))
-
-
-def _widest(d: Difference) -> float:
-    return d.metric.scale * max(abs(d.low), abs(d.high))
-
-
-def shown_spread(metric: Metric, mean: float, sd: float) -> tuple[str, str]:
-    """Mean and standard deviation for people, with as many digits as the mean needs; empty where there is none."""
-    mean, sd = metric.scale * mean, metric.scale * sd
-    return shown(mean), f"± {shown(sd, mean)}" if np.isfinite(mean) and np.isfinite(sd) else ""
+        return f"× {10**d.mean:.3f}", " … ".join(f"{10**bound:.3f}" for bound in bounds) or "–"
+    widest = max((d.metric.scale * abs(bound) for bound in bounds), default=None)
+    mean = shown(d.metric.scale * d.mean, widest) if bounds else d.metric.show(d.mean)
+    return mean, " … ".join(shown(d.metric.scale * bound, widest) for bound in bounds) or "–"
 
 
 def shown_p(p: float) -> str:
@@ -237,31 +198,27 @@ def shown_p(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
-def _name(metric: Metric) -> str:
+def _name(d: Difference) -> str:
     """A label that can stand in a list."""
-    return metric.label.replace(", ", " ").removesuffix(" (expected 1)")
+    return d.metric.label.replace(", ", " ").removesuffix(" (expected 1)")
 
 
 def _brief(d: Difference) -> str:
     """The figure from the reference's value to the other's, and by how much of the reference's that is."""
     unit = d.metric.unit and f" {d.metric.unit}"
-    return f"{_name(d.metric)} {_shown(d, d.reference)} → {_shown(d, d.other)}{unit}{_apart(d)}"
+    return f"{_name(d)} {_shown(d, d.reference)} → {_shown(d, d.other)}{unit}{''.join(_apart(d))}"
 
 
 def _shown(d: Difference, value: float) -> str:
     return shown(d.metric.scale * value)
 
 
-def _apart(d: Difference) -> str:
+def _apart(d: Difference) -> Iterator[str]:
     """By how much the other's mean is above or below the reference's: a factor where percentages are enormous."""
     small, large = sorted((d.reference, d.other))
     if d.metric.better != "lower" or d.reference <= 0:
-        return ""
+        return
     if small <= 0 or large / small < _FACTOR:
-        return f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
-    times = _digits(large / small) if large / small < 1e4 else f"{large / small:.1g}"
-    return f" ({times} times as {'much' if d.other > d.reference else 'little'})"
-
-
-def _digits(value: float) -> str:
-    return f"{value:.0f}" if value >= 10 else f"{value:.2f}"
+        yield f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
+    else:
+        yield f" ({number(large / small)} times as {'much' if d.other > d.reference else 'little'})"

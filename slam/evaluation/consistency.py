@@ -209,33 +209,3 @@ def _mean(values: Array) -> float:
 
 #: Beside the figures: the cameras are those of the calibration, while the covariances count errors of one.
 EXACT = "exact calibration"
-
-#: What a verdict may judge by, the best first: errors from the start add up, those of stretches do not.
-_JUDGED = {"NEES over 10 m": "over 10 m", "NEES over 1 m": "over 1 m", "mean NEES": "from the start"}
-
-
-def _is_number(figure: float | None) -> bool:
-    """Whether a figure could be had; files have null where not."""
-    return figure is not None and bool(np.isfinite(figure))
-
-
-def verdict(figures: dict[str, float]) -> str:
-    """One line in words on what the figures say, by which of them and why; empty where there are none.
-
-    A figure of which more than half of the stretches had to be left out is not judged by.
-    """
-    ratios = {
-        where: float(np.sqrt(figures[key] / _DOF))
-        for key, where in _JUDGED.items()
-        if _is_number(figures.get(key)) and (figures.get(f"no covariance {where}") or 0.0) <= 0.5
-    }
-    if not ratios:
-        return ""
-    judged, ratio = next(iter(ratios.items()))
-    says = "are too small" if ratio**2 > 2 else "are too large" if ratio**2 < 0.5 else "hold"
-    text = f"covariances {says}: errors {judged} are {ratio:.2f} times what they claim"
-    if ratio < 1 and figures.get(EXACT):
-        text += ", which counts errors of the calibration; this world's cameras have none"
-    if judged == "from the start" or "from the start" not in ratios:
-        return text
-    return f"{text}; from the start, where errors of the whole path add up, {ratios['from the start']:.2f} times"

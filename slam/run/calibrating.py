@@ -45,19 +45,12 @@ Show = Callable[[StereoSequence, int], AbstractContextManager[Callable[[FrameRes
 
 @dataclass(frozen=True)
 class Targets:
-    """Files to write.
+    """Files to write."""
 
-    Attributes:
-        out: what has been found, with its covariance.
-        opencv: the corrected calibration in OpenCV's form; None for none.
-        kalibr: in Kalibr's.
-        overwrite: whether files that are there may be replaced.
-    """
-
-    out: Path
-    opencv: Path | None = None
-    kalibr: Path | None = None
-    overwrite: bool = False
+    out: Path  # what has been found, with its covariance
+    opencv: Path | None = None  # the corrected calibration in OpenCV's form
+    kalibr: Path | None = None  # the same in Kalibr's
+    overwrite: bool = False  # whether files that are there may be replaced
 
     def require(self, rig: StereoRig, inputs: Sequence[Path]) -> None:
         """Raise where a file could not be written, before hours of work are done for it; `inputs` are not replaced."""
@@ -70,42 +63,25 @@ class Targets:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What one recording says.
-
-    Attributes:
-        name: of the recording.
-        frames: how many there were.
-        pairs: of views that show motion.
-        posterior: from this recording alone.
-        evidence: without any prior; None where no motion was seen.
-    """
+    """What one recording says."""
 
     name: str
-    frames: int
-    pairs: int
-    posterior: RigPosterior
-    evidence: RecordingEvidence | None
+    frames: int  # how many there were
+    pairs: int  # of views that show motion
+    posterior: RigPosterior  # from this recording alone
+    evidence: RecordingEvidence | None  # without any prior; None where no motion was seen
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What all recordings say.
+    """What all recordings say."""
 
-    Attributes:
-        found: by each.
-        kept: by all together.
-        agreed: whether they agree; None where one alone shows motion.
-        off: how far pixels of the corrected calibration are from the corrected pixels, root mean square [px].
-        warning: a line on why little can be expected of it; empty for none.
-        units: of each parameter, what it is multiplied by for people, and the unit that it then has.
-    """
-
-    found: Sequence[Found]
-    kept: SavedCalibration
-    agreed: Agreement | None
-    off: float
-    warning: str
-    units: Sequence[tuple[float, str]]
+    found: Sequence[Found]  # by each
+    kept: SavedCalibration  # by all together
+    agreed: Agreement | None  # whether they agree; None where one alone shows motion
+    off: float  # RMS distance [px] of the corrected calibration's pixels from the corrected pixels
+    warning: str  # why little can be expected of it; empty for none
+    units: Sequence[tuple[float, str]]  # of each parameter, a factor for people, and the unit that it then has
 
 
 @one_blas_thread
@@ -117,35 +93,33 @@ def calibrate(
     frames: tuple[int, int | None] = (0, None),
     inputs: Sequence[Path] = (),
 ) -> Calibrated:
-    """Run recordings of one rig, and write what they say of it.
+    """Run a range of frames of recordings of one rig, and write what they say of it.
 
-    Args:
-        sequences: the recordings.
-        targets: files to write.
-        show: the progress of each.
-        settings: as ``--set`` takes them.
-        frames: the first of each, and the one after the last; None for all.
-        inputs: files and folders that must not be replaced.
-
-    Raises:
-        SlamError: bad input; one line says what and where.
+    `settings` are as ``--set`` takes them; `inputs` are files and folders that must not be replaced. Raises SlamError
+    on bad input, before anything is run.
     """
-    _require_one_rig(sequences)
     rig = sequences[0].rig
+    for sequence in sequences:
+        if is_live(sequence):
+            raise ConfigurationError(f"{sequence.name}: a recording is needed, not a camera")
+        difference = RigNumbers.of(rig).difference(RigNumbers.of(sequence.rig))
+        if difference:
+            raise CalibrationError(f"{sequence.name}: not the rig of {sequences[0].name}: {difference}")
     targets.require(rig, inputs)
-    found = [_run(sequence, settings, frames, show) for sequence in sequences]
-    model = RigModel(rig)
+    configs = [_config(sequence, settings) for sequence in sequences]
+    found = [_run(sequence, config, frames, show) for sequence, config in zip(sequences, configs)]
+    model, systematic = RigModel(rig), configs[0].self_calibration.systematic
     evidence = [one.evidence for one in found if one.evidence is not None]
-    systematic = _config(sequences[0], settings).self_calibration.systematic
-    kept = joint_calibration(model, evidence, systematic)
-    agreed = agreement(model, evidence, systematic)
+    kept, agreed = joint_calibration(model, evidence, systematic), agreement(model, evidence, systematic)
     corrected = corrected_rig(model, kept.posterior.mean)
-    every = [
-        {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
-    ]
     warning = "" if any(one.pairs for one in found) else _NO_PAIRS
-    tree = {**kept.to_json(), "recordings": every, "agreement": None if agreed is None else agreed.words}
-    tree["warnings"] = [warning] if warning else []
+    tree = kept.to_json() | {
+        "recordings": [
+            {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
+        ],
+        "agreement": None if agreed is None else agreed.words,
+        "warnings": [warning] if warning else [],
+    }
     write_text(targets.out, json.dumps(tree, indent=1) + "\n")
     if targets.opencv is not None:
         write_opencv(targets.opencv, corrected.rig)
@@ -163,16 +137,6 @@ def _unit(name: str, unit: str, focal: float) -> tuple[float, str]:
     return (100.0, share) if share else _SHOWN[unit]
 
 
-def _require_one_rig(sequences: Sequence[StereoSequence]) -> None:
-    """Raise where recordings are of several rigs, or have no end."""
-    for sequence in sequences:
-        if is_live(sequence):
-            raise ConfigurationError(f"{sequence.name}: a recording is needed, not a camera")
-        difference = RigNumbers.of(sequences[0].rig).difference(RigNumbers.of(sequence.rig))
-        if difference:
-            raise CalibrationError(f"{sequence.name}: not the rig of {sequences[0].name}: {difference}")
-
-
 def _config(sequence: StereoSequence, settings: Sequence[str]) -> SystemConfig:
     """The settings for a recording."""
     config = SystemConfig.for_kind(sequence.kind, _FRONTEND, _BACKEND).with_settings([*_SETTINGS, *settings])
@@ -181,12 +145,11 @@ def _config(sequence: StereoSequence, settings: Sequence[str]) -> SystemConfig:
     return config
 
 
-def _run(sequence: StereoSequence, settings: Sequence[str], frames: tuple[int, int | None], show: Show) -> Found:
+def _run(sequence: StereoSequence, config: SystemConfig, frames: tuple[int, int | None], show: Show) -> Found:
     """What one recording says."""
-    system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=_config(sequence, settings))
-    last = len(sequence) if frames[1] is None else min(frames[1], len(sequence))
+    system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=config)
     count = 0
-    with show(sequence, max(last - frames[0], 0)) as on_frame:
+    with show(sequence, len(range(len(sequence))[slice(*frames)])) as on_frame:
         for _, result in system.run(sequence.frames(*frames)):
             on_frame(result)
             count += 1

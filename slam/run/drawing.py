@@ -1,6 +1,6 @@
 """Frames with landmarks and objects drawn in: landmarks yellow, new ones green, object features black, boxes and axes.
 
-The colours are those of paper B, Fig. 10.
+The colours are those of paper B, Fig. 10. Beside a frame, `GrowingMap` draws the map as it is so far.
 """
 
 from __future__ import annotations
@@ -11,51 +11,51 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import FrameResult, StereoFrame
+from slam.data import Estimate, FrameResult, StereoFrame
 from slam.errors import SlamError
 from slam.files import reason, require_utf8, write_png
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import MovingObject
 from slam.outputs import Output
-from slam.run.growing_map import GrowingMap
-from slam.run.style import body_colour
 
-_BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR
+_BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR, as all colours here
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
+_BODIES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))
+_OLD, _NOW, _PATH, _INK = (200, 200, 200), (200, 130, 30), (0, 110, 240), (90, 90, 90)  # of the map
 _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
 _FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size
 _LEAST_RADIUS = 4  # of a feature's circle [px]
 _LEGEND = 24  # height of the bar with the legend [px]
 _FILM, _DIGITS = ".mp4", 6  # a video's suffix; of a picture's name, at least
 _PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
+_AHEAD = 0.3  # of the map behind the camera
+_REACH = 2.5  # widths of the map in distances of the first landmarks
+
+
+def body_colour(number: int) -> tuple[int, int, int]:
+    """The colour (BGR) of a moving body in images, by its number."""
+    return _BODIES[(number - 1) % len(_BODIES)]
 
 
 def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: int = 960) -> np.ndarray:
-    """The left image (BGR uint8), enlarged to about `width`, with landmarks, moving features, boxes and axes.
-
-    Args:
-        image: left image of the frame.
-        result: of the step.
-        rig: the cameras.
-        width: of the picture [px].
-    """
+    """The left image of a step (BGR uint8), enlarged to about `width` [px], with landmarks, boxes and axes."""
     import cv2
 
     picture = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     scale = max(1, round(width / picture.shape[1]))
     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     corners = [_draw_object(picture, thing, result, rig, scale) for thing in result.objects]
-    moving = np.zeros(len(result.features), bool)
-    moving[result.moving_features] = True
-    beacons = result.matched_features[~moving[result.matched_features]]
+    beacons = result.matched_features[~np.isin(result.matched_features, result.moving_features)]
     radius = max(2 * scale, _LEAST_RADIUS)
-    for rows, colour in ((beacons, _BEACON), (result.added_features, _NEW)):
+    for rows, circles in (
+        (beacons, [(radius, _BEACON, 1)]),
+        (result.added_features, [(radius, _NEW, 1)]),
+        (np.unique(result.moving_features), [(radius + 1, _RING, 1), (radius, _MOVING, 2)]),
+    ):
         for u, v in result.features.uv_left[rows]:
-            cv2.circle(picture, _pixel(u, v, scale), radius, colour, 1, cv2.LINE_AA)
-    for u, v in result.features.uv_left[moving]:
-        cv2.circle(picture, _pixel(u, v, scale), radius + 1, _RING, 1, cv2.LINE_AA)
-        cv2.circle(picture, _pixel(u, v, scale), radius, _MOVING, 2, cv2.LINE_AA)
+            for size, colour, thickness in circles:
+                cv2.circle(picture, _pixel(u, v, scale), size, colour, thickness, cv2.LINE_AA)
     for thing, pixels in zip(result.objects, corners):  # over all else
         _draw_label(picture, thing, pixels, scale)
     return picture
@@ -89,23 +89,24 @@ def with_legend(picture: np.ndarray, bodies: Sequence[MovingObject] = ()) -> np.
     return np.concatenate([picture, bar])
 
 
-def _draw_object(
-    picture: np.ndarray, thing: MovingObject, result: FrameResult, rig: StereoRig, scale: int
-) -> Array:  # fmt: skip
+def _draw_object(picture: np.ndarray, thing: MovingObject, result: FrameResult, rig: StereoRig, scale: int) -> Array:
     """Box and axes of one body, a dashed box alone where it is not measured; returns the box's corners (8, 2) [px]."""
+    import cv2
+
     T_left_object = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
     lower, upper = thing.extent
     corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
-    colour = body_colour(thing.id)
-    measured = thing.estimate.measured
-    thickness = 2 if measured else 1
-    for a, b in _EDGES:
-        _line(picture, rig, transform(T_left_object, np.linspace(corners[a], corners[b], _PARTS)), colour, thickness,
-              scale, dashed=not measured)  # fmt: skip
-    length = 0.6 * max(float((upper - lower).max()), 1e-3)
-    for axis, axis_colour in enumerate(_AXES if measured else ()):
-        ends = np.linspace(np.zeros(3), length * np.eye(3)[axis], _PARTS)
-        _line(picture, rig, transform(T_left_object, ends), axis_colour, 2 * thickness, scale)
+    measured, length = thing.estimate.measured, 0.6 * max(float((upper - lower).max()), 1e-3)
+    lines = [(corners[a], corners[b], body_colour(thing.id), 1 + measured) for a, b in _EDGES]
+    for axis, colour in enumerate(_AXES if measured else ()):
+        lines.append((np.zeros(3), length * np.eye(3)[axis], colour, 4))
+    for begin, end, colour, thickness in lines:
+        uv = rig.left.project(transform(T_left_object, np.linspace(begin, end, _PARTS)))
+        seen = np.asarray((np.abs(np.nan_to_num(uv, nan=np.inf)) < 20 * rig.width).all(axis=1))  # not behind it
+        for i in range(0, _PARTS - 1, 1 if measured else 2):
+            if seen[i] and seen[i + 1]:
+                a, b = (_pixel(uv[j, 0], uv[j, 1], scale) for j in (i, i + 1))
+                cv2.line(picture, a, b, colour, thickness, cv2.LINE_AA)
     return rig.left.project(transform(T_left_object, corners))
 
 
@@ -127,30 +128,65 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
     cv2.putText(picture, text, (x, y), _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
 
 
-def _line(
-    picture: np.ndarray, rig: StereoRig, points: Array, colour: tuple[int, int, int], thickness: int, scale: int,
-    dashed: bool = False,
-) -> None:  # fmt: skip
-    """A polyline through points (N, 3) in left-camera coordinates; pieces behind the camera are left out."""
-    import cv2
-
-    uv = rig.left.project(points)
-    limit = 20 * rig.width
-    good = np.asarray((np.abs(np.nan_to_num(uv, nan=2.0 * limit)) < limit).all(axis=1))
-    for i in range(0, len(points) - 1, 2 if dashed else 1):
-        if good[i] and good[i + 1]:
-            cv2.line(
-                picture,
-                _pixel(uv[i, 0], uv[i, 1], scale),
-                _pixel(uv[i + 1, 0], uv[i + 1, 1], scale),
-                colour,
-                thickness,
-                cv2.LINE_AA,
-            )
-
-
 def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
     return round(scale * (u + 0.5)), round(scale * (v + 0.5))
+
+
+class GrowingMap:
+    """Draws the map from above, frame by frame: old landmarks, those in the map, the path, and moving bodies.
+
+    The camera's first direction is upwards.
+
+    Args:
+        metres: that are shown; None for as many as suit the distance of the first landmarks.
+    """
+
+    def __init__(self, metres: float | None = None) -> None:
+        self._metres = metres
+        self._seen: dict[int, Array] = {}
+        self._path: list[Array] = []
+
+    def add(self, estimate: Estimate) -> None:
+        """Take in what is known after a frame, landmarks included."""
+        self._seen.update(zip(estimate.ids.tolist(), estimate.positions))
+        self._path.append(estimate.T_world_left[:3, 3])
+
+    def draw(self, estimate: Estimate, result: FrameResult, side: int) -> np.ndarray:
+        """A square picture (side, side, 3), BGR uint8, around the camera."""
+        import cv2
+
+        if self._metres is None and len(estimate.positions):
+            distances = np.linalg.norm(estimate.positions - self._path[-1], axis=1)
+            self._metres = _REACH * float(np.percentile(distances, 90))
+        scale = side / (self._metres or 1.0)
+        picture = np.full((side, side, 3), 255, np.uint8)
+
+        def pixels(points: Array) -> np.ndarray:
+            across = scale * (np.reshape(points, (-1, 3)) - self._path[-1])[:, [0, 2]]
+            at = np.round([side / 2, side * (1 - _AHEAD)] + across * [1, -1])
+            return np.clip(at, -(10**6), 10**6).astype(np.int32)
+
+        for points, radius, colour in ((list(self._seen.values()), 1, _OLD), (estimate.positions, 2, _NOW)):
+            for at in pixels(np.array(points)).tolist():
+                cv2.circle(picture, at, radius, colour, -1, cv2.LINE_AA)
+        path = pixels(np.array(self._path))
+        cv2.polylines(picture, [path], False, _PATH, 2, cv2.LINE_AA)
+        cv2.circle(picture, path[-1].tolist(), 5, _PATH, -1, cv2.LINE_AA)
+        for body in result.objects:
+            colour, extent = body_colour(body.id), body.extent
+            corners = np.array([[extent[i, 0], 0, extent[j, 2]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
+            outline = pixels(transform(body.estimate.T_world_object, corners))
+            cv2.polylines(picture, [outline], True, colour, 2, cv2.LINE_AA)
+            place = body.estimate.T_world_object[:3, 3]
+            here, later = pixels(np.array([place, place + body.estimate.velocity[3:]])).tolist()  # in a second
+            cv2.arrowedLine(picture, here, later, colour, 2, cv2.LINE_AA, tipLength=0.25)
+        most = side / 5 / scale  # a bar of 1, 2 or 5 times a power of ten of metres
+        power = 10.0 ** np.floor(np.log10(most))
+        metres = power * max(factor for factor in (1, 2, 5) if factor * power <= most)
+        left = side - 12 - round(metres * scale)
+        cv2.line(picture, (left, side - 14), (side - 12, side - 14), _INK, 2)
+        cv2.putText(picture, f"{metres:g} m", (left, side - 20), _FONT, 0.8 * _TEXT, _INK, 1, cv2.LINE_AA)
+        return picture
 
 
 def output(path: Path) -> Output:
@@ -162,7 +198,7 @@ def output(path: Path) -> Output:
 class FramePictures:
     """Writes pictures of frames to a folder of PNG files, or to a video where the path ends in ``.mp4``.
 
-    The video's rate is that of the first two frames.
+    The video's rate is that of the first two frames; a single picture is shown for a second.
 
     Args:
         path: folder or video.
@@ -194,45 +230,37 @@ class FramePictures:
             estimate = system.estimate()
             self._map.add(estimate)
             picture = np.hstack([picture, self._map.draw(estimate, result, len(picture))])
-        self.add(frame.index, frame.stamp, with_legend(picture, result.objects))
-
-    def add(self, number: int, stamp: float, picture: np.ndarray) -> None:
-        """Append one picture, `number` in its sequence, taken at `stamp` [s]."""
+        picture = with_legend(picture, result.objects)
         if not self._film:
-            file = self.path / f"{number:0{_DIGITS}d}.png"
+            file = self.path / f"{frame.index:0{_DIGITS}d}.png"
             try:
                 write_png(file, picture)
             except OSError as error:
                 raise SlamError(f"{file}: cannot be written: {reason(error)}") from error
         elif self._first is None:
-            self._first = (stamp, picture)
+            self._first = (frame.stamp, picture)
         else:
             if self._video is None:
-                self._video = self._opened(1.0 / (stamp - self._first[0]))
+                self._open(1.0 / (frame.stamp - self._first[0]))
             self._video.write(picture)
 
-    def _opened(self, rate: float) -> Any:
-        """The video, with the first picture in it."""
+    def _open(self, rate: float) -> None:
+        """Begin the video with the first picture."""
         import cv2
 
         assert self._first is not None
         picture = self._first[1]
         size = (picture.shape[1], picture.shape[0])
-        video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-        if not video.isOpened():
+        self._video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        if not self._video.isOpened():
             raise SlamError(f"{self.path}: cannot be written")
-        video.write(picture)
-        return video
-
-    def close(self) -> None:
-        """Finish the video; a single picture is shown for a second."""
-        if self._video is None and self._first is not None:
-            self._video = self._opened(1.0)
-        if self._video is not None:
-            self._video.release()
+        self._video.write(picture)
 
     def __enter__(self) -> FramePictures:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.close()
+        if self._video is None and self._first is not None:
+            self._open(1.0)
+        if self._video is not None:
+            self._video.release()

@@ -19,37 +19,22 @@ _MOST_FRAMES = 10**12  # of a sequence: more than any has
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What to run and where to leave the files.
-
-    Attributes:
-        backend, frontend: names.
-        config: all settings.
-        out: folder for the files.
-        start, stop: range of frames; `stop` None for all.
-        record: file for a recording of what the back end is given, see `slam.run.replay`; None for none.
-        prior_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
-        save_map: file for the map at the end; None for none.
-        calibration: file with what is known of the rig's error, see `slam.calibration.saved`; None for nothing.
-        mono: use the left images alone.
-        overlap: read and extract the next frame while the present one is estimated; the results are the same.
-        live: take frames at their own rate, and leave out those that come too late; of a camera always.
-        origin: goes into ``config.json`` as it is: what else it takes to repeat the run, see `slam.run.repeat`.
-    """
+    """What to run and where to leave the files."""
 
     backend: str
     frontend: str
     config: SystemConfig
-    out: Path
+    out: Path  # folder for the files
     start: int = 0
-    stop: int | None = None
-    record: Path | None = None
-    prior_map: Path | None = None
-    save_map: Path | None = None
-    calibration: Path | None = None
-    mono: bool = False
-    overlap: bool = True
-    live: bool = False
-    origin: Mapping[str, Any] = field(default_factory=dict)
+    stop: int | None = None  # range of frames; None for all
+    record: Path | None = None  # file for a recording of what the back end is given, see `slam.run.replay`
+    prior_map: Path | None = None  # file of a map to start in, see `slam.mapping.map_io`; None to begin a new one
+    save_map: Path | None = None  # file for the map at the end
+    calibration: Path | None = None  # file with what is known of the rig's error, see `slam.calibration.saved`
+    mono: bool = False  # use the left images alone
+    overlap: bool = True  # read and extract the next frame while the present one is estimated; same results
+    live: bool = False  # take frames at their own rate, and leave out those that come too late; of a camera always
+    origin: Mapping[str, Any] = field(default_factory=dict)  # for ``config.json``: what else it takes to repeat the run
 
     @property
     def inputs(self) -> list[Path]:
@@ -67,11 +52,7 @@ class RunOptions:
 
 
 def parse_frames(text: str | None) -> tuple[int, int | None]:
-    """``A:B`` (either may be left out) as a range of frames.
-
-    Raises:
-        SlamError: not of that form.
-    """
+    """``A:B`` (either may be left out) as a range of frames; raises SlamError: not of that form."""
     if text is None:
         return 0, None
     first, colon, last = text.partition(":")

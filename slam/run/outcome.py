@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from slam.data import StereoFeatures
+from slam.geometry.arrays import BoolArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED, baseline_doubt
@@ -58,72 +59,82 @@ def outcome(
     tracked = frames - len(untracked)
     if frames < 1 or len(untracked) <= _MANY * frames:
         return ""
+    causes = []
     frozen = 2 * record.repeated > len(untracked)
     first = next((line for line in warnings if REPEATED not in line), "")
     if not first and not frozen:
         first = _cause(record, untracked, rig, in_map) or doubt
-    if not first and not frozen and dropped < frames:  # where most came, the gaps are hardly all of it
-        first = _any_cause(record, rig, driving)
-    causes = [first] if first else []
+        if not first and dropped < frames:  # where most came, the gaps are hardly all of it
+            first = _any_cause(record, rig, driving)
+    if first:
+        causes.append(first)
     if frozen:
         causes.append(f"in {record.repeated} of them {REPEATED}")
     if dropped:
-        few = "a frame was" if dropped == 1 else f"{dropped} frames were"
         causes.append(
-            f"{few} dropped, and the frames about them are far apart: make a frame cheaper (smaller images, --set "
-            "objects.mode=off), or move more slowly"
+            f"{'a frame was' if dropped == 1 else f'{dropped} frames were'} dropped, and the frames about them are far "
+            "apart: make a frame cheaper (smaller images, --set objects.mode=off), or move more slowly"
         )
-    return f"{_how_many(tracked, frames)}; likely cause: {'; and '.join(causes)}"
-
-
-def _how_many(tracked: int, frames: int) -> str:
-    """How many of the frames were tracked, or were not where these are fewer."""
     if not tracked:
-        return "no frame was tracked"
-    if 2 * tracked < frames:
-        return f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'} tracked"
-    return f"{frames - tracked} of {frames} frames {'was' if frames - tracked == 1 else 'were'} not tracked"
+        counted = "no frame was tracked"
+    elif 2 * tracked < frames:
+        counted = f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'} tracked"
+    else:
+        counted = f"{frames - tracked} of {frames} frames {'was' if frames - tracked == 1 else 'were'} not tracked"
+    return f"{counted}; likely cause: {'; and '.join(causes)}"
+
+
+def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:
+    """The first step that gave frames that were not tracked too little, and what to look at; empty where none did."""
+    features, stereo = np.median(np.array(record.features)[untracked], axis=0)
+    if features < ENOUGH_FEATURES:
+        return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
+    if 2 * record.hidden > len(untracked):
+        return f"in {record.hidden} of them {HIDDEN}"
+    if in_map:
+        return "the camera is not where the map was made, or the place looks different now"
+    without, missing = set(record.without_right), 0
+    for row in untracked:  # ascending: without a right image, or after such without a tracked one between
+        if row in without or row - 1 in without:
+            without.add(row)
+            missing += 1
+    if 2 * missing > len(untracked):
+        return (
+            f"{missing} of these {len(untracked)} frames have no right image or follow such, and nothing new can be "
+            "added to the map there: look for the missing images, and whether their names or times are the left ones'"
+        )
+    if stereo < ENOUGH_FEATURES:
+        return (
+            f"in the median of these frames {stereo:.0f} of {features:.0f} features are found in the right image: "
+            "check that the images are of two cameras, the left one first, and the calibration"
+        )
+    return baseline_doubt(rig)
 
 
 def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
     """What may be the cause where each step gave enough, with what is known."""
-    kind = "" if driving else "a vehicle's camera without --kind driving, "
-    depths = np.array(record.depths)[np.isfinite(record.depths)]
-    seen = f" and what they see is {_rounded(float(np.median(depths)))} m away in the median" if len(depths) else ""
+    depth, speeds = _depth(record), _speeds(record)
+    apart = f"the cameras are {rig.baseline:.3g} m apart"
+    if depth is not None:
+        apart += f" and what they see is {_rounded(depth)} m away in the median"
     if rig.baseline > _WIDEST[driving]:
         return (
-            f"by the calibration the cameras are {rig.baseline:.3g} m apart{seen}, which no hand carries: a baseline "
-            "in another unit (unit=cm, unit=mm), or a vehicle's camera without --kind driving"
+            f"by the calibration {apart}, which no hand carries: a baseline in another unit (unit=cm, unit=mm), or a "
+            "vehicle's camera without --kind driving"
+        )
+    moved, vehicle = "", "" if driving else "a vehicle's camera without --kind driving, "
+    if len(speeds):
+        turn, way = speeds.max(axis=0)
+        moved = (
+            f" (where it was tracked the camera moved at up to {_rounded(way)} m/s and turned at up to "
+            f"{_rounded(np.degrees(turn))}°/s)"
         )
     return (
-        f"features are found in both images, but not again in the next frame: {kind}frames too far apart"
-        f"{_speed(record)}, images that are not in order of time or have other times than theirs (fps=…, times=…), or "
-        f"the calibration of another camera or in another unit: by it the cameras are {rig.baseline:.3g} m apart{seen}"
+        "features are found in both images, but not again in the next frame: "
+        f"{vehicle}frames too far apart{moved}, images that "
+        "are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of another "
+        f"camera or in another unit: by it {apart}"
     )
-
-
-def _rounded(value: float) -> str:
-    """Two digits, without an exponent."""
-    return f"{float(f'{value:.2g}'):g}"
-
-
-def _speeds(record: RunRecord) -> Array:
-    """Turn rates [rad/s] and speeds [m/s] (N, 2) where two successive frames were tracked."""
-    measured = np.array(record.measured, bool)
-    both = measured[1:] & measured[:-1]
-    poses = np.array(record.poses).reshape(-1, 4, 4)
-    moved = log(inverse(poses[:-1]) @ poses[1:])[both] / np.diff(record.stamps)[both, None]
-    return np.linalg.norm(moved.reshape(-1, 2, 3), axis=2)
-
-
-def _speed(record: RunRecord) -> str:
-    """How fast the camera was where two successive frames were tracked; empty where there are none."""
-    speeds = _speeds(record)
-    if not len(speeds):
-        return ""
-    turn, way = speeds.max(axis=0)
-    fastest = f"{_rounded(way)} m/s and turned at up to {_rounded(np.degrees(turn))}°/s"
-    return f" (where it was tracked the camera moved at up to {fastest})"
 
 
 def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str:
@@ -132,30 +143,18 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     A baseline that is k times too long makes path, speed and distances k times too large, and no residual shows it.
     Empty where they are possible, or too few are known.
     """
-    speeds, depths = _speeds(record), np.array(record.depths)[np.isfinite(record.depths)]
-    if len(speeds) < _LEAST_CHANGES or not len(depths):
+    speeds, depth = _speeds(record), _depth(record)
+    if len(speeds) < _LEAST_CHANGES or depth is None:
         return ""
-    speed, depth = float(np.median(speeds[:, 1])), float(np.median(depths))
-    if speed <= _FASTEST[driving] and depth >= _NEAREST[driving] and rig.baseline <= _WIDEST[driving]:
-        return ""
+    asked = f"by the calibration the cameras are {rig.baseline:.3g} m apart; is that in metres? (unit=cm, unit=mm)"
+    speed = float(np.median(speeds[:, 1]))
     if speed <= _FASTEST[driving] and depth >= _NEAREST[driving]:
-        return f"by the calibration the cameras are {rig.baseline:.3g} m apart; is that in metres? (unit=cm, unit=mm)"
+        return asked if rig.baseline > _WIDEST[driving] else ""
     carrier = "no vehicle does" if driving else "no camera in a hand does (is it a vehicle's: --kind driving?)"
     return (
         f"the camera moved at {_rounded(speed)} m/s and saw things {_rounded(depth)} m away in the median, which "
-        f"{carrier}: by the calibration the cameras are {rig.baseline:.3g} m apart; is that in metres? "
-        "(unit=cm, unit=mm)"
+        f"{carrier}: {asked}"
     )
-
-
-def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
-    """Depth [m] of the feature with the median disparity; NaN where none has a right pixel."""
-    stereo = np.flatnonzero(features.has_stereo)
-    if not len(stereo):
-        return float("nan")
-    left, right = features.uv_left[stereo], features.uv_right[stereo]
-    middle = [np.argsort(left[:, 0] - right[:, 0], kind="stable")[len(stereo) // 2]]
-    return float(rig.triangulate(left[middle], right[middle])[0, 2])
 
 
 def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) -> str:
@@ -164,20 +163,17 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     Times in another unit or of another rate do so, and a vehicle that is taken for a camera in a hand, unless the
     motion is known to be that of a vehicle. Empty where the motion is as expected.
     """
-    measured = np.array(record.measured, bool)
-    stamps, poses = np.array(record.stamps), np.array(record.poses).reshape(-1, 4, 4)
-    if len(stamps) < _LEAST_CHANGES + 2:
+    velocities, both, durations = _velocities(record)
+    if len(velocities) < _LEAST_CHANGES + 1:
         return ""
-    durations = np.diff(stamps)
-    velocities = log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None]  # of the camera, in its own axes
     between = 0.5 * (durations[1:] + durations[:-1])[:, None]
     densities = np.repeat([motion.angular_acceleration, motion.acceleration], 3)
     changes = np.diff(velocities, axis=0) / (np.sqrt(between) * densities)
-    counted = changes[measured[2:] & measured[1:-1] & measured[:-2]]
+    counted = changes[both[1:] & both[:-1]]
     if len(counted) < _LEAST_CHANGES:
         return ""
     if driving:
-        along = np.abs(velocities[measured[1:] & measured[:-1], 3:])
+        along = np.abs(velocities[both, 3:])
         aside = along[(along[:, 0] > _ASIDE) & (along[:, 0] > along[:, 2]), 0]
         if len(aside) >= _LEAST_CHANGES:
             return (
@@ -200,34 +196,35 @@ def nothing_tracked(summary: dict[str, Any]) -> bool:
     return summary["frames"] > 1 and not summary["status"].get(_TRACKED)
 
 
-def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:
-    """The first step that gave frames that were not tracked too little, and what to look at; empty where none did."""
-    features, stereo = np.median(np.array(record.features)[untracked], axis=0)
-    if features < ENOUGH_FEATURES:
-        return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
-    if 2 * record.hidden > len(untracked):
-        return f"in {record.hidden} of them {HIDDEN}"
-    if in_map:
-        return "the camera is not where the map was made, or the place looks different now"
-    missing = _by_missing_images(record, untracked)
-    if 2 * missing > len(untracked):
-        return (
-            f"{missing} of these {len(untracked)} frames have no right image or follow such, and nothing new can be "
-            "added to the map there: look for the missing images, and whether their names or times are the left ones'"
-        )
-    if stereo < ENOUGH_FEATURES:
-        return (
-            f"in the median of these frames {stereo:.0f} of {features:.0f} features are found in the right image: "
-            "check that the images are of two cameras, the left one first, and the calibration"
-        )
-    return baseline_doubt(rig)
+def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
+    """Depth [m] of the feature with the median disparity; NaN where none has a right pixel."""
+    stereo = np.flatnonzero(features.has_stereo)
+    if not len(stereo):
+        return float("nan")
+    left, right = features.uv_left[stereo], features.uv_right[stereo]
+    middle = [np.argsort(left[:, 0] - right[:, 0], kind="stable")[len(stereo) // 2]]
+    return float(rig.triangulate(left[middle], right[middle])[0, 2])
 
 
-def _by_missing_images(record: RunRecord, untracked: Sequence[int]) -> int:
-    """Number of untracked frames that have no right image, or follow such without a tracked one between."""
-    without, count = set(record.without_right), 0
-    for row in untracked:  # ascending
-        if row in without or row - 1 in without:
-            without.add(row)
-            count += 1
-    return count
+def _velocities(record: RunRecord) -> tuple[Array, BoolArray, Array]:
+    """Velocities (N, 6) between frames in the camera's axes [rad/s, m/s], whether both were measured, times [s]."""
+    measured, durations = np.array(record.measured, bool), np.diff(record.stamps)
+    poses = np.array(record.poses).reshape(-1, 4, 4)
+    return log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None], measured[1:] & measured[:-1], durations
+
+
+def _speeds(record: RunRecord) -> Array:
+    """Turn rates [rad/s] and speeds [m/s] (N, 2) where two successive frames were tracked."""
+    velocities, both, _ = _velocities(record)
+    return np.linalg.norm(velocities[both].reshape(-1, 2, 3), axis=2)
+
+
+def _depth(record: RunRecord) -> float | None:
+    """Median distance of what the frames see [m]; None where none is known."""
+    depths = np.array(record.depths)[np.isfinite(record.depths)]
+    return float(np.median(depths)) if len(depths) else None
+
+
+def _rounded(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"

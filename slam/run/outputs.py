@@ -10,7 +10,6 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -41,10 +40,11 @@ _NUMBER = r"\s+(?:-?\d[-+.\deE]*|null)"
 _NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\s+\]")  # as json indents them; no text holds a line break
 
 
-class RunFiles:
+class RunFiles(ExitStack):
     """Writer of a run's folder; a context manager that closes the files.
 
-    The folder is locked meanwhile: two runs in one would spoil each other's files.
+    The folder is locked meanwhile: two runs in one would spoil each other's files. Each method raises SlamError where a
+    file cannot be written: a whole one is then as it was, and of rows those before stay.
 
     Args:
         folder: made if it does not exist; files of an earlier run in it are overwritten.
@@ -54,70 +54,63 @@ class RunFiles:
     """
 
     def __init__(self, folder: Path) -> None:
+        super().__init__()
         self.folder = folder
-        with ExitStack() as stack, naming_folder(folder):
+        with ExitStack() as opened, naming_folder(folder):
             folder.mkdir(parents=True, exist_ok=True)
             lock = lock_folder(folder)
             if lock is not None:
-                stack.callback(os.close, lock)
+                opened.callback(os.close, lock)
             for name in _WHOLE:
                 remove_file(folder / name)
             self._trajectory, self._frames, self._objects = (
-                stack.enter_context(closing(RowFile(folder / name))) for name in _ROWS
+                opened.enter_context(closing(RowFile(folder / name))) for name in _ROWS
             )
             self._frames.write(csv_rows([FRAME_COLUMNS]))
             self._objects.write(csv_rows([OBJECT_COLUMNS]))
-            self._stack = stack.pop_all()
-
-    def __enter__(self) -> RunFiles:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.close()
+            self.enter_context(opened.pop_all())
 
     def write_frame(self, number: int, result: FrameResult, loop: int | str = "", refused: int | str = "") -> None:
-        """Append one frame to trajectory.txt, frames.csv and objects.csv.
+        """Append one frame, `number` in its sequence, to trajectory.txt, frames.csv and objects.csv.
 
-        Args:
-            number: of the frame in its sequence.
-            result: of its step.
-            loop: number of the frame whose place it shows again, where it closed a loop, or ``map``.
-            refused: the same of a place that it only seemed to show again.
-
-        Raises:
-            SlamError: a row cannot be written whole; those before stay.
+        `loop` is the number of the frame whose place it shows again, where it closed a loop, or ``map``; `refused` the
+        same of a place that it only seemed to show again.
         """
-        e, r = result.estimate, result.report
-        row: list[Any] = [number, f"{e.stamp:.9f}", result.status.value, result.reason]
-        features = result.features
-        row += [len(features), int(features.has_stereo.sum()), result.predicted]
-        row += [len(result.matched), len(r.used), len(r.rejected)]
-        row += [len(result.added), len(result.erased), result.map_size]
-        deviations = _deviations(e) if result.located else [float("nan")] * 4
-        row += [int(result.keyframe), loop, refused]
-        row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, deviations)]
-        row += [f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES]
-        line = tum_line(e.stamp, e.T_world_left) if result.located else ""
+        e, r, features = result.estimate, result.report, result.features
+        sigmas = [float("nan")] * 4
+        if result.located:
+            R, P = e.T_world_left[:3, :3], e.covariance
+            position = np.sqrt(np.maximum(np.diag(R @ P[3:, 3:] @ R.T), 0))
+            sigmas = [*position, float(np.sqrt(max(np.trace(P[:3, :3]), 0.0)))]
+        row = [
+            number, f"{e.stamp:.9f}", result.status.value, result.reason,
+            len(features), int(features.has_stereo.sum()), result.predicted,
+            len(result.matched), len(r.used), len(r.rejected),
+            len(result.added), len(result.erased), result.map_size, int(result.keyframe), loop, refused,
+            _number(features.threshold), _number(r.nis), r.dof, *map(_number, sigmas),
+            *(f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES),
+        ]  # fmt: skip
         things = csv_rows(_object_row(number, thing) for thing in result.objects)
         with naming_folder(self.folder):
             self._frames.write(csv_rows([row]))
             self._objects.write(things)
-            self._trajectory.write(line)
-
-    def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
-        """Write a path to a file; raises SlamError where it cannot be written, and nothing is left of it."""
-        lines = (tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses))
-        write_text(self.folder / name, "".join(lines))
+            self._trajectory.write(tum_line(e.stamp, e.T_world_left) if result.located else "")
 
     def write_landmarks(self, estimate: Estimate, landmarks: LandmarkTable | None, numbers: list[int]) -> None:
-        """Write landmarks.csv; `numbers` are the frames' numbers by step. Raises as `write_trajectory`."""
-        rows = [] if landmarks is None else _landmark_rows(estimate, landmarks, numbers)
-        write_text(self.folder / "landmarks.csv", csv_rows([LANDMARK_COLUMNS, *rows]))
+        """Write landmarks.csv; `numbers` are the frames' numbers by step."""
+        rows: list[Sequence[Any]] = [LANDMARK_COLUMNS]
+        upper = np.triu_indices(3)
+        for i, position, covariance in zip(estimate.ids, estimate.positions, estimate.covariances):
+            if landmarks is not None:
+                at = int(landmarks.rows(np.array([i]))[0])
+                step = int(landmarks.last_seen[at])
+                last = numbers[step] if step >= 0 else ""  # empty: known from the start, and not seen yet
+                values = (f"{x:.9g}" for x in (*position, *covariance[upper]))
+                rows.append([int(i), *values, int(landmarks.seen[at]), last])
+        write_text(self.folder / "landmarks.csv", csv_rows(rows))
 
     def write_old_landmarks(self, atlas: Atlas, present: IdArray) -> None:
-        """Write landmarks_old.csv: of this run's keyframes, without those `present`; raises as `write_trajectory`."""
+        """Write landmarks_old.csv: of this run's keyframes, without those `present`."""
         found: dict[int, Array] = {}
         for keyframe, T in zip(atlas.keyframes[atlas.prior_count :], atlas.poses_in_map()[atlas.prior_count :]):
             rows = np.flatnonzero(~np.isin(keyframe.landmarks, [-1, *present]))
@@ -126,23 +119,25 @@ class RunFiles:
         lines = ([i, *(f"{x:.9g}" for x in found[i])] for i in sorted(found))
         write_text(self.folder / OLD_LANDMARKS, csv_rows([header(OLD_TABLE), *lines]))
 
-    def write_json(self, name: str, tree: dict[str, Any]) -> None:
-        """Write a JSON file at once or not at all; raises as `write_trajectory`."""
-        write_json(self.folder / name, tree)
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a path at once or not at all; raises SlamError where it cannot be written."""
+    write_text(path, "".join(tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses)))
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:
     """Write a JSON file at once or not at all; numbers that JSON cannot hold become null.
 
+    Each list of numbers stands on one line: a matrix has a line for each row.
+
     Raises:
         SlamError: it cannot be written.
     """
-    write_text(path, _rows_on_lines(json.dumps(_finite(tree), indent=2)) + "\n")
 
+    def on_one_line(found: re.Match[str]) -> str:
+        return "[" + ", ".join(found[0][1:-1].replace(",", " ").split()) + "]"
 
-def _rows_on_lines(text: str) -> str:
-    """JSON with each list of numbers on one line: a matrix has a line for each row."""
-    return _NUMBERS.sub(lambda found: "[" + ", ".join(found[0][1:-1].replace(",", " ").split()) + "]", text)
+    write_text(path, _NUMBERS.sub(on_one_line, json.dumps(_finite(tree), indent=2)) + "\n")
 
 
 @contextmanager
@@ -167,37 +162,14 @@ def csv_rows(rows: Iterable[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
-def _landmark_rows(estimate: Estimate, landmarks: LandmarkTable, numbers: list[int]) -> Iterator[list[Any]]:
-    """A row of landmarks.csv for each landmark."""
-    upper = np.triu_indices(3)
-    for i, position, covariance in zip(estimate.ids, estimate.positions, estimate.covariances):
-        at = int(landmarks.rows(np.array([i]))[0])
-        values = (f"{x:.9g}" for x in (*position, *covariance[upper]))
-        step = int(landmarks.last_seen[at])
-        last = numbers[step] if step >= 0 else ""  # empty: known from the start, and not seen yet
-        yield [int(i), *values, int(landmarks.seen[at]), last]
-
-
 def _object_row(number: int, thing: MovingObject) -> list[Any]:
     """A row of `slam.run.schema.OBJECT_TABLE` for a body in frame `number`."""
     e = thing.estimate
-    numbers = [*_pose_numbers(e.T_world_object), *e.velocity[3:], *e.velocity[:3]]
-    numbers += [*_pose_numbers(thing.motion), *e.covariance[np.triu_indices(6)]]
+    places = [[*T[:3, 3], *angles(T[:3, :3])] for T in (e.T_world_object, thing.motion)]
+    numbers = [*places[0], *e.velocity[3:], *e.velocity[:3], *places[1], *e.covariance[np.triu_indices(6)]]
     seen = f"{thing.measured_at:.9f}" if np.isfinite(thing.measured_at) else ""
     flags = [int(thing.moving), int(e.measured), seen, f"{thing.existence:.6f}"]
     return [number, f"{e.stamp:.9f}", thing.id, *flags, *(f"{x:.9g}" for x in numbers)]
-
-
-def _pose_numbers(T: Array) -> list[float]:
-    """x, y, z [m], roll, pitch, yaw [rad]."""
-    return [*map(float, T[:3, 3]), *map(float, angles(T[:3, :3]))]
-
-
-def _deviations(estimate: Estimate) -> list[float]:
-    """Standard deviations of the position in world axes [m], and of the rotation all axes together [rad]."""
-    R, P = estimate.T_world_left[:3, :3], estimate.covariance
-    position = np.diag(R @ P[3:, 3:] @ R.T)
-    return [*np.sqrt(np.maximum(position, 0)), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0)))]
 
 
 def _number(value: float) -> str:

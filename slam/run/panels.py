@@ -4,69 +4,185 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slam.geometry.se3 import inverse
+from slam.evaluation.metrics import associate
+from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import draw_map, draw_path, is_revised, place_of_truth, pose_errors, stretch, well_known, widths
-from slam.run.run_data import RunData
+from slam.run.run_data import RunData, place_of_truth, pose_errors, reach, well_known
 from slam.run.schema import STAGE_NAMES
-from slam.run.style import DASHES, STAGE_COLOURS, backend_colours
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
+_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#00838f", "iekf": "#ad1457"}
+_OTHERS = ("#2e7d32", "#c62828", "#5d4037", "#9e9d24")
+_STAGES = {
+    "read": "#bdbdbd", "extract": "#1565c0", "predict": "#90caf9", "associate": "#ef6c00", "update": "#c62828",
+    "estimate": "#f48fb1", "objects": "#6a1b9a", "manage": "#2e7d32", "atlas": "#00838f",
+}  # fmt: skip
+_TRUTH, _OLD = "0.3", "0.75"
+_LANDMARKS = {"not seen now": ("#7cb342", ".", 2.0), "seen now": ("#c62828", "^", 3.5)}  # told apart by shape, too
+_CORRECTED, _CLOSED, _REFUSED = "#4527a0", "0.1", "#d81b60"  # what loops do
+_BODIES = ("#00838f", "#6a1b9a", "#5d4037", "#ad1457")
+_DASHES = ("-", "--", ":", "-.")  # around bands: where those of two back ends are equal, both are seen
+_STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
+_SIGMAS = 2.0  # size of ellipses
 _LETTER = 0.6  # mean width of a letter in sizes of the font
-_TRUTH = "0.25"
-_AXES = ("right", "down", "forward", "rotation")
-_HEADROOM = 1.2  # height of a map over that of what it shows: room for the legend
+_LEAST_SHARE = 0.002  # of the longest time: a stage below it is not seen, and not named
+_MAP_RATIO = 1.15  # width of a map over its height
+
+
+def backend_colours(backends: Sequence[str]) -> list[str]:
+    """A colour for each of the runs in a picture, by the names of their back ends.
+
+    A built-in back end has the same colour in all pictures, in whatever order. Others, and further runs of the same
+    back end, have the next colour that is left.
+    """
+    left = cycle([*_OTHERS, *(colour for name, colour in _BACKENDS.items() if name not in backends)])
+    own = dict(_BACKENDS)
+    return [own.pop(name) if name in own else next(left) for name in backends]
+
+
+def widths(count: int) -> Array:
+    """Widths of lines (N,), the first the widest: where lines coincide, each is seen beside the one drawn over it."""
+    return 1 + 1.2 * np.arange(count)[::-1]
+
+
+# ------------------------------------------------------------------------------------------------ path and map
 
 
 def path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     """The paths from above, in the world of the first run, and the true one."""
-    paths, truth = in_one_world(runs)
+    paths, truth = _in_one_world(runs)
     if truth is not None:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
-    for colour, width, run, path in zip(colours(runs), 2.0 * widths(len(runs)), runs, paths):
-        draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
+    for colour, width, run, path in zip(_colours(runs), 2.0 * widths(len(runs)), runs, paths):
+        _draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
-        if is_revised(run):
+        if _is_revised(run):
             final = path.poses[0] @ inverse(run.online.poses[0]) @ run.final.poses
             axis.plot(*final[:, [0, 2], 3].T, ":", color=colour, lw=0.7 * width, label=f"{run.name}, final")
-    set_title(axis, "Path from above, online unless said otherwise (dot: start)")
+    set_title(axis, "Path from above, online (dot: start)")
     axis.set(xlabel="right [m]", ylabel="forward [m]")
     shown = paths if truth is None else [*paths, truth]
-    if not stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in shown])):
+    if not _stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in shown])):
         axis.set_aspect("equal", adjustable="datalim")
-    axis.legend(frameon=False)
+    axis.legend(frameon=True, framealpha=0.8, edgecolor="none")
+    axis.locator_params(axis="x", nbins=6)
     axis.grid(color="0.9", lw=0.5)
 
 
-def colours(runs: Sequence[RunData]) -> list[str]:
-    """A colour for each run."""
-    return backend_colours([run.backend for run in runs])
+def map_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
+    """Each run's map from above: landmarks with the ellipses of those well known, path, loops, bodies; one legend."""
+    for axis, run, colour in zip(axes, runs, _colours(runs)):
+        _draw_map(axis, run, colour)
+        known, every = len(well_known(run)), len(run.positions)
+        shown = "2σ ellipses" if known == every else f"2σ ellipses of {known}"  # the others would cover these
+        set_title(axis, f"Map of {run.name}: {every} landmarks, {shown}")
+    _legend_below(axes)
 
 
-def map_panel(axis: Axes, run: RunData, colour: str) -> None:
-    """The map from above with ellipses."""
-    draw_map(axis, run, colour)
-    _widen(axis)
-    axis.set_ylim(top=axis.get_ylim()[0] + _HEADROOM * float(np.ptp(axis.get_ylim())))
-    known, every = len(well_known(run)), len(run.positions)
-    shown = "2σ ellipses" if known == every else f"2σ ellipses of {known}"  # the others would cover these
-    set_title(axis, f"Map of {run.name}: {every} landmarks, {shown}")
-    axis.legend(loc="upper left", ncols=2, fontsize="small", frameon=True, framealpha=0.8, edgecolor="none")
+def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
+    from matplotlib.collections import EllipseCollection
+
+    plane = run.covariances[:, [0, 2]][:, :, [0, 2]]
+    values, vectors = np.linalg.eigh(plane) if len(plane) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    known = np.isin(np.arange(len(run.positions)), well_known(run))
+    for rows, (label, (shade, mark, size)) in zip((~run.seen_last, run.seen_last), _LANDMARKS.items()):
+        sure = rows & known
+        ellipses = EllipseCollection(
+            width[sure, 1], width[sure, 0], angle[sure], units="xy", offsets=run.positions[sure][:, [0, 2]],
+            offset_transform=axis.transData, facecolors="none", edgecolors=shade, linewidths=0.8,
+        )  # fmt: skip
+        axis.add_collection(ellipses)
+        axis.plot(*run.positions[rows][:, [0, 2]].T, mark, ms=size, color=shade, label=f"landmarks {label}")
+    if len(run.old):
+        axis.plot(*run.old[:, [0, 2]].T, ".", ms=1.5, color=_OLD, zorder=0, label="landmarks before")
+    _draw_path(axis, run, run.online, f"path of {run.name}, online", color=colour, lw=3, alpha=0.6)
+    final = run.final.positions[:, [0, 2]]
+    if _is_revised(run):
+        axis.plot(*final.T, color=_CORRECTED, lw=1.2, label="path, final")
+    if len(run.loops):
+        axis.plot(*final[run.keyframes].T, ".", ms=3, color=_CORRECTED, label="keyframes")
+        axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=_CLOSED, label="loops closed")
+    if len(run.refused):
+        axis.plot(*final[run.refused[:, 0]].T, "x", ms=5, color=_REFUSED, label="loops refused")
+    for positions, shade in zip(run.bodies.values(), cycle(_BODIES)):
+        axis.plot(*positions[:, [0, 2]].T, "-s", ms=4, lw=1.5, markevery=[-1], color=shade, label="moving bodies")
+    if run.truth is not None:
+        _, true = associate(run.online, run.truth, 0.02, interpolated=True)
+        T = place_of_truth(run, run.truth)
+        points = true.positions @ T[:3, :3].T + T[:3, 3]
+        axis.plot(*points[:, [0, 2]].T, "--", color=_TRUTH, lw=1.2, label="true path")
+    axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
+    _limit_map(axis, run)
 
 
-def _widen(axis: Axes, ratio: float = 1.15) -> None:
-    """Widen the limits of one direction until width over height are about those of the panel."""
-    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
-    width, height = right - left, top - bottom
-    wider, higher = max(0.0, ratio * height - width) / 2, max(0.0, width / ratio - height) / 2
-    axis.set(xlim=(left - wider, right + wider), ylim=(bottom - higher, top + higher))
+def _limit_map(axis: Axes, run: RunData) -> None:
+    """Limits that hold the path and the well-known landmarks with their ellipses, in the ratio of a panel."""
+    known = well_known(run)
+    near = np.linalg.norm(run.old - run.online.positions.mean(axis=0), axis=1) < reach(run)
+    points = np.concatenate([run.positions[known], run.online.positions, run.final.positions, run.old[near]])[:, [0, 2]]
+    around = np.zeros_like(points)
+    around[: len(known)] = _SIGMAS * np.sqrt(np.diagonal(run.covariances[known], axis1=1, axis2=2)[:, [0, 2]])
+    low, high = (points - around).min(axis=0), (points + around).max(axis=0)
+    width, height = high - low + 0.1 * float((high - low).max()) + 0.2
+    half = 0.5 * np.array([max(width, _MAP_RATIO * height), max(height, width / _MAP_RATIO)])
+    (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
+    axis.set(xlim=(left, right), ylim=(bottom, top))
+
+
+def _draw_path(axis: Axes, run: RunData, path: Trajectory, label: str, **style: Any) -> None:
+    """A run's path from above in any world; dotted where the camera was not tracked."""
+    points = path.positions[:, [0, 2]]
+    axis.plot(*np.where(run.measured[:, None], points, np.nan).T, label=label, **style)
+    if not run.measured.all():
+        axis.plot(*points.T, label=f"{label}, not tracked", **{**style, "lw": 1, "ls": ":"})
+
+
+def _is_revised(run: RunData) -> bool:
+    """Whether the final path is another than the online one."""
+    same = len(run.final) == len(run.online)
+    return not (same and np.allclose(run.final.poses, run.online.poses, rtol=0, atol=1e-6))
+
+
+def _stretch(axis: Axes, points: np.ndarray) -> bool:
+    """Give each axis a scale of its own where points (N, 2) lie nearly in a line along one; whether it did."""
+    extent = np.ptp(points, axis=0)
+    narrow = int(np.argmin(extent))
+    if not extent[narrow] * _STRAIGHT < extent[1 - narrow]:
+        return False
+    half = 0.6 * max(float(extent[narrow]), 0.01 * float(extent[1 - narrow]))  # what is straight is not blown up
+    middle = float(points[:, narrow].max() + points[:, narrow].min()) / 2
+    name, label = "xy"[narrow], (axis.get_xlabel, axis.get_ylabel)[narrow]()
+    axis.set(**{f"{name}lim": (middle - half, middle + half), f"{name}label": f"{label}, on a scale of its own"})
+    return True
+
+
+def _in_one_world(runs: Sequence[RunData]) -> tuple[list[Trajectory], Trajectory | None]:
+    """The online paths in the world of the first run that has a truth, and that truth; as they are where none has."""
+    first = next((run for run in runs if run.truth is not None), None)
+    if first is None or first.truth is None:
+        return [run.online for run in runs], None
+    to_first = place_of_truth(first, first.truth)
+    paths = []
+    for run in runs:
+        path = run.online
+        if run is not first and run.truth is not None:
+            in_truth = inverse(place_of_truth(run, run.truth)) @ path.poses
+            path = Trajectory(path.stamps, to_first @ in_truth)
+        paths.append(path)
+    return paths, Trajectory(first.truth.stamps, to_first @ first.truth.poses)
+
+
+# --------------------------------------------------------------------------------------------- errors and times
 
 
 def error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
@@ -74,10 +190,10 @@ def error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     known = any(run.truth is not None for run in runs)
     series = [pose_errors(run) for run in runs]
     shown = [(error if known else sigma)[:, :3] for _, error, sigma in series]
-    factor, unit = unit_of(max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0))
+    factor, unit = _unit_of(max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0))
     factors = np.array([factor, factor, factor, 1.0])
-    for i, (run, colour, (time, error, sigma)) in enumerate(zip(runs, colours(runs), series)):
-        dashes, width = DASHES[i % len(DASHES)], 1.1 * widths(len(runs))[i]
+    for i, (run, colour, (time, error, sigma)) in enumerate(zip(runs, _colours(runs), series)):
+        dashes, width = _DASHES[i % len(_DASHES)], 1.1 * widths(len(runs))[i]
         untracked = (run.online.stamps - run.online.stamps[:1])[~run.measured]
         for k, (axis, e, s) in enumerate(zip(axes, (factors * error).T, (factors * sigma).T)):
             if known:
@@ -90,7 +206,7 @@ def error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
             if len(untracked):
                 label = f"{run.name}, not tracked"
                 axis.plot(untracked, np.zeros(len(untracked)), "x", ms=4, color=colour, label=label)
-    for axis, name, of in zip(axes, _AXES, (unit, unit, unit, "deg")):
+    for axis, name, of in zip(axes, ("right", "down", "forward", "rotation"), (unit, unit, unit, "deg")):
         axis.set_ylabel(f"{name} [{of}]" if known else f"σ {name} [{of}]")
         axis.axhline(0, color="0.6", lw=0.5)
         axis.margins(x=0.01)
@@ -98,9 +214,8 @@ def error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     errors = f"Error of the online pose{turned}; band: ±3σ as claimed"
     set_title(axes[0], errors if known else "No true path is known, so no errors: claimed σ of the online pose")
     axes[-1].set_xlabel("time [s]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    if len(handles) > 1:  # a line alone is that of the one run
-        _legend_below(axes[0], handles, labels)
+    if len(axes[0].get_legend_handles_labels()[0]) > 1:  # a line alone is that of the one run
+        _legend_below(axes[:1])
 
 
 def time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
@@ -108,15 +223,15 @@ def time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
 
     Medians of stages do not add up to that of a frame: they are drawn in proportion.
     """
-    rows = np.arange(len(runs))[::-1]
-    left = np.zeros(len(runs))
-    totals = np.array([_median_of_later(np.sum(list(run.milliseconds.values()), axis=0)) for run in runs])
-    names = [stage for stage in STAGE_COLOURS if stage in runs[0].milliseconds]
-    parts = np.array([[_median_of_later(run.milliseconds[stage]) for run in runs] for stage in names])
+    rows, left = np.arange(len(runs))[::-1], np.zeros(len(runs))
+    later = [{name: ms[1:] if len(ms) > 1 else ms for name, ms in run.milliseconds.items()} for run in runs]
+    totals = np.array([np.median(np.sum(list(times.values()), axis=0)) for times in later])
+    names = [stage for stage in _STAGES if stage in later[0]]
+    parts = np.array([[np.median(times[stage]) for times in later] for stage in names])
     parts *= totals / np.maximum(parts.sum(axis=0), 1e-12)
     for stage, width in zip(names, parts):
-        if width.any():
-            axis.barh(rows, width, left=left, height=0.6, color=STAGE_COLOURS[stage], label=STAGE_NAMES[stage])
+        label = STAGE_NAMES[stage] if width.max() > _LEAST_SHARE * totals.max() else "_"
+        axis.barh(rows, width, left=left, height=0.6, color=_STAGES[stage], label=label)
         left += width
     for row, end, total in zip(rows, left, totals):
         axis.text(end, row, f" {total:.0f} ms" if total >= 100 else f" {total:.3g} ms", va="center", fontsize="small")
@@ -125,50 +240,22 @@ def time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     margin = 0.7 if len(runs) > 1 else 1.2
     axis.set(ylim=(-margin, len(runs) - 1 + margin))
     set_title(axis, "Median time of a frame, and the shares of its stages")
-    _legend_below(axis, *axis.get_legend_handles_labels())
+    _legend_below([axis])
 
 
-def _median_of_later(times: np.ndarray) -> float:
-    """The median of all frames but the first."""
-    return float(np.median(times[1:] if len(times) > 1 else times))
-
-
-def in_one_world(runs: Sequence[RunData]) -> tuple[list[Trajectory], Trajectory | None]:
-    """The online paths in the world of the first run that has a truth, and that truth; as they are where none has."""
-    first = next((run for run in runs if run.truth is not None), None)
-    if first is None or first.truth is None:
-        return [run.online for run in runs], None
-    to_first = place_of_truth(first, first.truth)
-    paths = []
-    for run in runs:
-        if run is first or run.truth is None:
-            paths.append(run.online)
-            continue
-        in_truth = inverse(place_of_truth(run, run.truth)) @ run.online.poses
-        paths.append(Trajectory(run.online.stamps, to_first @ in_truth))
-    return paths, Trajectory(first.truth.stamps, to_first @ first.truth.poses)
-
-
-def unit_of(largest: float) -> tuple[float, str]:
+def _unit_of(largest: float) -> tuple[float, str]:
     """Factor and name of the unit in which a length of so many metres reads best."""
     return (1.0, "m") if largest > 1 else (100.0, "cm") if largest > 0.01 else (1000.0, "mm")
 
 
+# -------------------------------------------------------------------------------------------- titles and legends
+
+
 def set_title(axis: Axes, text: str) -> None:
     """A title in as many lines as it takes."""
-    axis.set_title(wrapped(text, _width(axis)))
-
-
-def _width(axis: Axes) -> float:
-    """Width of a panel with what stands beside it [in]."""
     figure, grid = axis.figure, axis.get_gridspec()
-    return float(figure.bbox.width / figure.dpi) / (1 if grid is None else grid.ncols)
-
-
-def _legend_below(axis: Axes, handles: Sequence[Artist], labels: Sequence[str]) -> None:
-    """A legend below a panel in as many columns as there is room for, all of it inside the picture."""
-    columns = max(1, int(_width(axis) / (0.5 + 0.07 * max(map(len, labels), default=1))))
-    axis.figure.legend(handles, labels, loc="outside lower center", ncols=min(5, columns), frameon=False)
+    columns = 1 if grid is None else grid.ncols
+    axis.set_title(wrapped(text, 0.9 * figure.bbox.width / figure.dpi / columns))
 
 
 def wrapped(text: str, width: float) -> str:
@@ -176,3 +263,20 @@ def wrapped(text: str, width: float) -> str:
     from matplotlib import rcParams
 
     return textwrap.fill(text, int(72 * width / (_LETTER * rcParams["axes.titlesize"])))
+
+
+def _colours(runs: Sequence[RunData]) -> list[str]:
+    return backend_colours([run.backend for run in runs])
+
+
+def _legend_below(axes: Sequence[Axes]) -> None:
+    """One legend below some panels, each name once, in as many columns as there is room for inside the picture."""
+    from matplotlib import rcParams
+
+    names: dict[str, Artist] = {}
+    for axis in axes:
+        names |= {label: handle for handle, label in zip(*axis.get_legend_handles_labels()) if label not in names}
+    figure = axes[0].figure
+    letters = 72 * figure.bbox.width / figure.dpi / rcParams["legend.fontsize"]  # room, in heights of a letter
+    columns = max(1, int(letters / (4.8 + _LETTER * max(map(len, names), default=1))))  # a mark takes 4.8
+    figure.legend(list(names.values()), list(names), loc="outside lower center", ncols=min(5, columns), frameon=False)

@@ -5,7 +5,8 @@ Drawn without pyplot: there is no state to share, and it is loaded faster.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import logging
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +14,12 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
-from slam.errors import SlamError
-from slam.evaluation.consistency import verdict
-from slam.files import whole_file
+from slam.errors import ConfigurationError, SlamError
+from slam.files import noting_inputs, whole_file
 from slam.naming import unknown
-from slam.run.panels import colours, error_panels, map_panel, path_panel, time_panel, unit_of, wrapped
+from slam.outputs import Output, require_outputs
+from slam.run.panels import error_panels, map_panels, path_panel, time_panel, wrapped
+from slam.run.results import facts
 from slam.run.run_data import RunData
 
 if TYPE_CHECKING:
@@ -28,10 +30,9 @@ PICTURE = "summary.png"
 
 _MOST_MAPS = 3  # side by side in the summary
 _PAGE = 8.0  # [in] below which text is small, as in a paper
-_LEAST_HEIGHT = 9.4  # [in] of the summary, below which legends take the place of the panels
 _COLUMN = 5.0  # [in] below which panels do not stand side by side
 _STYLE: dict[str, Any] = {
-    "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 11, "legend.fontsize": 8, "svg.hashsalt": "slam",
+    "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 10, "legend.fontsize": 8, "svg.hashsalt": "slam",
     "pdf.fonttype": 42, "text.parse_math": False,
 }  # fmt: skip
 _SMALL_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
@@ -47,12 +48,34 @@ _METADATA: dict[str, dict[str, Any]] = {
 }
 
 
-def read_runs(folders: Sequence[Path]) -> list[list[RunData]]:
-    """Finished runs by sequence, in the order given; each has the shortest name that tells it from the others.
+def plot_folders(
+    folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None, overwrite: bool = False
+) -> list[tuple[Path, str]]:
+    """Draw finished runs, those of one sequence in one picture, as `plot` does; returns files and captions.
 
-    Raises:
-        SlamError: a folder does not hold a finished run.
+    Without `out`, a PNG goes to the first folder of each sequence. Raises SlamError where a folder is none of a
+    finished run, or a file cannot be written.
     """
+    with noting_inputs() as inputs:
+        groups = _read(folders)
+    if out is not None and len(groups) > 1:
+        names = ", ".join(runs[0].sequence for runs in groups)
+        raise ConfigurationError(f"runs of {len(groups)} sequences ({names}) do not go into one file: leave out --out")
+    files = [out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png") for runs in groups]
+    require_outputs([Output(file, "--out", makes_folder=True) for file in files], inputs, overwrite)
+    return [(file, plot(runs, file, kind, width)) for runs, file in zip(groups, files)]
+
+
+def leave_picture(folder: Path) -> None:
+    """The picture of a run that has just ended; where there is nothing to draw a warning says so."""
+    try:
+        plot(_read([folder])[0], folder / PICTURE)
+    except SlamError as error:
+        logging.getLogger(__name__).warning("no picture: %s", error)
+
+
+def _read(folders: Sequence[Path]) -> list[list[RunData]]:
+    """Finished runs by sequence, in the order given; each has the shortest name that tells it from the others."""
     found: dict[str, list[RunData]] = {}
     for folder in folders:
         run = RunData.read(folder, folder.resolve().name)
@@ -80,16 +103,17 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
     Raises:
         SlamError: the format or the kind is not known, the width is out of range, or the file cannot be written.
     """
-    if path.suffix.lower() not in _METADATA:
+    suffix = path.suffix.lower()
+    if suffix not in _METADATA:
         raise SlamError(f"{path}: a picture is a file .png, .pdf or .svg")
     if kind not in KINDS:
         raise SlamError(unknown("figure", kind, KINDS))
     if width is not None and not NARROWEST <= width <= WIDEST:
         raise SlamError(f"the width of a picture is {NARROWEST:g} to {WIDEST:g} mm, got {width:g}")
-    figure, caption = _drawn(runs, kind, width, titles=path.suffix.lower() == ".png" and width is None)
+    figure, caption = _drawn(runs, kind, width, titles=suffix == ".png" and width is None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        metadata = {"Title": _title(runs), **_METADATA[path.suffix.lower()]}
+        metadata = {"Title": _title(runs), **_METADATA[suffix]}
         with whole_file(path) as file, _style(width):
             figure.savefig(file, format=path.suffix[1:], dpi=110 if width is None else 300, metadata=metadata)
     except OSError as error:
@@ -125,40 +149,28 @@ def _style(width: float | None) -> AbstractContextManager[None]:
 def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
     """All at a glance: path and maps above, errors and times below; in a column one below the other."""
     maps = runs[:_MOST_MAPS]
-    parts = 1 + len(maps)
+    lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
+    heads = [wrapped(line, width or max(10.0, 4.4 * (1 + len(maps)))) for line in lines]
+    head = 0.17 * len("\n".join(heads).splitlines())
     if _is_column(width):
-        heights = [*[0.9 * width] * parts, _errors_height(width), _time_height(runs)]
-        figure = _figure(width, sum(heights))
-        *parts_above, left, right = np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights))
-        first, *others = (part.subplots() for part in parts_above)
+        heights = [0.9 * width, 0.95 * width * len(maps), max(width, 4.8), 1.9 + 0.4 * len(runs)]
+        figure = _figure(width, sum(heights) + head)
+        first, second, left, right = np.asarray(figure.subfigures(4, 1, height_ratios=heights))
+        path_axis, map_axes = first.subplots(), list(second.subplots(len(maps), 1, squeeze=False).ravel())
     else:
-        width = width or 5.0 * parts
-        figure = _figure(width, max(9.8 * (width / (5.0 * parts)), _LEAST_HEIGHT) + 0.25 * len(runs))
-        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(4.6, 5.2)))
-        first, *others = above.subplots(1, parts)
+        parts = 1 + len(maps)
+        width = width or max(10.0, 4.4 * parts)
+        side = width / parts
+        figure = _figure(width, 0.95 * side + 5.4 + head)
+        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(0.95 * side + 0.4, 5.0)))
         left, right = np.asarray(below.subfigures(1, 2))
-    path_panel(first, runs)
-    for axis, run, colour in zip(others, maps, colours(runs)):
-        map_panel(axis, run, colour)
+        path_axis, *map_axes = above.subplots(1, parts)
+    path_panel(path_axis, runs)
+    map_panels(map_axes, maps)
     error_panels(left.subplots(4, 1, sharex=True), runs)
     time_panel(right.subplots(), runs)
-    lines = [_title(runs), *(f"{run.name}: {facts}" for run in runs if (facts := _facts(run.summary)))]
-    figure.suptitle("\n".join(wrapped(line, figure.get_figwidth()) for line in lines))
+    figure.suptitle("\n".join(heads))
     return figure
-
-
-def _facts(summary: Mapping[str, Any]) -> str:
-    """What a run found, also where there is no truth, and whether its covariances hold, in one line."""
-    words = []
-    if summary.get("speed_m_per_s") is not None:
-        words.append(f"{summary['path_length_m']:.3g} m at {summary['speed_m_per_s']:.2g} m/s")
-        factor, unit = unit_of(summary["final_sigma_m"])
-        words.append(f"σ of the last position {factor * summary['final_sigma_m']:.2g} {unit}")
-    if "loops" in summary:
-        loops = summary["loops"]
-        words.append(f"loops closed {loops['closed']}, refused {loops['refused']}")
-        words.append(f"moving bodies {summary.get('bodies', 0)}")
-    return "; ".join([*words, *filter(None, [verdict(summary.get("consistency", {}))])])
 
 
 def _path(runs: Sequence[RunData], width: float | None) -> Figure:
@@ -170,20 +182,19 @@ def _path(runs: Sequence[RunData], width: float | None) -> Figure:
 def _map(runs: Sequence[RunData], width: float | None) -> Figure:
     rows, columns = (len(runs), 1) if _is_column(width) else (1, len(runs))
     width = width or 5.0 * columns
-    figure = _figure(width, 0.96 * width / columns * rows)
-    for axis, run, colour in zip(figure.subplots(rows, columns, squeeze=False).ravel(), runs, colours(runs)):
-        map_panel(axis, run, colour)
+    figure = _figure(width, width / columns * rows + 0.3)
+    map_panels(list(figure.subplots(rows, columns, squeeze=False).ravel()), runs)
     return figure
 
 
 def _errors(runs: Sequence[RunData], width: float | None) -> Figure:
-    figure = _figure(width or 6.0, _errors_height(width) if width else 5.6)
+    figure = _figure(width or 6.0, max(width, 4.8) if width else 5.6)  # below 4.8 in the labels of the axes overlap
     error_panels(figure.subplots(4, 1, sharex=True), runs)
     return figure
 
 
 def _time(runs: Sequence[RunData], width: float | None) -> Figure:
-    figure = _figure(width or 6.0, _time_height(runs))
+    figure = _figure(width or 6.0, 1.9 + 0.4 * len(runs))
     time_panel(figure.subplots(), runs)
     return figure
 
@@ -197,14 +208,6 @@ KINDS: dict[str, Callable[[Sequence[RunData], float | None], Figure]] = {
 def _is_column(width: float | None) -> TypeGuard[float]:
     """Whether a width [in] is that of a column, in which panels stand one below the other."""
     return width is not None and width < _COLUMN
-
-
-def _errors_height(width: float) -> float:
-    return max(width, 4.8)  # below which the labels of the four axes overlap
-
-
-def _time_height(runs: Sequence[RunData]) -> float:
-    return 1.9 + 0.4 * len(runs)
 
 
 def _title(runs: Sequence[RunData]) -> str:

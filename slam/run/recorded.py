@@ -88,12 +88,11 @@ class Recording:
             raise MeasurementError("recording: stamps must be finite and increase, with a number each")
         if len(stamps) and np.abs(stamps).max() > LATEST_STAMP:
             raise MeasurementError(f"recording: a stamp is beyond {LATEST_STAMP:g} s")
-        for what in ("observed", "added"):
-            _require_rows(what, [rows for frame in self.frames if len(rows := getattr(frame, what))])
         known: set[int] = set()
         for frame in self.frames:
-            if len(frame.observed) or len(frame.added) or len(frame.removed):
-                known = _require_lives(frame, known)
+            _require_rows("observed", frame.observed)
+            _require_rows("added", frame.added)
+            known = _require_lives(frame, known)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -130,18 +129,15 @@ class Recording:
         return LandmarkTable(ids, descriptors, none.astype(np.int8), counts, counts, none, latest)
 
 
-def _require_rows(what: str, every: list[Observations]) -> None:
+def _require_rows(what: str, rows: Observations) -> None:
     """Raise where pixels or ids of observations are none."""
-    if not every:
+    if not len(rows):
         return
-    left, right, ids = (
-        np.concatenate([getattr(rows, key) for rows in every]) for key in ("uv_left", "uv_right", "ids")
-    )
-    if not np.isfinite(left).all():
+    if not np.isfinite(rows.uv_left).all():
         raise MeasurementError(f"recording: a left pixel of {what} is not finite")
-    if (np.abs(left) > FARTHEST_PIXEL).any() or (np.abs(right) > FARTHEST_PIXEL).any():
+    if (np.abs(rows.uv_left) > FARTHEST_PIXEL).any() or (np.abs(rows.uv_right) > FARTHEST_PIXEL).any():
         raise MeasurementError(f"recording: a pixel of {what} is far outside of any image")
-    if ids.min() < 0 or ids.max() > MOST_ID:
+    if rows.ids.min() < 0 or rows.ids.max() > MOST_ID:
         raise MeasurementError(f"recording: ids of landmarks must go from 0 to {MOST_ID}")
 
 

@@ -25,25 +25,15 @@ _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-con
 
 @dataclass(frozen=True)
 class Origin:
-    """What a command line says of a run besides names and settings.
+    """What a command line says of a run besides names and settings."""
 
-    Attributes:
-        command: the command line.
-        sequence: as `slam.open_sequence` takes it.
-        format: of the sequence; None for found out.
-        kind: kind of motion that the defaults are for.
-        prior_map: file of the map that it starts in; None for none.
-        mono: whether the left images are used alone.
-        calibration: file with what is known of the rig's error; None for none.
-    """
-
-    command: str
-    sequence: str
-    format: str | None
-    kind: str
-    prior_map: Path | None = None
-    mono: bool = False
-    calibration: Path | None = None
+    command: str  # the command line
+    sequence: str  # as `slam.open_sequence` takes it
+    format: str | None  # of the sequence; None for found out
+    kind: str  # of motion that the defaults are for
+    prior_map: Path | None = None  # file of the map that it starts in
+    mono: bool = False  # whether the left images are used alone
+    calibration: Path | None = None  # file with what is known of the rig's error
 
     def to_json(self, folder: Path) -> dict[str, Any]:
         """The tree for the ``config.json`` of a run in `folder`: files by absolute and by relative path."""
@@ -59,23 +49,15 @@ class Origin:
 
 @dataclass(frozen=True)
 class Repeat:
-    """A run as its ``config.json`` describes it.
+    """A run as its ``config.json`` describes it."""
 
-    Attributes:
-        origin: the sequence is where it is found now; empty where it is not known.
-        frontend, backend: names.
-        config: all settings.
-        start, stop: range of frames.
-        versions: of the packages that it was made with.
-    """
-
-    origin: Origin
+    origin: Origin  # the sequence is where it is found now; empty where it is not known
     frontend: str
     backend: str
     config: SystemConfig
     start: int
     stop: int | None
-    versions: Mapping[str, str]
+    versions: Mapping[str, str]  # of the packages that it was made with
 
 
 def load(
@@ -95,13 +77,11 @@ def load(
         if str(tree.get("command", "")).startswith("slam replay"):
             raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
         source, (start, stop) = tree.get("source") or {}, tree["frames"]
-        known, kept = (
-            given or (Path(_found(tree[key], file)) if tree.get(key) else None)
-            for key, given in (("prior_map", prior_map), ("calibration", calibration))
-        )
+        given = {"prior_map": prior_map, "calibration": calibration}
+        files = {key: own or (Path(_found(tree[key], file)) if tree.get(key) else None) for key, own in given.items()}
         origin = Origin(
             str(tree.get("command", "")), sequence or (_found(source, file) if source else ""), source.get("format"),
-            str(tree.get("kind", "handheld")), known, bool(tree.get("mono", False)), kept,
+            str(tree.get("kind", "handheld")), mono=bool(tree.get("mono", False)), **files,
         )  # fmt: skip
         names = str(tree["frontend"]), str(tree["backend"])
         config, made_with = SystemConfig.from_json(tree["settings"]), dict(tree.get("versions", {}))
@@ -134,10 +114,9 @@ def running_code() -> dict[str, str]:
     return {**versions(), "code": digest.hexdigest()[:12]}
 
 
-def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """What differs between two sets of versions, in words; empty where nothing does."""
-    differing = [f"{name} {old}, now {now.get(name)}" for name, old in then.items() if now.get(name) != old]
-    return "; ".join(differing)
+def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """What differs between two sets of versions, in words."""
+    return [f"{name} {old}, now {now.get(name)}" for name, old in then.items() if now.get(name) != old]
 
 
 def portable(tree: Any) -> Any:

@@ -10,9 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from slam.data import FrameResult, FrameStatus, Observations, Prediction, StereoFeatures, UpdateReport, UpdateStatus
+from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
-from slam.geometry.se3 import Array
 from slam.interfaces import Backend, RevisingBackend
 from slam.run.recorded import RecordedFrame, Recording
 from slam.third_party import checked, named_failures
@@ -51,69 +50,58 @@ def _step(
     recording: Recording, backend: Backend, k: int, frame: RecordedFrame, config: AssociationConfig | None
 ) -> FrameResult:
     """One frame."""
-    times = [time.perf_counter()]
+    times, guess, seen = [time.perf_counter()], None, frame.observed
     if frame.revision is not None and isinstance(backend, RevisingBackend):
         backend.revise(frame.revision.rows)
-    prediction = backend.predict(frame.stamp)
-    checked(backend, "predict", prediction)
+    prediction = checked(backend, "predict", backend.predict(frame.stamp))
     times.append(time.perf_counter())
-    guess = None if config is None else _agreement(recording, backend, prediction, frame.observed, config, seed=k)
+    if config is not None and len(seen):
+        measured, points = measurement_rows(seen.uv_left, seen.uv_right), backend.positions(seen.ids)
+        threshold = config.consistency_sigmas * recording.models.pixel_sigma
+        expected = prediction.T_world_left
+        found = find_consensus(recording.rig, points, measured, expected, threshold, config.hypotheses, seed=k)
+        guess = found.T_world_left
     times.append(time.perf_counter())
-    report = backend.update(frame.observed, guess)
-    checked(backend, "update", report)
+    report = checked(backend, "update", backend.update(seen, guess))
     times.append(time.perf_counter())
-    _keep_map(backend, frame)
-    times.append(time.perf_counter())
-    estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
-    times.append(time.perf_counter())
-    status, reason = _status(report, k == recording.first)
-    seen, new = len(frame.observed), len(frame.added)
-    return FrameResult(
-        index=k,
-        status=status,
-        reason=reason,
-        estimate=estimate,
-        report=report,
-        features=_features(frame),
-        predicted=len(prediction.ids),
-        matched=frame.observed.ids,
-        matched_features=np.arange(seen),
-        added=frame.added.ids,
-        added_features=np.arange(seen, seen + new),
-        erased=frame.removed,
-        map_size=int(recording.map_sizes[k]),
-        revision=frame.revision,
-        milliseconds=dict(zip(_STAGES, 1e3 * np.diff(times))),
-    )
-
-
-def _agreement(
-    recording: Recording,
-    backend: Backend,
-    prediction: Prediction,
-    observed: Observations,
-    config: AssociationConfig,
-    seed: int,
-) -> Array | None:
-    """The pose on which most observations agree; None without any."""
-    if not len(observed):
-        return None
-    measured = measurement_rows(observed.uv_left, observed.uv_right)
-    threshold = config.consistency_sigmas * recording.models.pixel_sigma
-    points, expected = backend.positions(observed.ids), prediction.T_world_left
-    found = find_consensus(recording.rig, points, measured, expected, threshold, config.hypotheses, seed)
-    return found.T_world_left
-
-
-def _keep_map(backend: Backend, frame: RecordedFrame) -> None:
-    """Remove and add landmarks in the order in which the system does; what has just been added may leave at once."""
-    at_once = np.isin(frame.removed, frame.added.ids)
+    at_once = np.isin(frame.removed, frame.added.ids)  # what has just been added may leave at once
     if not at_once.all():
         backend.remove(frame.removed[~at_once])
     if len(frame.added):
         backend.add(frame.added)
     if at_once.any():
         backend.remove(frame.removed[at_once])
+    times.append(time.perf_counter())
+    estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
+    times.append(time.perf_counter())
+    status, reason = _status(report, k == recording.first)
+    count, every = len(seen), len(seen) + len(frame.added)
+    nothing = np.full(every, np.nan)
+    features = StereoFeatures(
+        frame.stamp,
+        np.concatenate([seen.uv_left, frame.added.uv_left]),
+        np.concatenate([seen.uv_right, frame.added.uv_right]),
+        *(nothing, nothing, nothing),
+        np.zeros(every, np.int8),
+        np.zeros((every, 0), np.float32),
+    )
+    return FrameResult(
+        index=k,
+        status=status,
+        reason=reason,
+        estimate=estimate,
+        report=report,
+        features=features,
+        predicted=len(prediction.ids),
+        matched=seen.ids,
+        matched_features=np.arange(count),
+        added=frame.added.ids,
+        added_features=np.arange(count, every),
+        erased=frame.removed,
+        map_size=int(recording.map_sizes[k]),
+        revision=frame.revision,
+        milliseconds=dict(zip(_STAGES, 1e3 * np.diff(times))),
+    )
 
 
 def _status(report: UpdateReport, first: bool) -> tuple[FrameStatus, str]:
@@ -124,14 +112,3 @@ def _status(report: UpdateReport, first: bool) -> tuple[FrameStatus, str]:
     if first:
         return FrameStatus.STARTED, ""
     return FrameStatus.PREDICTED, report.reason or f"only {len(report.used)} landmarks matched"
-
-
-def _features(frame: RecordedFrame) -> StereoFeatures:
-    """The observations as features: first those of the map, then the new ones."""
-    uv_left = np.concatenate([frame.observed.uv_left, frame.added.uv_left])
-    uv_right = np.concatenate([frame.observed.uv_right, frame.added.uv_right])
-    nothing = np.full(len(uv_left), np.nan)
-    none = np.zeros((len(uv_left), 0), np.float32)
-    return StereoFeatures(
-        frame.stamp, uv_left, uv_right, nothing, nothing, nothing, np.zeros(len(uv_left), np.int8), none
-    )

@@ -1,7 +1,7 @@
 """What the figures of a run are: the one table that terminal, pictures and comparisons read its ``summary.json`` by.
 
 A row has the figure's name, unit, place in the summary, and which way is better. What is computed, and how, is in
-`slam.evaluation` and `slam.evaluation.objects`.
+`slam.evaluation` and `slam.evaluation.objects`. Whether covariances hold is judged here, for one run and for several.
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from slam.evaluation.consistency import EXACT
+from slam.evaluation.metrics import chi_square_band
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,14 @@ COMPLETED = Metric("completed", "runs completed", "higher", True, "%", 100)
 _ONLINE, _FINAL, _HONEST = ("accuracy", "online"), ("accuracy", "final"), ("consistency",)
 _MM, _PERCENT, _FRAMES = ("mm", 1e3), ("%", 100.0), ("frames", 1.0)
 
+#: NEES by key: over what, its place in the summary, and whether a summary speaks of it.
+_NEES = {
+    "nees_per_dof": ("from the start", "mean NEES", True),
+    "nees_1m_per_dof": ("over 1 m", "NEES over 1 m", False),
+    "nees_10m_per_dof": ("over 10 m", "NEES over 10 m", True),
+    "nees_100m_per_dof": ("over 100 m", "NEES over 100 m", False),
+}
+
 #: In the order of the tables. Times are apart: they differ from run to run.
 METRICS = (
     Metric("ate_online_m", "ATE RMSE, online", "lower", True, *_MM, (*_ONLINE, "ATE RMSE [m]")),
@@ -77,14 +88,10 @@ METRICS = (
     Metric("gps_m", "GPS distance RMSE", "lower", True, *_MM, (*_ONLINE, "GPS distance RMSE [m]")),
     Metric("scale_error_percent", "scale error, absolute", "lower", False, "%", 1.0, (*_HONEST, "scale error [%]")),
     Metric("scale_sigma_percent", "scale sigma (claimed)", "", False, "%", 1.0, (*_HONEST, "scale sigma [%]")),
-    Metric("nees_per_dof", "NEES / 6 from the start (expected 1)", "one", True, place=(*_HONEST, "mean NEES"),
-           share_of="dof"),
-    Metric("nees_1m_per_dof", "NEES / 6 over 1 m (expected 1)", "one", place=(*_HONEST, "NEES over 1 m"),
-           share_of="dof"),
-    Metric("nees_10m_per_dof", "NEES / 6 over 10 m (expected 1)", "one", True, place=(*_HONEST, "NEES over 10 m"),
-           share_of="dof"),
-    Metric("nees_100m_per_dof", "NEES / 6 over 100 m (expected 1)", "one", place=(*_HONEST, "NEES over 100 m"),
-           share_of="dof"),
+    *(Metric(key, f"NEES / 6 {where} (expected 1)", "one", main, place=(*_HONEST, name), share_of="dof")
+      for key, (where, name, main) in _NEES.items()),
+    *(Metric(f"{key}_left_out", f"stretches {where} without covariance", "", False, *_PERCENT,
+             (*_HONEST, f"no covariance {where}")) for key, (where, _, _) in list(_NEES.items())[1:]),
     Metric("nis_per_dof", "NIS per degree of freedom (expected 1)", "one",
            place=(*_HONEST, "NIS per degree of freedom")),
     Metric("landmark_error_m", "landmark error, median", "lower", True, *_MM),
@@ -100,62 +107,75 @@ METRICS = (
     Metric("used_per_frame", "observations used per frame"),
 )  # fmt: skip
 
-#: What a run's own table says besides, without a better or worse.
-OF_A_RUN = (
+BY_KEY = {metric.key: metric for metric in METRICS}
+
+#: Frames whose pose was not measured: they are in no figure of accuracy, and counted here. The share tracked is tested.
+UNTRACKED = ("frames_lost", "frames_predicted", "frames_failed")
+
+#: What a run's own table says besides, without a better or worse: above the other figures, and below them.
+_ABOVE = (
     Metric("landmarks", "landmarks at the end", place=("landmarks",)),
     Metric("path_m", "path length", unit="m", place=("path_length_m",)),
     Metric("speed", "speed, median", unit="m/s", place=("speed_m_per_s",)),
     Metric("sigma_m", "sigma of the last position", "", False, *_MM, ("final_sigma_m",)),
     Metric("bodies", "moving bodies found", place=("bodies",)),
+)
+_COMPILING = Metric("compiling", "kernels compiled, beside these times", unit="s", place=("compile_seconds",))
+_BELOW = (
     Metric("dropped", "frames dropped", place=("live", "frames dropped")),
     Metric("behind", "behind, median", unit="ms", place=("live", "milliseconds behind", "median")),
     Metric("behind_most", "behind, most", unit="ms", place=("live", "milliseconds behind", "max")),
     Metric("milliseconds", "stages of a frame, median", unit="ms", place=("milliseconds", "median_total")),
     Metric("rate", "frames per second", place=("frames_per_second",)),
-    Metric("compiling", "kernels compiled, beside these times", unit="s", place=("compile_seconds",)),
-)  # fmt: skip
+    _COMPILING,
+)
+_COMPILED = 0.05  # compile times below this [s] are not worth a row
 
 #: Figures of a comparison that a run's own table leaves out: shares of its status, which it shows in words.
-_NOT_OF_ONE_RUN = ("tracked", "frames_lost", "frames_predicted", "frames_failed", "scale_sigma_percent")
+_NOT_OF_ONE_RUN = ("tracked", *UNTRACKED, "scale_sigma_percent")
 
 #: Of a moving body, what a run's own table says.
 _OF_BODIES = ("coverage", "ME translation median [m]", "ME rotation median [deg]")
 
-_COMPILED = 0.05  # compile times below this [s] are not worth a row
-
-#: Frames whose pose was not measured: they are in no figure of accuracy, and counted here. The share tracked is tested.
-UNTRACKED = ("frames_lost", "frames_predicted", "frames_failed")
-
-BY_KEY = {metric.key: metric for metric in METRICS}
-
-_OBJECT = "object"
-_NEES = "NEES / degree of freedom"
+_BODY_NEES = "NEES / degree of freedom"
 _SHARES = ("precision", "recall", "F1", "coverage", "counted right")
 _UNITS = {"m": _MM, "deg": ("deg", 1.0), "frames": _FRAMES}
+
+#: NEES by which covariances are judged, the best first: errors from the start add up along the path.
+_JUDGED = ("nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof", "nees_100m_per_dof")
 
 
 def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str]]]:
     """The table of some runs for people: label with unit, and a text per run; what no run has is left out."""
     yield "frames tracked", list(map(_tracked, summaries))
-    found = [_placed(OF_A_RUN, s) | figures(s) for s in summaries]
-    objects = [object_metric(key) for key in dict.fromkeys(key for one in found for key in one) if _is_of_body(key)]
-    left_out = [m.key for m in OF_A_RUN[-1:] if not any(one.get(m.key, 0.0) > _COMPILED for one in found)]
-    for metric in (*OF_A_RUN[:5], *METRICS, *objects, *OF_A_RUN[5:]):
+    found = [_placed((*_ABOVE, *_BELOW), s) | figures(s) for s in summaries]
+    bodies = [key for one in found for key in one if key.startswith("object bodies") and key.endswith(_OF_BODIES)]
+    left_out = set(_NOT_OF_ONE_RUN)
+    if not any(one.get(_COMPILING.key, 0.0) > _COMPILED for one in found):
+        left_out.add(_COMPILING.key)
+    for metric in (*_ABOVE, *METRICS, *map(object_metric, dict.fromkeys(bodies)), *_BELOW):
         values = [one.get(metric.key, float("nan")) for one in found]
-        if metric.key not in (*_NOT_OF_ONE_RUN, *left_out) and np.isfinite(values).any():
+        if metric.key not in left_out and np.isfinite(values).any():
             yield metric.title, list(map(metric.show, values))
+
+
+def facts(summary: Mapping[str, Any]) -> str:
+    """What a run found, also where there is no truth, and whether its covariances hold, in one line for a picture."""
+    found = _placed(_ABOVE, summary) | figures(summary)
+    shown = (*_ABOVE[1:], BY_KEY["loops_closed"], BY_KEY["loops_refused"])
+    words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown if m.key in found]
+    return "; ".join([*words, *filter(None, [verdict_of_run(summary)])])
 
 
 def _tracked(summary: Mapping[str, Any]) -> str:
     """How many frames had a measured pose, and what became of the others; the first one starts the map."""
-    status = summary["status"]
-    own = status.get("tracked", 0) + status.get("started", 0)
-    others = [f"{n} {name}" for name, n in status.items() if name not in ("tracked", "started")]
-    return ", ".join([f"{own} of {summary['frames']}", *others])
+    others = [f"{n} {name}" for name, n in summary["status"].items() if name not in ("tracked", "started")]
+    return ", ".join([f"{_measured(summary)} of {summary['frames']}", *others])
 
 
-def _is_of_body(key: str) -> bool:
-    return key.startswith(f"{_OBJECT} bodies") and key.endswith(_OF_BODIES)
+def _measured(summary: Mapping[str, Any]) -> int:
+    status = summary.get("status", {})
+    return int(status.get("tracked", 0) + status.get("started", 0))
 
 
 def _placed(metrics: Sequence[Metric], summary: Mapping[str, Any]) -> dict[str, float]:
@@ -178,22 +198,60 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
         found["scale_error_percent"] = abs(found["scale_error_percent"])
     if not found.get("loops_closed", 0) + found.get("loops_refused", 0):
         found = {key: value for key, value in found.items() if not key.startswith("loops")}
-    frames, status = summary.get("frames", 0), summary.get("status", {})
-    if frames:
-        started = status.get("started", 0)  # its pose is that of the world
-        found["tracked"] = (status.get("tracked", 0) + started) / frames
+    if frames := summary.get("frames", 0):
+        status = summary.get("status", {})
+        found["tracked"] = _measured(summary) / frames
         found |= {key: status.get(key.removeprefix("frames_"), 0) / frames for key in UNTRACKED}
         found["used_per_frame"] = summary.get("observations", {}).get("used", 0) / frames
     return {**found, **object_figures(summary)}
 
 
+def verdict(found: Mapping[str, float], runs: int = 1) -> str:
+    """Whether covariances are as large as the errors, by which figure and which band; empty where no NEES is known.
+
+    A figure of which more than half of the stretches had no covariance is not judged by.
+
+    Args:
+        found: `figures` of a run, or their means over several.
+        runs: how many. The band is that of as many independent values: it holds even if all frames of a run are as good
+            as one, which errors of the rig make them.
+    """
+    low, high = (bound / 6 for bound in chi_square_band(6, max(runs, 1)))
+    usable = [key for key in _JUDGED if not found.get(f"{key}_left_out", 0.0) > 0.5]
+    known = {_NEES[key][0]: found[key] for key in usable if np.isfinite(found.get(key, np.nan))}
+    if not known:
+        return ""
+    said = {w: "are too small" if v > high else "are too large" if v < low else "hold" for w, v in known.items()}
+    judged = next(iter(known))
+    others = [f"{w} {number(known[w])}: they {said[w]}" for w in known if said[w] != said[judged]]
+    word = "hold in part" if others and said[judged] == "hold" else said[judged]
+    of = "runs" if runs == 1 else f"means of {runs} runs"
+    text = (
+        f"covariances {word}: NEES / 6 {judged} is {number(known[judged])}, expected {low:.2f} to {high:.2f} (95 % of "
+        f"{of}); errors are {np.sqrt(known[judged]):.2f} times what they claim"
+    )
+    return "; ".join([text, *others])
+
+
+def verdict_of_run(summary: Mapping[str, Any]) -> str:
+    """`verdict` on a run by its summary, with what it leaves out; empty where no NEES is known."""
+    text = verdict(figures(summary))
+    if not text:
+        return ""
+    if "are too large" in text and summary["consistency"].get(EXACT):
+        text += "; they count errors of the calibration, and this world's cameras have none"
+    if left_out := summary["frames"] - _measured(summary):
+        text += f"; not judged: {left_out} of {summary['frames']} frames, whose pose was not measured"
+    return text
+
+
 def object_metric(key: str) -> Metric:
     """A figure of moving objects by the key that `object_figures` gives it."""
-    text = re.sub(r"^bodies (\d+) (ME )?", _named_body, key.removeprefix(f"{_OBJECT} "))
+    text = re.sub(r"^bodies (\d+) (ME )?", _named_body, key.removeprefix("object "))
     label = text if text.startswith("body") else f"objects: {text}"
     if key.endswith(_SHARES):
         return Metric(key, label, "higher", False, *_PERCENT)
-    if key.endswith(_NEES):
+    if key.endswith(_BODY_NEES):
         return Metric(key, label, "one")
     found = re.fullmatch(r"(.*) \[(\w+)\]", label)
     lower = "lower" if found or "false" in key else ""
@@ -211,22 +269,19 @@ def object_figures(summary: Mapping[str, Any]) -> dict[str, float]:
 
     What is found of the moving features has no value where no body has moved.
     """
-    objects = summary.get("objects")
-    if not isinstance(objects, Mapping):
-        return {}
-    found = dict(_leaves(_OBJECT, objects))
+    found = dict(_leaves("object", summary.get("objects")))
     for key in [key for key in found if key.endswith(" mean NEES")]:
         name = key.removesuffix("mean NEES")
-        found[name + _NEES] = found.pop(key) / found.pop(name + "dof", 6.0)
-    bodies = [found[key] for key in found if key.endswith(" frames in view")]
-    if not any(bodies):
+        found[name + _BODY_NEES] = found.pop(key) / found.pop(name + "dof", 6.0)
+    if not any(value for key, value in found.items() if key.endswith(" frames in view")):
         found = {key: value for key, value in found.items() if not key.endswith(("precision", "recall", "F1"))}
     return found
 
 
-def _leaves(name: str, tree: Any) -> list[tuple[str, float]]:
+def _leaves(name: str, tree: Any) -> Iterator[tuple[str, float]]:
+    """Numbers of a tree, named by the keys on the way to them."""
     if isinstance(tree, Mapping):
-        return [leaf for key in tree for leaf in _leaves(f"{name} {key}", tree[key])]
-    if isinstance(tree, (int, float)) and not isinstance(tree, bool):
-        return [(name, float(tree))]
-    return []
+        for key, value in tree.items():
+            yield from _leaves(f"{name} {key}", value)
+    elif isinstance(tree, (int, float)) and not isinstance(tree, bool):
+        yield name, float(tree)

@@ -5,77 +5,53 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slam.errors import SlamError
+from slam.evaluation.metrics import align, associate
+from slam.evaluation.summary import rotation_errors
 from slam.files import read_object, read_text
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, hat, so3_exp
 from slam.geometry.trajectory import Trajectory
 from slam.naming import printable
 from slam.run.schema import OLD_LANDMARKS, STAGES
 
-_NOWHERE = np.zeros((0, 3))
+_TURNED = np.radians(1.0)  # how far the axes of a recorded truth are turned against the camera's, about
 
 
 @dataclass(frozen=True, eq=False)
 class RunData:
-    """What a run's folder says.
+    """What a run's folder says."""
 
-    Attributes:
-        name: shown in the pictures.
-        online, final: paths.
-        positions: landmarks (N, 3) [m].
-        covariances: (N, 3, 3) [m²].
-        seen_last: which landmarks were measured in the last frame (N,).
-        deviations: of the online position in world axes [m] and of the rotation [deg], (F, 4), by pose of `online`.
-        measured: whether each pose of `online` was measured (F,), or is the motion model's alone.
-        status: of each frame.
-        milliseconds: by stage, of each frame [ms].
-        truth: true path, in its own world; None where it is not known.
-        sequence, backend: names.
-        folder: where it was read from.
-        truth_is_exact: whether the truth has no errors of its own: that of a world.
-        loops: rows of `final` whose places are the same (L, 2), the later one first.
-        refused: rows of `final` whose places only looked alike (L, 2), the later one first.
-        keyframes: rows of `final` that are keyframes (K,).
-        old: landmarks that had left the map before the end (M, 3) [m].
-        bodies: where moving bodies were measured (B, 3) [m], by id.
-        summary: of the run; empty where there is none.
-    """
-
-    name: str
+    name: str  # shown in the pictures
     online: Trajectory
     final: Trajectory
-    positions: Array
-    covariances: Array
-    seen_last: np.ndarray
-    deviations: Array
-    measured: np.ndarray
-    status: list[str]
-    milliseconds: dict[str, Array]
-    truth: Trajectory | None = None
-    sequence: str = ""
-    backend: str = ""
-    folder: Path = Path()
-    truth_is_exact: bool = True
-    loops: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
-    refused: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
-    keyframes: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    old: Array = field(default_factory=lambda: _NOWHERE)
-    bodies: Mapping[str, Array] = field(default_factory=dict)
-    summary: Mapping[str, Any] = field(default_factory=dict)
+    positions: Array  # of landmarks (N, 3) [m]
+    covariances: Array  # of these (N, 3, 3) [m²]
+    seen_last: np.ndarray  # which landmarks were measured in the last frame (N,)
+    deviations: Array  # of the online position in world axes [m] and of the rotation [deg], (F, 4), by pose
+    measured: np.ndarray  # whether each pose of `online` was measured (F,), or is the motion model's alone
+    status: list[str]  # of each frame
+    milliseconds: dict[str, Array]  # by stage, of each frame [ms]
+    truth: Trajectory | None  # in its own world; None where it is not known
+    sequence: str
+    backend: str
+    folder: Path
+    truth_is_exact: bool  # whether the truth has no errors of its own: that of a world
+    loops: np.ndarray  # rows of `final` whose places are the same (L, 2), the later one first
+    refused: np.ndarray  # rows of `final` whose places only looked alike (L, 2), the later one first
+    keyframes: np.ndarray  # rows of `final` (K,)
+    old: Array  # landmarks that had left the map before the end (M, 3) [m]
+    bodies: Mapping[str, Array]  # where moving bodies were measured (B, 3) [m], by id
+    summary: Mapping[str, Any]  # of the run; empty where there is none
 
     @classmethod
     def read(cls, folder: Path, name: str) -> RunData:
-        """Read the files of a finished run.
-
-        Raises:
-            SlamError: the folder does not hold a finished run.
-        """
+        """Read the files of a finished run; raises SlamError: the folder does not hold a finished run."""
         if not folder.exists():
             raise SlamError(f"{folder}: there is no such folder")
         if not (folder / "landmarks.csv").exists():
@@ -111,8 +87,8 @@ class RunData:
             config["format"] == "synthetic",
             _pairs(frames, final, "loop"),
             _pairs(frames, final, "refused"),
-            _keyframes(frames, final),
-            _numbers(_rows(folder / OLD_LANDMARKS), ("x", "y", "z")) if (folder / OLD_LANDMARKS).exists() else _NOWHERE,
+            _rows_at(final, np.array([float(row["stamp"]) for row in frames if row.get("keyframe") == "1"])),
+            _numbers(_rows(folder / OLD_LANDMARKS) if (folder / OLD_LANDMARKS).exists() else [], ("x", "y", "z")),
             _bodies(folder),
             read_object(folder / "summary.json") if (folder / "summary.json").exists() else {},
         )
@@ -125,11 +101,6 @@ def _pairs(frames: list[dict[str, str]], final: Trajectory, column: str) -> np.n
     return _rows_at(final, np.array(pairs).reshape(-1, 2))
 
 
-def _keyframes(frames: list[dict[str, str]], final: Trajectory) -> np.ndarray:
-    """Rows of the final path (K,) that are keyframes."""
-    return _rows_at(final, np.array([float(row["stamp"]) for row in frames if row.get("keyframe") == "1"]))
-
-
 def _rows_at(final: Trajectory, stamps: Array) -> np.ndarray:
     """Rows of the final path at stamps."""
     return np.searchsorted(final.stamps, stamps - 1e-9).clip(0, max(len(final) - 1, 0))
@@ -140,11 +111,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
-    """Stamp [s], id and position [m] of every row of objects.csv.
-
-    Raises:
-        SlamError: the file is missing or damaged.
-    """
+    """Stamp [s], id and position [m] of every row of objects.csv; raises SlamError: the file is missing or damaged."""
     path = folder / "objects.csv"
     try:
         return [(float(row["stamp"]), row["id"], [float(row[c]) for c in "xyz"]) for row in _rows(path)]
@@ -163,3 +130,70 @@ def _bodies(folder: Path) -> dict[str, Array]:
 def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
     """Columns of a table as numbers (N, C); NaN for an empty cell."""
     return np.array([[float(row[c] or "nan") for c in columns] for row in rows]).reshape(-1, len(columns))
+
+
+def place_of_truth(run: RunData, truth: Trajectory) -> Array:
+    """Pose (4, 4) of the true path's world in the run's, in which both paths begin at the same position.
+
+    It is turned by the first pose. A recorded one is turned a little further, so that the whole paths fit: an error of
+    its first orientation by some tenths of a degree would look like an error of the path that grows with the distance.
+    Where no little turn makes them fit, the truth's orientations are in other axes, and the paths alone count.
+    """
+    own, true = associate(run.online, truth, 0.02, interpolated=True)
+    T, turn = np.eye(4), own.poses[0, :3, :3] @ true.poses[0, :3, :3].T
+    T[:3, :3] = turn
+    if not run.truth_is_exact:
+        places, true_places = (path.positions - path.positions[0] for path in (own, true))
+        T[:3, :3] = _fitted(places, true_places, turn, align(true, own).R)
+    T[:3, 3] = own.positions[0] - T[:3, :3] @ true.positions[0]
+    return T
+
+
+def _fitted(own: Array, true: Array, turn: Array, by_paths: Array) -> Array:
+    """A rotation (3, 3) close to `turn` by which places since the start (N, 3) fit; `by_paths` where none does.
+
+    What the paths do not tell, such as a turn about a straight path, stays as it was.
+    """
+    turned = true @ turn.T
+    J = -hat(turned).reshape(-1, 3)
+    gaps = own - turned
+    prior = float(np.mean(gaps**2)) / _TURNED**2
+    fitted = so3_exp(np.linalg.solve(J.T @ J + max(prior, 1e-12) * np.eye(3), J.T @ gaps.ravel())) @ turn
+    left, least = (float(((own - true @ R.T) ** 2).sum()) for R in (fitted, by_paths))
+    return fitted if left <= 2 * least or left <= float(np.sum(own**2)) * _TURNED**2 else by_paths
+
+
+def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
+    """Time since the start (N,) [s], errors of the online pose and their claimed standard deviations, (N, 4) each.
+
+    The first three columns are the position along the axes of the run's world [m], see `place_of_truth`; the last one
+    is the angle of the rotation's error [deg]. Without a truth the errors are zero.
+    """
+    if run.truth is None:
+        stamps = run.online.stamps
+        return stamps - stamps[0], np.zeros((len(stamps), 4)), run.deviations
+    own, true = associate(run.online, run.truth, 0.02, interpolated=True)
+    T = place_of_truth(run, run.truth)
+    expected = true.positions @ T[:3, :3].T + T[:3, 3]
+    turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)
+    errors = np.column_stack([own.positions - expected, np.degrees(turned)])
+    return own.stamps - run.online.stamps[0], errors, run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
+
+
+def well_known(run: RunData) -> np.ndarray:
+    """Rows of landmarks that are well known and near the path, most recent last: others spoil a picture's scale."""
+    size = np.sqrt(np.trace(run.covariances, axis1=1, axis2=2)) if len(run.positions) else np.zeros(0)
+    distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
+    return np.flatnonzero((size < 0.2 * _extent(run)) & (distance < reach(run)))
+
+
+def _extent(run: RunData) -> float:
+    """How far the path reaches [m]; of the scene where the camera hardly moved, or was lost."""
+    distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
+    scene = 0.5 * float(np.median(distance)) if len(distance) else 0.0
+    return max(float(np.ptp(run.online.positions, axis=0).max()), scene, 1.0)
+
+
+def reach(run: RunData) -> float:
+    """Distance from the middle of the path up to which landmarks are shown [m]."""
+    return 2.0 * _extent(run) + 3.0

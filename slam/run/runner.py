@@ -14,7 +14,7 @@ from slam import registry
 from slam.calibration import load_calibration
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
-from slam.evaluation.objects import ObjectScore, labels_in_images, score_for
+from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
@@ -22,7 +22,7 @@ from slam.mapping.map_io import load_map, save_map
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
-from slam.run.outputs import RunFiles
+from slam.run.outputs import RunFiles, write_json, write_trajectory
 from slam.run.recorded import RecordedFrame, Recording
 from slam.run.recording import save_recording
 from slam.run.repeat import portable, versions
@@ -50,6 +50,7 @@ def run(
     frontend: Frontend | None = None,
     watches: Iterable[Watch] = (),
     until: threading.Event | None = None,
+    record: RunRecord | None = None,
 ) -> dict[str, Any]:
     """Run a sequence; returns the summary that is also written to ``summary.json``.
 
@@ -64,6 +65,7 @@ def run(
         frontend: used in place of the one that the options name.
         watches: called after every step with its images, its result and the system, to show or to draw it.
         until: ends a live run when it is set, as if there were no more frames.
+        record: gathers what the run gives, for whom the files are not enough.
 
     Raises:
         SlamError: bad input; one line says what and where.
@@ -76,33 +78,33 @@ def run(
     if options.record is not None:
         config = replace(options.config, map=replace(options.config.map, monocular=False))
         options = replace(options, config=config)
-    frames = sequence.frames(options.start, options.stop)
-    live = None
+    frames, live = sequence.frames(options.start, options.stop), None
     if options.live or is_live(sequence):
         live = LiveFrames(frames, not is_live(sequence), until)
         frames = iter(live)
     if options.mono:
         frames = (replace(frame, right=None) for frame in frames)
-    known = None if options.prior_map is None else load_map(options.prior_map)
-    rig_prior = None if options.calibration is None else load_calibration(options.calibration)
     system = StereoSlam(
         sequence.rig,
         frontend or options.frontend,
         options.backend,
         config=options.config,
-        prior_map=known,
-        rig_prior=rig_prior,
+        prior_map=None if options.prior_map is None else load_map(options.prior_map),
+        rig_prior=None if options.calibration is None else load_calibration(options.calibration),
     )
     if live is not None:  # before its clock starts, with its first frame
         warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
-    record = RunRecord()
-    results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)
+    record = RunRecord() if record is None else record
+    results = _processed(system, frames, live, tuple(watches), options.overlap, record)
     return _Run(sequence, options, system, record, live).drive(results, on_frame)
 
 
 @one_blas_thread
 def run_recording(
-    recording: Recording, options: RunOptions, on_frame: Callable[[FrameResult], None] | None = None
+    recording: Recording,
+    options: RunOptions,
+    on_frame: Callable[[FrameResult], None] | None = None,
+    record: RunRecord | None = None,
 ) -> dict[str, Any]:
     """Replay a recording through a back end; leaves the files of a run and returns its summary, as `run` does.
 
@@ -110,6 +112,7 @@ def run_recording(
         recording: what the back end is given.
         options: back end, settings and folder; there is no front end and no range of frames.
         on_frame: called after every frame, for a progress display.
+        record: gathers what the run gives, for whom the files are not enough.
 
     Raises:
         SlamError: bad input; one line says what and where.
@@ -117,8 +120,40 @@ def run_recording(
     config = options.config
     backend = registry.create("backends", options.backend, recording.rig, models=config.models, **config.backend)
     results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
-    record = RunRecord()
+    record = RunRecord() if record is None else record
     return _Run(recording, options, Replayed(recording, backend, record), record).drive(results, on_frame)
+
+
+def _processed(
+    system: StereoSlam,
+    frames: Iterator[StereoFrame],
+    live: LiveFrames | None,
+    watches: tuple[Watch, ...],
+    overlap: bool,
+    record: RunRecord,
+) -> Iterator[tuple[int, FrameResult]]:
+    """Each frame's number and what the system did with it; a live run's time of reading is one of waiting, and 0."""
+    reading: dict[int, float] = {}  # wall time [ms] by number of the frame
+
+    def timed() -> Iterator[StereoFrame]:
+        while True:
+            start = time.perf_counter()
+            frame = next(frames, None)
+            if frame is None:
+                return
+            reading[frame.index] = 1e3 * (time.perf_counter() - start) if live is None else 0.0
+            yield frame
+
+    for frame, result in system.run(timed(), overlap):
+        result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
+        if live is not None:
+            record.ages.append(live.age(frame))
+        if frame.right is None:
+            record.without_right.append(len(record.statuses))
+        record.depths.append(median_depth(result.features, system.rig))
+        yield frame.index, result
+        for watch in watches:
+            watch(frame, result, system)
 
 
 @dataclass(eq=False)
@@ -144,15 +179,14 @@ class _Run:
         record, score = self.record, score_for(self.sequence)
         ended, stopped_by = "completed", None
         with RunFiles(self.options.out) as files:
-            files.write_json("config.json", self._config())
+            write_json(self.options.out / "config.json", self._config())
             with self._each():
                 frontend, backend = getattr(self.system, "frontend", None), self.system.backend
-                files.write_json("schema.json", schema(self.options.config, frontend, backend))
+                write_json(self.options.out / "schema.json", schema(self.options.config, frontend, backend))
             try:
                 for number, result in results:
                     record.add(number, result)
-                    places = (_place(step, record) for step in (result.loop, result.refused_loop))
-                    files.write_frame(number, result, *places)
+                    files.write_frame(number, result, self._place(result.loop), self._place(result.refused_loop))
                     if score is not None:
                         score.add(number, result, labels_in_images(self.sequence, number, result.features))
                     if self.options.record is not None:
@@ -165,28 +199,40 @@ class _Run:
             finally:
                 if self.live is not None and self.live.ended_early and stopped_by is None:
                     ended = "ended by the user"
-                summary = self._finish(files, ended, score)
+                summary = self._head(ended)
+                if record.stamps:
+                    self._write_last(files, summary, score)
+                summary["seed"] = getattr(self.sequence, "values", {}).get("seed", 0)  # nothing else is random
+                summary |= {"configuration": self.options.config.to_json(), "versions": versions()}
+                with self._each():
+                    write_json(self.options.out / "summary.json", summary)
                 self._write_copies()
                 if self.failures:
                     summary["failures"] = self._said()
                     with self._each():
-                        files.write_json("summary.json", summary)
-                self._report(stopped_by)
+                        write_json(self.options.out / "summary.json", summary)
+                self._raise_failures(stopped_by)
         return summary
+
+    def _place(self, step: int | None) -> int | str:
+        """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
+        if step is None:
+            return ""
+        return self.record.numbers[step] if step >= 0 else "map"
 
     @contextmanager
     def _each(self) -> Iterator[None]:
         """One of the last files: it is written although another one failed."""
         try:
             yield
-        except Exception as error:  # noqa: BLE001 `_report` raises it
+        except Exception as error:  # noqa: BLE001 `_raise_failures` raises it
             self.failures.append(error)
 
     def _said(self) -> list[str]:
         """What failed, a line each."""
         return [one_line(text_of(error)) or type(error).__name__ for error in self.failures]
 
-    def _report(self, stopped_by: BaseException | None) -> None:
+    def _raise_failures(self, stopped_by: BaseException | None) -> None:
         """Raise what failed, in one line with the error that stopped the run; a signal goes on, after warnings.
 
         Raises:
@@ -206,6 +252,25 @@ class _Run:
         first = [] if stopped_by is None else [str(stopped_by)]
         kind = SlamError if stopped_by is None else type(stopped_by)
         raise kind("; ".join(dict.fromkeys([*first, *lines]))) from stopped_by
+
+    def _write_last(self, files: RunFiles, summary: dict[str, Any], score: Any) -> None:
+        """Write the files that are made at the end but the summary, and add to that how good the run was."""
+        system, record, sequence = self.system, self.record, self.sequence
+        final = Trajectory.empty()
+        with self._each():
+            final = system.trajectory()
+            write_trajectory(self.options.out / "trajectory_final.txt", final)
+        with self._each():
+            pairs = with_truth(record.trajectory, sequence)
+            if pairs is not None:
+                write_trajectory(self.options.out / "truth.txt", pairs[1])
+        with self._each():
+            files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
+        if isinstance(system, StereoSlam) and system.landmarks is not None:
+            with self._each():
+                files.write_old_landmarks(system.atlas, system.landmarks.ids)
+        with self._each():
+            summary |= results_of(sequence, system, record, final, score)
 
     def _write_copies(self) -> None:
         """The recording and the map, where they were asked for."""
@@ -236,35 +301,8 @@ class _Run:
         models, truth = options.config.models, sequence.ground_truth
         return Recording(sequence.name, sequence.rig, models, tuple(self.tape), truth, kind=sequence.kind)
 
-    def _finish(self, files: RunFiles, ended: str, score: ObjectScore | None) -> dict[str, Any]:
-        """Write the last files, each whether or not another fails, and return the summary."""
-        summary = self._head(ended)
-        system, record, sequence = self.system, self.record, self.sequence
-        if record.stamps:
-            final = Trajectory.empty()
-            with self._each():
-                final = system.trajectory()
-                files.write_trajectory("trajectory_final.txt", final)
-            with self._each():
-                pairs = with_truth(record.trajectory, sequence)
-                if pairs is not None:
-                    files.write_trajectory("truth.txt", pairs[1])
-            with self._each():
-                files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
-            if isinstance(system, StereoSlam) and system.landmarks is not None:
-                with self._each():
-                    files.write_old_landmarks(system.atlas, system.landmarks.ids)
-            with self._each():
-                summary.update(results_of(sequence, system, record, final, score))
-        summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
-        summary["configuration"] = self.options.config.to_json()
-        summary["versions"] = versions()
-        with self._each():
-            files.write_json("summary.json", summary)
-        return summary
-
     def _head(self, ended: str) -> dict[str, Any]:
-        """The summary's first part: what was run, how it ended, and whether the camera was tracked."""
+        """The part of the summary that is known of every run: what was run, how it ended, and the tracking."""
         options, record, sequence = self.options, self.record, self.sequence
         warnings = getattr(self.system, "warnings", ())
         driving = options.origin.get("kind") == "driving"
@@ -285,11 +323,8 @@ class _Run:
         }
 
     def _names(self) -> dict[str, Any]:
-        options, sequence = self.options, self.sequence
-        return {
-            "sequence": sequence.name, "format": sequence.format, "frontend": options.frontend,
-            "backend": options.backend,
-        }  # fmt: skip
+        names = {"sequence": self.sequence.name, "format": self.sequence.format}
+        return names | {"frontend": self.options.frontend, "backend": self.options.backend}
 
     def _config(self) -> dict[str, Any]:
         """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
@@ -303,49 +338,3 @@ class _Run:
             "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
             "versions": versions(),
         }
-
-
-def _place(step: int | None, record: RunRecord) -> int | str:
-    """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
-    if step is None:
-        return ""
-    return record.numbers[step] if step >= 0 else "map"
-
-
-def _processed(
-    system: StereoSlam, reading: _Reading, watches: tuple[Watch, ...], overlap: bool, record: RunRecord
-) -> Iterator[tuple[int, FrameResult]]:
-    """Each frame's number and what the system did with it."""
-    for frame, result in system.run(reading, overlap):
-        result.milliseconds["read"] = reading.milliseconds.pop(frame.index)  # type: ignore[index]
-        if reading.live is not None:
-            record.ages.append(reading.live.age(frame))
-        if frame.right is None:
-            record.without_right.append(len(record.statuses))
-        record.depths.append(median_depth(result.features, system.rig))
-        yield frame.index, result
-        for watch in watches:
-            watch(frame, result, system)
-
-
-class _Reading:
-    """Frames, and the wall time that reading each took [ms] by its index; nothing in a live run, which waits for them.
-
-    Args:
-        frames: to be read.
-        live: where they come from in a live run; else None.
-    """
-
-    def __init__(self, frames: Iterator[StereoFrame], live: LiveFrames | None = None) -> None:
-        self._frames = frames
-        self.live = live
-        self.milliseconds: dict[int, float] = {}
-
-    def __iter__(self) -> Iterator[StereoFrame]:
-        while True:
-            start = time.perf_counter()
-            frame = next(self._frames, None)
-            if frame is None:
-                return
-            self.milliseconds[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
-            yield frame

@@ -21,21 +21,13 @@ _PARTS = ("frontend", "backend")  # sections whose settings are those of a class
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting.
+    """One setting."""
 
-    Attributes:
-        key: as ``--set`` takes it, such as ``"map.grid"``.
-        owner: the front end or back end that has it; empty for settings that all runs have.
-        defaults: by kind of motion.
-        unit: empty for words, counts and ratios.
-        text: what it means.
-    """
-
-    key: str
-    owner: str
-    defaults: dict[str, Any]
-    unit: str
-    text: str
+    key: str  # as ``--set`` takes it, such as ``"map.max_landmarks"``
+    owner: str  # the front end or back end that has it; empty for settings that all runs have
+    defaults: dict[str, Any]  # by kind of motion
+    unit: str  # empty for words, counts and ratios
+    text: str  # what it means
 
 
 def settings() -> Iterator[Setting]:
@@ -44,20 +36,32 @@ def settings() -> Iterator[Setting]:
     for f in fields(SystemConfig):
         if f.name not in _PARTS:
             yield from _of_class({kind: getattr(config, f.name) for kind, config in configs.items()}, f.name, "")
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
-            parts = {kind: _config_of(section, name, kind) for kind in KINDS}
+            named: dict[str, Any] = {section: name}
+            parts = {}
+            for kind in KINDS:
+                options = getattr(SystemConfig.for_kind(kind, **named), section)
+                parts[kind] = getattr(registry.create(f"{section}s", name, rig, **options), "config", None)
             if all(map(is_dataclass, parts.values())):
                 yield from _of_class(parts, section, name)
 
 
-def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
-    """Unit and meaning of each setting of a configuration, by key; nested configurations included.
+def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
+    """Settings of one configuration class, given its instances by kind of motion."""
+    first = next(iter(configs.values()))
+    texts = documented(type(first))
+    for f in fields(first):
+        values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
+        if is_dataclass(getattr(first, f.name)):
+            yield from _of_class(values, key, owner)
+        elif can_be_set(key, owner):
+            yield Setting(key, owner, values, *texts.get(f.name, ("", "")))
 
-    Args:
-        config: a dataclass with its fields described under ``Attributes:``; nothing comes of another object.
-        section: its name, in front of each key.
-    """
+
+def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
+    """Unit and meaning of each setting of a configuration below `section`, by key; nothing of another object."""
     found: dict[str, dict[str, str]] = {}
     if not is_dataclass(config) or isinstance(config, type):
         return found
@@ -67,8 +71,7 @@ def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
         if is_dataclass(value):
             found |= descriptions(value, key)
         elif section:
-            unit, text = texts.get(f.name, ("", ""))
-            found[key] = {"unit": unit, "meaning": text}
+            found[key] = dict(zip(("unit", "meaning"), texts.get(f.name, ("", ""))))
     return found
 
 
@@ -84,27 +87,6 @@ def documented(kind: type) -> dict[str, tuple[str, str]]:
                 unit = units[i] if len(units) == len(each) else units[0] if units else ""
                 found[name] = unit, plain.replace("``", "").rstrip(".")
     return found
-
-
-def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
-    """Settings of one configuration class, given its instances by kind of motion."""
-    first = next(iter(configs.values()))
-    texts = documented(type(first))
-    for f in fields(first):
-        values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
-        if is_dataclass(getattr(first, f.name)):
-            yield from _of_class(values, key, owner)
-        elif can_be_set(key, owner):
-            unit, text = texts.get(f.name, ("", ""))
-            yield Setting(key, owner, values, unit, text)
-
-
-def _config_of(section: str, name: str, kind: str) -> Any:
-    """The configuration of a front end or back end as it is made by default; None where it has none."""
-    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
-    named: dict[str, Any] = {section: name}
-    options = getattr(SystemConfig.for_kind(kind, **named), section)
-    return getattr(registry.create(f"{section}s", name, rig, **options), "config", None)
 
 
 def in_force(part: object) -> dict[str, Any] | None:

@@ -119,51 +119,54 @@ def results_of(
     final: Trajectory,
     score: ObjectScore | None,
 ) -> dict[str, Any]:
-    """The part of a summary that says how good the run was."""
-    measured = np.array(record.measured)
+    """The part of a summary that says how good the run was; frames whose pose was not measured are in no error."""
+    measured, path = np.array(record.measured), record.trajectory
+    online, steps = path.select(measured), np.diff(path.positions, axis=0)
+    speeds = np.linalg.norm(steps, axis=1) / np.diff(path.stamps)
+    common = [record.common[row] for row in np.flatnonzero(measured)]
     found: dict[str, Any] = {
-        "path_length_m": record.trajectory.length,
-        "speed_m_per_s": _speed(record.trajectory),
+        "path_length_m": path.length,
+        "speed_m_per_s": float(np.median(speeds)) if len(speeds) else None,
         "final_sigma_m": float(np.sqrt(np.trace(record.covariances[-1][3:, 3:]))),
         "landmarks": 0 if system.landmarks is None else len(system.landmarks),
         "observations": {"used": record.used, "rejected": record.rejected},
         "accuracy": {
-            "online": evaluate(record.trajectory.select(measured), sequence),
-            "final": evaluate(final.select(np.isin(final.stamps, record.trajectory.stamps[measured])), sequence),
+            "online": evaluate(online, sequence),
+            "final": evaluate(final.select(np.isin(final.stamps, online.stamps)), sequence),
             "poses left out": int((~measured).sum()),
         },
         "consistency": {
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **consistency(
-                record.trajectory.select(measured),
-                np.array(record.covariances)[measured],
-                sequence,
-                [record.common[row] for row in np.flatnonzero(measured)],
-            ),
+            **consistency(online, np.array(record.covariances)[measured], sequence, common),
         },
     }
     if isinstance(system, StereoSlam):
-        if found["consistency"].get("mean NEES") is not None and system.config.self_calibration.enabled:
-            found["consistency"] |= _exactness(sequence)
+        values = getattr(sequence, "values", None)  # of a world: with recordings nobody knows
+        if "mean NEES" in found["consistency"] and system.config.self_calibration.enabled and values is not None:
+            found["consistency"][EXACT] = not (values["focal_error"] or values["turn_error"])
         found["self_calibration"] = system.calibration.summary()
         found["loops"] = system.atlas.summary()
         found["bodies"] = len(record.bodies)
         if system.atlas.loops or system.atlas.refused:
-            path = record.trajectory
             odometry = Trajectory(path.stamps, inverse(np.array(record.T_map_odom)) @ path.poses)
             found["accuracy"]["online without loops"] = evaluate(odometry.select(measured), sequence)
     if score is not None:
         found["objects"] = score.summary()
-    compiled = compile_clock.seconds() - record.compiled_before
+    return found | _times(record)
+
+
+def _times(record: RunRecord) -> dict[str, Any]:
+    """Medians per stage, and the rate, over all frames but the first, which may wait for compilers."""
+    totals = [sum(each.values()) for each in record.milliseconds]
+    later = record.milliseconds[1:] or record.milliseconds
+    median = {stage: float(np.median([each.get(stage, 0.0) for each in later])) for stage in STAGES}
+    seconds = record.times[-1] - record.times[0]
+    times = {"median": median, "median_total": float(np.median(totals[1:] or totals)), "first_frame": totals[0]}
     return {
-        **found, "milliseconds": _timings(record), "frames_per_second": _rate(record), "compile_seconds": compiled,
-    }  # fmt: skip
-
-
-def _exactness(sequence: Sequence | Recording) -> dict[str, bool]:
-    """Whether a world's cameras are those of its calibration; nothing of recordings, where nobody knows."""
-    values = getattr(sequence, "values", None)
-    return {} if values is None else {EXACT: not (values["focal_error"] or values["turn_error"])}
+        "milliseconds": times,
+        "frames_per_second": (len(record.times) - 1) / seconds if seconds > 0 else None,
+        "compile_seconds": compile_clock.seconds() - record.compiled_before,
+    }
 
 
 def live_frames(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
@@ -174,23 +177,3 @@ def live_frames(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
         "milliseconds behind": {"median": float(np.median(later)), "max": float(later.max())},
         "clock waited [s]": live.clock_waited,
     }
-
-
-def _speed(path: Trajectory) -> float | None:
-    """Median speed [m/s]; None for a single pose."""
-    steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1) / np.diff(path.stamps)
-    return float(np.median(steps)) if len(steps) else None
-
-
-def _rate(record: RunRecord) -> float | None:
-    """Frames per second over all frames but the first, compiling left out; None for a single frame."""
-    seconds = record.times[-1] - record.times[0]
-    return (len(record.times) - 1) / seconds if seconds > 0 else None
-
-
-def _timings(record: RunRecord) -> dict[str, Any]:
-    """Median per stage over all frames but the first, and the first frame's total [ms]."""
-    totals = [sum(m.values()) for m in record.milliseconds]
-    later = record.milliseconds[1:] or record.milliseconds
-    median = {stage: float(np.median([m.get(stage, 0.0) for m in later])) for stage in STAGES}
-    return {"median": median, "median_total": float(np.median(totals[1:] or totals)), "first_frame": totals[0]}

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import Estimate, FrameResult, StereoFrame
+from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError
 from slam.files import noting_inputs, require_utf8
 from slam.geometry.rig import StereoRig
@@ -46,14 +46,16 @@ class Viewer:
     """
 
     def __init__(self, target: str, rig: StereoRig | None = None, truth: Trajectory | None = None) -> None:
-        self._rr = _rerun()
+        try:
+            self.rr = import_module("rerun")
+        except ImportError as error:
+            raise SlamError("the viewer needs Rerun: pip install 'surf-stereo-slam[viewer]'") from error
         self._target = target
-        self._recording = _open(self._rr, target)
-        self._rig = rig
+        self._recording = _open(self.rr, target)
+        self._rig, self._truth = rig, truth
         self._start: float | None = None
         self._path: list[Array] = []
-        self._truth = truth
-        self._log("world", self._rr.ViewCoordinates.RDF, static=True)
+        self.log("", self.rr.ViewCoordinates.RDF, static=True)
 
     def __enter__(self) -> Viewer:
         return self
@@ -68,28 +70,29 @@ class Viewer:
 
     def show(self, frame: StereoFrame, result: FrameResult, system: StereoSlam) -> None:
         """One more frame, right after its step."""
-        rr, e, features = self._rr, result.estimate, result.features
-        self._at(frame.index, e.stamp)
-        if self._truth is not None and not self._path:
-            self._draw_truth(e)
-        self._camera(e.T_world_left)
+        rr, e, pixels = self.rr, result.estimate, result.features.uv_left
+        if self._truth is not None and not self._path:  # placed by the first pose
+            at = int(np.argmin(np.abs(self._truth.stamps - e.stamp)))
+            placed = e.T_world_left @ inverse(self._truth.poses[at]) @ self._truth.poses
+            self.log("/truth", rr.LineStrips3D([placed[:, :3, 3]], colors=_TRUTH), static=True)
+        self.show_pose(frame.index, e.stamp, e.T_world_left)
         image = frame.left if frame.left.ndim == 2 else frame.left[..., 2::-1]
         if image.dtype == np.uint8 and self._rig is not None:
-            self._log("world/camera/image", rr.Image(image).compress(jpeg_quality=80))
-        kinds = (
-            ("measured", result.matched_features, _SEEN),
-            ("new", result.added_features, _NEW),
-            ("moving", result.moving_features, _MOVING),
-        )
-        for name, rows, colour in kinds:
-            self._log(f"world/camera/image/{name}", rr.Points2D(features.uv_left[rows], colors=colour, radii=2.0))
+            self.log("/camera/image", rr.Image(image).compress(jpeg_quality=80))
+        kinds = {
+            "measured": (result.matched_features, _SEEN),
+            "new": (result.added_features, _NEW),
+            "moving": (result.moving_features, _MOVING),
+        }
+        for name, (rows, colour) in kinds.items():
+            self.log(f"/camera/image/{name}", rr.Points2D(pixels[rows], colors=colour, radii=2.0))
         for moving in result.objects:
-            T, box = moving.estimate.T_world_object, moving.extent
-            self._log(f"world/objects/{moving.id}", _transform(rr, T))
+            place, box = f"/objects/{moving.id}", moving.extent
+            self.log(place, self._transform(moving.estimate.T_world_object))
             boxes = rr.Boxes3D(centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=_MOVING)
-            self._log(f"world/objects/{moving.id}/box", boxes)
+            self.log(f"{place}/box", boxes)
         if result.keyframe:
-            self._draw_places(system)
+            self._show_places(system)
         if result.index % _MAP_EVERY == 0:
             whole = system.estimate()
             self.show_map(whole.positions, whole.covariances, np.isin(whole.ids, result.matched))
@@ -100,58 +103,43 @@ class Viewer:
         vectors *= np.sign(np.linalg.det(vectors))[:, None, None]
         half = _SIGMAS * np.sqrt(np.maximum(values, 0))
         for name, rows, colour in (("seen", seen, _SEEN), ("not_seen", ~seen, _UNSEEN)):
-            shapes = self._rr.Ellipsoids3D(
+            shapes = self.rr.Ellipsoids3D(
                 centers=positions[rows], half_sizes=half[rows], quaternions=quaternion(vectors[rows]), colors=colour
             )
-            self._log(f"world/map/{name}", shapes)
+            self.log(f"/map/{name}", shapes)
 
     def show_pose(self, number: int, stamp: float, T_world_left: Array) -> None:
         """The camera alone."""
-        self._at(number, stamp)
-        self._camera(T_world_left)
-
-    def show_object(self, name: str, position: list[float]) -> None:
-        """Where a moving object is [m]."""
-        self._log(f"world/objects/{name}", self._rr.Points3D([position], colors=_MOVING, radii=0.03))
-
-    def _camera(self, T_world_left: Array) -> None:
-        rr = self._rr
+        rr = self.rr
+        self._start = stamp if self._start is None else self._start
+        self._recording.set_time("frame", sequence=number)
+        self._recording.set_time("time", duration=stamp - self._start)
         self._path.append(T_world_left[:3, 3])
-        self._log("world/camera", _transform(rr, T_world_left))
+        self.log("/camera", self._transform(T_world_left))
         if self._rig is not None:
             left = self._rig.left
             K = [[left.fu, 0, left.u0], [0, left.fv, left.v0], [0, 0, 1]]
             pinhole = rr.Pinhole(image_from_camera=K, resolution=[left.width, left.height], image_plane_distance=0.2)
-            self._log("world/camera/image", pinhole)
-        self._log("world/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
+            self.log("/camera/image", pinhole)
+        self.log("/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
 
-    def _draw_places(self, system: StereoSlam) -> None:
+    def _show_places(self, system: StereoSlam) -> None:
         """Keyframes, the path through them as loops have corrected it, and loops, closed and refused."""
-        rr, atlas = self._rr, system.atlas
+        rr, atlas = self.rr, system.atlas
         at = atlas.poses_in_map()[:, :3, 3]
-        self._log("world/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
-        self._log("world/places/path", rr.LineStrips3D([at[atlas.prior_count :]], colors=_PLACE))
-        for name, pairs, colour in (
-            ("closed", [(loop.first, loop.second) for loop in atlas.loops], _CLOSED),
-            ("refused", atlas.refused, _REFUSED),
-        ):
+        self.log("/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
+        self.log("/places/path", rr.LineStrips3D([at[atlas.prior_count :]], colors=_PLACE))
+        closed = [(loop.first, loop.second) for loop in atlas.loops]
+        for name, pairs, colour in (("closed", closed, _CLOSED), ("refused", atlas.refused, _REFUSED)):
             strips = at[np.array(pairs, int).reshape(-1, 2)]
-            self._log(f"world/places/loops_{name}", rr.LineStrips3D(strips, colors=colour))
+            self.log(f"/places/loops_{name}", rr.LineStrips3D(strips, colors=colour))
 
-    def _draw_truth(self, first: Estimate) -> None:
-        """The true path, placed by the first pose."""
-        assert self._truth is not None
-        at = int(np.argmin(np.abs(self._truth.stamps - first.stamp)))
-        placed = first.T_world_left @ inverse(self._truth.poses[at]) @ self._truth.poses
-        self._log("world/truth", self._rr.LineStrips3D([placed[:, :3, 3]], colors=_TRUTH), static=True)
+    def _transform(self, T: Array) -> Any:
+        return self.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
 
-    def _at(self, number: int, stamp: float) -> None:
-        self._start = stamp if self._start is None else self._start
-        self._recording.set_time("frame", sequence=number)
-        self._recording.set_time("time", duration=stamp - self._start)
-
-    def _log(self, path: str, what: Any, static: bool = False) -> None:
-        self._recording.log(path, what, static=static)
+    def log(self, path: str, what: Any, static: bool = False) -> None:
+        """Show something at its place below the world."""
+        self._recording.log(f"world{path}", what, static=static)
 
 
 def outputs(target: str, option: str) -> list[Output]:
@@ -162,13 +150,7 @@ def outputs(target: str, option: str) -> list[Output]:
 def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
     """Show a finished run from its files: path, objects, and the map at its end; images are not among them.
 
-    Args:
-        folder: of the run.
-        target: as of `Viewer`.
-        overwrite: whether a file that is there may be replaced.
-
-    Raises:
-        SlamError: the folder does not hold a finished run, or see `Viewer`.
+    Raises SlamError where the folder does not hold a finished run, and as `Viewer` does.
     """
     with noting_inputs() as inputs:
         run, objects = RunData.read(folder, folder.name), read_objects(folder)
@@ -178,19 +160,8 @@ def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
             viewer.show_pose(number, float(stamp), pose)
             for seen, name, position in objects:
                 if abs(seen - stamp) < 1e-6:
-                    viewer.show_object(name, position)
+                    viewer.log(f"/objects/{name}", viewer.rr.Points3D([position], colors=_MOVING, radii=0.03))
         viewer.show_map(run.positions, run.covariances, run.seen_last)
-
-
-def _transform(rr: Any, T: Array) -> Any:
-    return rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
-
-
-def _rerun() -> Any:
-    try:
-        return import_module("rerun")
-    except ImportError as error:
-        raise SlamError("the viewer needs Rerun: pip install 'surf-stereo-slam[viewer]'") from error
 
 
 def _open(rr: Any, target: str) -> Any:

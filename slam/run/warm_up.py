@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
+from pathlib import Path
 
 from slam.data import FrameResult
 from slam.registry import ONLINE
 from slam.runtime.compile_clock import compile_clock
+from slam.runtime.cores import available_cores
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
@@ -41,17 +47,50 @@ def warm_up(*backends: str, until: threading.Event | None = None) -> float:
         >>> seconds = slam.warm_up("ekf")
     """
     before = compile_clock.seconds()
-    for _ in chain.from_iterable(_frames(backend) for backend in backends or ONLINE):
+    for _ in chain.from_iterable(chain(_with_images(name), _with_bodies(name)) for name in backends or ONLINE):
         if until is not None and until.is_set():
             break
     return compile_clock.seconds() - before
 
 
-def _frames(backend: str) -> Iterator[FrameResult]:
-    """All frames of the scenes, processed."""
+def _with_images(backend: str) -> Iterator[FrameResult]:
     for scene in _SCENES:
         sequence = open_sequence(scene)
         yield from (result for _, result in StereoSlam(sequence.rig, backend=backend).run(sequence))
+
+
+def _with_bodies(backend: str) -> Iterator[FrameResult]:
     world = open_sequence(_BODIES)
     system = StereoSlam(world.rig, None, backend, kind=world.kind)
     yield from (system.process_features(seen.features) for seen in world.observe())  # type: ignore[attr-defined]
+
+
+@contextmanager
+def compiled_in_background(backend: str) -> Iterator[None]:
+    """Where nothing is compiled yet, a second process compiles the kernels of back end and moving objects meanwhile.
+
+    Numba compiles one function at a time in a process, and the first frame waits for the front end's kernels anyway.
+    What the second process has made is loaded from Numba's cache; what is not there in time is compiled here. It ends
+    with the block, or when it is done.
+    """
+    from slam.objects.scene_kernels import groups_apart
+
+    folder = groups_apart.stats.cache_path
+    cold = folder is not None and not any(Path(folder).glob("scene_kernels.groups_apart-*.nbi"))
+    if available_cores() < 2 or not cold:
+        yield
+        return
+    command = [sys.executable, "-P", "-m", __name__, backend]  # -P: no module of the working folder
+    paths, nowhere = os.pathsep.join(filter(None, sys.path)), subprocess.DEVNULL
+    environment = {**os.environ, "PYTHONPATH": paths}
+    process = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=environment)
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+if __name__ == "__main__":
+    for _ in _with_bodies(sys.argv[1]):
+        pass

@@ -116,10 +116,10 @@ def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monke
     ("setting", "meant"),
     [
         ("map.max_landmark=3", "'max_landmarks'"),
-        ("mpa.grid=3", "'map.grid'"),
+        ("mpa.monocular=true", "'map.monocular'"),
         ("mapp.gird=3", "'map'"),
         ("max_landmarks=3", "'map.max_landmarks'"),
-        ("map.max_speed=3", "'models.objects.max_speed' or 'objects.max_speed'"),
+        ("map.max_speed=3", "'objects.max_speed'"),  # not that of the models, which cannot be set
     ],
 )
 def test_a_setting_is_suggested(setting, meant):

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -24,20 +25,16 @@ def fails_with_one_line(done, *words):
 @pytest.fixture
 def euroc(tmp_path):
     """A tiny EuRoC folder of noise images."""
-    import cv2
-
-    rng = np.random.default_rng(0)
-    folder = tmp_path / "euroc"
+    rng, folder = np.random.default_rng(0), tmp_path / "euroc"
     for camera, x in (("cam0", 0.0), ("cam1", 0.11)):
         data = folder / "mav0" / camera / "data"
         data.mkdir(parents=True)
-        rows = "#timestamp [ns],filename\n"
-        for k in range(3):
-            name = f"{1_000_000_000 + 50_000_000 * k}.png"
-            cv2.imwrite(str(data / name), rng.integers(0, 255, (120, 160), dtype=np.uint8))
-            rows += f"{name[:-4]},{name}\n"
-        (folder / "mav0" / camera / "data.csv").write_text(rows)
-        (folder / "mav0" / camera / "sensor.yaml").write_text(
+        stamps = [1_000_000_000 + 50_000_000 * k for k in range(3)]
+        for stamp in stamps:
+            cv2.imwrite(str(data / f"{stamp}.png"), rng.integers(0, 255, (120, 160), dtype=np.uint8))
+        rows = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
+        (data.parent / "data.csv").write_text(f"#timestamp [ns],filename\n{rows}")
+        (data.parent / "sensor.yaml").write_text(
             f"sensor_type: camera\nT_BS:\n  rows: 4\n  cols: 4\n  data: [1,0,0,{x}, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n"
             "resolution: [160, 120]\ncamera_model: pinhole\nintrinsics: [150, 150, 80, 60]\n"
             "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
@@ -54,13 +51,12 @@ def test_a_good_folder_of_noise_runs_and_says_that_nothing_was_tracked(euroc, tm
     assert said.startswith("slam: no frame was tracked; likely cause: in the median of these frames")
 
 
-def test_missing_folder(tmp_path):
-    fails_with_one_line(in_a_new_process("run", tmp_path / "nowhere", "--out", tmp_path / "out"), "nowhere")
-
-
-def test_empty_folder(slam_command, tmp_path):
+def test_a_folder_that_is_missing_or_empty(slam_command, tmp_path):
     (tmp_path / "empty").mkdir()
+    fails_with_one_line(in_a_new_process("run", tmp_path / "nowhere", "--out", tmp_path / "out"), "nowhere")
     fails_with_one_line(slam_command("run", tmp_path / "empty", "--out", tmp_path / "out"), "empty")
+    for command in ("run", "render"):
+        fails_with_one_line(slam_command(command, "", "--out", tmp_path / "out"), "path is empty")
 
 
 def test_cameras_swapped(slam_command, euroc, tmp_path):
@@ -96,11 +92,6 @@ def test_a_truncated_image_is_said_and_the_rest_goes_on(slam_command, euroc, tmp
 )
 def test_unknown_names_and_keys(slam_command, euroc, tmp_path, arguments, words):
     fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out", *arguments), *words)
-
-
-@pytest.mark.parametrize("command", ["run", "render"])
-def test_an_empty_sequence(slam_command, command, tmp_path):
-    fails_with_one_line(slam_command(command, "", "--out", tmp_path / "out"), "path is empty")
 
 
 @pytest.mark.slow

@@ -6,14 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.commands.plot import plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import pose_errors
 from slam.run.options import RunOptions
 from slam.run.plots import KINDS
-from slam.run.run_data import RunData
+from slam.run.plots import plot_folders as plot_runs
+from slam.run.run_data import RunData, pose_errors
 from slam.run.runner import run
 from slam.sequences import open_sequence
 
@@ -22,41 +21,37 @@ WORLD = "synthetic:aisle?frames=8&width=160&height=120"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Folders of three runs of one world: two back ends, and some frames only; and of a run of another world."""
-    root = tmp_path_factory.mktemp("runs")
-    config = SystemConfig.for_kind("handheld")
-    for name, backend, start in (("a", "ekf", 0), ("b", "smoother", 0), ("later", "ekf", 3)):
-        run(open_sequence(WORLD), RunOptions(backend, "surf", config, root / name, start))
-    run(open_sequence("synthetic:desk?frames=3&width=160&height=120"), RunOptions("ekf", "surf", config, root / "desk"))
+    """Folders of two runs of one world by two back ends."""
+    root, config = tmp_path_factory.mktemp("runs"), SystemConfig.for_kind("handheld")
+    for name, backend in (("a", "ekf"), ("b", "smoother")):
+        run(open_sequence(WORLD), RunOptions(backend, "surf", config, root / name))
     return root
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_without_truth_or_objects_is_drawn(runs, tmp_path, kind):
+def test_runs_with_and_without_truth_are_drawn(runs, tmp_path, kind):
     shutil.copytree(runs / "a", tmp_path / "a")
     (tmp_path / "a" / "truth.txt").unlink()
-    plot_runs([tmp_path / "a"], tmp_path / "a.png", kind)
-    assert (tmp_path / "a.png").stat().st_size > 1000
+    for width, folders in ((None, [tmp_path / "a"]), (88.0, [tmp_path / "a", runs / "b"]), (180.0, [runs / "b"])):
+        plot_runs(folders, tmp_path / "a.png", kind, width, overwrite=True)
+        assert (tmp_path / "a.png").stat().st_size > 1000
 
 
-def test_bad_input_is_one_line(runs, tmp_path):
-    with pytest.raises(SlamError, match="not the folder of a finished run"):
-        plot_runs([tmp_path], None, "summary")
-    with pytest.raises(SlamError, match=r"a picture is a file \.png, \.pdf or \.svg"):
-        plot_runs([runs / "a"], tmp_path / "a.jpg", "summary")
-    with pytest.raises(SlamError, match=r"is 50 to 1000 mm, got 8\.8"):
-        plot_runs([runs / "a"], tmp_path / "a.png", "path", 8.8)
-    with pytest.raises(SlamError, match=r"unknown figure 'eror'.*did you mean 'errors'"):
-        plot_runs([runs / "a"], tmp_path / "a.png", "eror")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SlamError, match="cannot be written"):
-        plot_runs([runs / "a"], tmp_path / "file" / "a.png", "path")
-
-
-def test_a_picture_that_is_there_is_not_replaced(runs, tmp_path):
+@pytest.mark.parametrize(
+    ("folder", "file", "kind", "width", "words"),
+    [
+        (".", None, "summary", None, "not the folder of a finished run"),
+        ("a", "a.jpg", "summary", None, r"a picture is a file \.png, \.pdf or \.svg"),
+        ("a", "a.png", "path", 8.8, r"is 50 to 1000 mm, got 8\.8"),
+        ("a", "a.png", "eror", None, r"unknown figure 'eror'.*did you mean 'errors'"),
+        ("a", "paper.pdf/a.png", "path", None, "cannot be written"),
+        ("a", "paper.pdf", "path", None, "is there already"),
+    ],
+)
+def test_bad_input_is_one_line(runs, tmp_path, folder, file, kind, width, words):
     (tmp_path / "paper.pdf").write_text("mine")
-    with pytest.raises(SlamError, match="is there already"):
-        plot_runs([runs / "a"], tmp_path / "paper.pdf", "path")
+    with pytest.raises(SlamError, match=words):
+        plot_runs([runs / folder], file and tmp_path / file, kind, width)
     assert (tmp_path / "paper.pdf").read_text() == "mine"
 
 

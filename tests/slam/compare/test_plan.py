@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from slam.commands.compare import variants_of
+from slam.commands.compare import compare, variants_of
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
+from slam.compare.statistics import certain_of, fewest
+from slam.compare.tables import most_tests
+from slam.compare.wording import caution
 from slam.errors import ConfigurationError
 
 WORLDS = ("synthetic:aisle?frames=30", "synthetic:box")
@@ -17,13 +20,9 @@ def test_trials_are_paired_and_have_folders_of_their_own():
     assert trials[2].source == "synthetic:aisle?frames=30&seed=1"
     assert next(t.source for t in trials if "box" in t.sequence) == "synthetic:box?seed=0"
     assert trials[-1].source == "/data/kitti/01"
-
-
-def test_names_that_differ_in_odd_characters_or_early_alone_stay_apart():
-    long = "x" * 80
+    long = "x" * 80  # names that differ in odd characters, or early, alone
     names = ("synthetic:box?box=1", "synthetic:box?box_1", f"/a/{long}", f"/b/{long}")
-    trials = Plan(names, ("ekf",)).trials_of(CLOSED_LOOP)
-    assert len({t.folder for t in trials}) == 4
+    assert len({t.folder for t in Plan(names, ("ekf",)).trials_of(CLOSED_LOOP)}) == 4
 
 
 @pytest.mark.parametrize(
@@ -35,6 +34,7 @@ def test_names_that_differ_in_odd_characters_or_early_alone_stay_apart():
         ((("synthetic:box?seed=3",), ("ekf",)), "seed"),
         ((("/data",), ("ekf",), (Variant("s", "simulated"),)), "worlds alone"),
         ((WORLDS, ("ekf",), (Variant("surf"),), 0), "at least one trial"),
+        ((WORLDS, ("ekf",), (Variant("surf"),), 10**9), "at most 100000 trials"),
     ],
 )
 def test_bad_plans(arguments, word):
@@ -42,24 +42,31 @@ def test_bad_plans(arguments, word):
         Plan(*arguments)
 
 
+def test_no_more_workers_than_anybody_has(tmp_path):
+    with pytest.raises(ConfigurationError, match="at most 1024 workers"):
+        compare(Plan(("synthetic:desk",), ("ekf",)), tmp_path, workers=10**9)
+
+
 def test_variants():
-    assert parse_variant("small:surf:frontend.descriptor=16:map.max_landmarks=100") == Variant(
-        "small", "surf", ("frontend.descriptor=16", "map.max_landmarks=100")
-    )
-    assert parse_variant("few:map.max_landmarks=100", ("a.b=1",)) == Variant(
-        "few", "surf", ("a.b=1", "map.max_landmarks=100")
-    )
+    few = ("frontend.descriptor=16", "map.max_landmarks=100")
+    assert parse_variant(f"small:surf:{':'.join(few)}") == Variant("small", "surf", few)
+    assert parse_variant("few:map.max_landmarks=100", few[:1]) == Variant("few", "surf", few)
     for bad in ("", ":surf", "a:surf:nothing"):
         with pytest.raises(ConfigurationError, match="form"):
             parse_variant(bad)
+    with pytest.raises(ConfigurationError, match="names no front end and no setting"):
+        parse_variant("a")
     assert variants_of([], [], ["a.b=1"]) == (Variant("surf", "surf", ("a.b=1",)),)
     assert [v.name for v in variants_of(["surf", "simulated"], ["x:a.b=1"], [])] == ["surf", "simulated", "x"]
 
 
-def test_no_more_trials_and_workers_than_anybody_has(tmp_path):
-    from slam.commands.compare import compare
-
-    with pytest.raises(ConfigurationError, match="at most 100000 trials"):
-        Plan(("synthetic:desk",), ("ekf",), trials=10**9)
-    with pytest.raises(ConfigurationError, match="at most 1024 workers"):
-        compare(Plan(("synthetic:desk",), ("ekf",)), tmp_path, workers=10**9)
+def test_how_many_trials_are_enough_is_one_number():
+    """It was 6 before the trials, where one test was counted, and more after them."""
+    tests = most_tests(Plan(WORLDS[:1], ("ekf", "smoother", "window")))
+    enough = fewest(tests)
+    assert certain_of(enough) >= tests > certain_of(enough - 1)
+    assert enough == 12  # as many as there are by default
+    for trials in (1, 2, 8):
+        assert f"{enough} trials are enough for all figures" in caution(trials, tests)
+        assert " or more" not in caution(trials, tests)
+    assert caution(enough, tests) == ""

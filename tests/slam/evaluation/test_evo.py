@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from slam.compare.simulated import SimulatedFrontend, WithoutImages
+from slam.compare.trial import SimulatedFrontend, WithoutImages
 from slam.config import SystemConfig
 from slam.evaluation.summary import evaluate
 from slam.geometry.trajectory import Trajectory

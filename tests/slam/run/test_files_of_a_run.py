@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import resource
-import signal
 import stat
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -25,12 +23,9 @@ from tests.fuzz.runs import Features, Scripted, disk_of
 LAST = ("trajectory_final.txt", "landmarks.csv", "summary.json")
 
 
-def run(tmp_path, backend="ekf", error=None, at=0, **more):
-    options = RunOptions(backend, "none", SystemConfig(), tmp_path / "out", **more)
-    return runner.run(Scripted(error, at), options, frontend=Features())
-
-
-# --- single files ---
+def run(tmp_path, sequence=None, watches=(), **more):
+    options = RunOptions("ekf", "none", SystemConfig(), tmp_path / "out", **more)
+    return runner.run(sequence or Scripted(None, 0), options, frontend=Features(), watches=watches)
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path):
@@ -69,9 +64,6 @@ def test_no_more_is_read_than_allowed(tmp_path):
     assert read_bytes("/proc/self/stat", 100_000) == b""  # whatever it holds, it says no size
 
 
-# --- a folder ---
-
-
 def test_two_runs_do_not_share_a_folder(tmp_path):
     with RunFiles(tmp_path / "out"), pytest.raises(SlamError, match="another run is writing to this folder"):
         RunFiles(tmp_path / "out")
@@ -89,10 +81,9 @@ def test_a_disk_that_fills_up_half_way(tmp_path):
             hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
             resource.setrlimit(resource.RLIMIT_FSIZE, ((out / "frames.csv").stat().st_size + 10, hard))
 
-    options = RunOptions("ekf", "none", SystemConfig(), out)
     words = r"out: File too large; .*summary\.json: cannot be written: File too large$"
     with pytest.raises(SlamError, match=words) as caught, disk_of(10**6):
-        runner.run(Scripted(None, 0), options, frontend=Features(), watches=[fill])
+        run(tmp_path, watches=[fill])
     assert "\n" not in str(caught.value)
     assert (out / "trajectory.txt").read_text().count("\n") == 4
     assert (out / "frames.csv").read_text().count("\n") == 5
@@ -110,9 +101,8 @@ def test_one_last_file_that_fails_loses_no_other(tmp_path, bad):
             yield from super().frames()
             place.mkdir()  # in its place, when the run has begun
 
-    options = RunOptions("ekf", "none", SystemConfig(), tmp_path / "out", record=record, save_map=save_map)
     with pytest.raises(SlamError, match=bad) as caught:
-        runner.run(Late(None, 0), options, frontend=Features())
+        run(tmp_path, Late(None, 0), record=record, save_map=save_map)
     assert str(caught.value).count("cannot be written") <= 2
     others = [p for p in (*(tmp_path / "out" / n for n in LAST), record, save_map) if p.name != bad]
     assert all(p.is_file() and p.stat().st_size for p in others)
@@ -139,41 +129,8 @@ def test_an_error_on_its_way_is_not_replaced(tmp_path, caplog):
         pass
 
     with pytest.raises(Stop), disk_of(5000):
-        run(tmp_path, error=Stop("stop"), at=2, record=tmp_path / "a.npz")
+        run(tmp_path, Scripted(Stop("stop"), 2), record=tmp_path / "a.npz")
     assert any("cannot be written" in line for line in caplog.messages)
-
-
-# --- signals ---
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ignored", [False, True])
-def test_a_closed_terminal_leaves_a_summary(tmp_path, ignored):
-    """And where it is to be ignored, as `nohup` has it, the run goes on."""
-    frames = 12 if ignored else 2000
-    command = [sys.executable, "-m", "slam", "run", f"synthetic:desk?frames={frames}&width=128&height=96"]
-    handler = signal.SIG_IGN if ignored else signal.SIG_DFL  # whatever the tests themselves were started with
-    process = subprocess.Popen(
-        [*command, "--out", str(tmp_path), "--quiet"],
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, handler),
-    )
-    path = tmp_path / "trajectory.txt"
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and (not path.exists() or path.read_text().count("\n") < 3):
-        time.sleep(0.02)
-    process.send_signal(signal.SIGHUP)
-    _, errors = process.communicate(timeout=120)
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    if ignored:
-        assert process.returncode == 0 and summary["frames"] == frames
-    else:
-        assert process.returncode == 129 and "stopped by SIGHUP" in errors
-        assert summary["ended"] == "stopped: SIGHUP" and 3 <= summary["frames"] < frames
-
-
-# --- limits of the machine ---
 
 
 def test_too_little_address_space_is_one_line():

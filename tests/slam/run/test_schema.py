@@ -19,40 +19,25 @@ from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, header
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=4&width=160&height=120"
-
-
-def markdown(table):
-    """The rows of a table as ``docs/files.md`` has them."""
-    rows = [f"| {_spelled(c.names)} | {c.unit or '–'} | {c.text} |" for c in table]
-    return ["| column | unit | holds |", "| --- | --- | --- |", *rows]
-
-
-def _spelled(names):
-    """Names of columns; of many the first and the last."""
-    return (
-        ", ".join(f"`{name}`" for name in names) if len(names) <= 8 else f"`{names[0]}`, `{names[1]}` … `{names[-1]}`"
-    )
+PLACE = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 def body(id, seed):
     """A moving body with a full covariance, all of its numbers different."""
     rng = np.random.default_rng(seed)
-    A = rng.normal(size=(6, 12))
-    T = pose(rotation(rng.normal(size=3) / 3), rng.normal(size=3))
-    none = np.zeros(0, np.int64)
+    A, none = rng.normal(size=(6, 12)), np.zeros(0, np.int64)
+    T, motion = (pose(rotation(rng.normal(size=3) / scale), rng.normal(size=3)) for scale in (3, 9))
     e = ObjectEstimate(id, 0.1 * seed, T, A @ A.T, rng.normal(size=6), A @ A.T, bool(seed % 2), none, none)
-    return MovingObject(
-        id, none, e, pose(rotation(rng.normal(size=3) / 9), rng.normal(size=3)), T, A[:2, :3], id == 1, 0.1, 0.05, 0.75
-    )
+    return MovingObject(id, none, e, motion, T, A[:2, :3], id == 1, 0.1, 0.05, 0.75)
 
 
 BODIES = {2: (body(1, 1),), 3: (body(1, 2), body(4, 3))}
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    """The folder of a short run that is told of moving bodies, and its summary."""
-    out = tmp_path_factory.mktemp("run")
+def out(tmp_path_factory):
+    """The folder of a short run that is told of moving bodies."""
+    folder = tmp_path_factory.mktemp("run")
     write = RunFiles.write_frame
 
     def write_frame(files, number, result, *places):
@@ -60,35 +45,32 @@ def done(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RunFiles, "write_frame", write_frame)
-        origin = Origin("slam run", WORLD, None, "handheld").to_json(out)
-        options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), out, origin=origin)
-        return out, run(open_sequence(WORLD), options)
+        origin = Origin("slam run", WORLD, None, "handheld").to_json(folder)
+        options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), folder, origin=origin)
+        run(open_sequence(WORLD), options)
+    return folder
 
 
 def rows_of(path):
     """A table's rows by column; the trajectories' columns stand in the schema alone."""
-    text = path.read_text(encoding="utf-8")
+    lines = path.read_text(encoding="utf-8").splitlines()
     if path.suffix == ".txt":
-        names = header(TABLES[path.name])
-        return [dict(zip(names, line.split(), strict=True)) for line in text.splitlines()]
-    return list(csv.DictReader(text.splitlines()))
+        return [dict(zip(header(TABLES[path.name]), line.split(), strict=True)) for line in lines]
+    return list(csv.DictReader(lines))
 
 
-def test_the_schema_has_every_file_and_every_column(done):
-    out, _ = done
-    schema = json.loads((out / "schema.json").read_text(encoding="utf-8"))
-    assert set(schema["files"]) == set(FILES)
+def test_the_schema_has_every_file_and_every_column(out):
+    files = json.loads((out / "schema.json").read_text(encoding="utf-8"))["files"]
+    assert set(files) == set(FILES)
     assert {path.name for path in out.iterdir()} == set(FILES) - {"summary.png"}  # that one is the command's
     for name in TABLES:
-        columns = schema["files"][name]["columns"]
-        rows = rows_of(out / name)
+        columns, rows = files[name]["columns"], rows_of(out / name)
         if name != OLD_LANDMARKS or rows:  # so short a run may keep all its landmarks
             assert [column["name"] for column in columns] == list(rows[0])
         assert all(column["meaning"] for column in columns)
 
 
-def test_rows_of_objects_are_what_the_system_said(done):
-    out, _ = done
+def test_rows_of_objects_are_what_the_system_said(out):
     rows = [{name: float(value) for name, value in row.items()} for row in rows_of(out / "objects.csv")]
     expected = [(number, thing) for number, things in BODIES.items() for thing in things]
     assert len(rows) == len(expected)
@@ -98,11 +80,8 @@ def test_rows_of_objects_are_what_the_system_said(done):
         assert (row["moving"], row["measured"]) == (thing.moving, e.measured)
         assert (row["last_measured"], row["existence"]) == (0.05, 0.75)
         assert [row[c] for c in ("wx", "wy", "wz", "vx", "vy", "vz")] == pytest.approx(list(e.velocity), rel=1e-6)
-        for T, names in (
-            (e.T_world_object, ("x", "y", "z", "roll", "pitch", "yaw")),
-            (thing.motion, tuple(f"motion_{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw"))),
-        ):
-            numbers = np.array([row[name] for name in names])
+        for T, prefix in ((e.T_world_object, ""), (thing.motion, "motion_")):
+            numbers = np.array([row[f"{prefix}{name}"] for name in PLACE])
             np.testing.assert_allclose(numbers[:3], T[:3, 3], rtol=1e-6)
             np.testing.assert_allclose(rotation(numbers[3:]), T[:3, :3], atol=1e-7)
         upper = [row[f"c{i}{j}"] for i in range(6) for j in range(i, 6)]

@@ -20,7 +20,7 @@ def test_without_rerun_one_line_says_what_to_install(monkeypatch, tmp_path):
 
 
 def test_without_a_display_one_line_says_what_to_do(monkeypatch):
-    monkeypatch.setattr("slam.run.viewer._rerun", SimpleNamespace)
+    monkeypatch.setattr("slam.run.viewer.import_module", lambda name: SimpleNamespace())
     monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

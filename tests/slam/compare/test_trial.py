@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from slam.compare.trial import nees_series
+from slam.data import Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
+from slam.evaluation.summary import consistency, evaluate
+from slam.geometry.se3 import exp
+from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.run.results import BY_KEY, UNTRACKED, figures
+from slam.run.summary import RunRecord, results_of
+
+N, SIGMA = 120, 0.01
+NONE = np.zeros(0, np.int64)
+
+
+STRAIGHT = np.tile(np.eye(4), (N, 1, 1))
+STRAIGHT[:, 2, 3] = 0.2 * np.arange(N)
+TRUTH = Trajectory(0.1 * np.arange(N), STRAIGHT)
+SEQUENCE = SimpleNamespace(format="folder", ground_truth=TRUTH, gps=None, truth_noise=TruthNoise(1e-4, 1e-3))
+
+
+def estimated():
+    """The true path with independent errors, the first pose without any."""
+    rng = np.random.default_rng(0)
+    poses = STRAIGHT @ np.array([exp(SIGMA * rng.standard_normal(6) * (k > 0)) for k in range(N)])
+    return Trajectory(TRUTH.stamps, poses), np.array([SIGMA**2 * np.eye(6) * (k > 0) for k in range(N)])
+
+
+def measured(statuses):
+    """Figures and series of a run whose frames have these statuses, far off where they are not measured."""
+    path, covariances = estimated()
+    poses, record, nothing = path.poses.copy(), RunRecord(), np.zeros(0, np.intp)
+    for k in range(N):
+        status = statuses.get(k, FrameStatus.STARTED if k == 0 else FrameStatus.TRACKED)
+        poses[k, :3, 3] += 5.0 * (k in statuses)
+        estimate = Estimate(path.stamps[k], poses[k], covariances[k], NONE, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        report = UpdateReport(UpdateStatus.OK, "", NONE, NONE, 20.0, 10)
+        features = StereoFeatures.empty(path.stamps[k])
+        record.add(k, FrameResult(
+            k, status, "", estimate, report, features, 0, NONE, nothing, NONE, nothing, NONE, 7, {"update": 1.0}
+        ))  # fmt: skip
+    summary = {"frames": N, "status": {name: record.statuses.count(name) for name in record.statuses}}
+    final = Trajectory(path.stamps, poses)
+    summary |= results_of(SEQUENCE, SimpleNamespace(landmarks=None), record, final, None)
+    return figures(summary), nees_series(record, SEQUENCE)
+
+
+def test_the_figures_are_those_of_the_summary():
+    path, covariances = estimated()
+    found, _ = measured({})
+    expected = consistency(path, covariances, SEQUENCE)
+    assert found["nees_per_dof"] == pytest.approx(expected["mean NEES"] / 6)
+    assert found["nees_10m_per_dof"] == pytest.approx(expected["NEES over 10 m"] / 6)
+    assert "nees_100m_per_dof" not in found  # the path is too short
+    assert found["scale_error_percent"] == pytest.approx(abs(expected["scale error [%]"]))
+    assert found["rpe_1s_m"] == evaluate(path, SEQUENCE)["RPE RMSE over 1 s [m]"]
+    assert found["nis_per_dof"] == pytest.approx(2.0)
+    assert found["tracked"] == 1
+    assert all(found[key] == 0 for key in UNTRACKED)
+    assert set(found) <= set(BY_KEY)
+
+
+def test_frames_that_are_not_tracked_are_counted_and_left_out_of_the_accuracy():
+    """Metres of error in 23 of 120 frames, none of which was measured: a figure of its own, not one of accuracy."""
+    statuses = {k: FrameStatus.PREDICTED for k in range(40, 60)}
+    statuses |= {70: FrameStatus.LOST, 71: FrameStatus.LOST, 80: FrameStatus.FAILED}
+    found, series = measured(statuses)
+    path, covariances = estimated()
+    rows = np.array([k not in statuses for k in range(N)])
+    alone = evaluate(path.select(rows), SEQUENCE)
+    assert found["ate_online_m"] == found["ate_final_m"] == pytest.approx(alone["ATE RMSE [m]"])
+    assert found["ate_online_m"] < 0.05
+    honest = consistency(path.select(rows), covariances[rows], SEQUENCE)["mean NEES"]
+    assert found["nees_per_dof"] == pytest.approx(honest / 6)
+    assert found["tracked"] == pytest.approx(97 / 120)
+    assert [found[key] for key in UNTRACKED] == pytest.approx([2 / 120, 20 / 120, 1 / 120])
+    np.testing.assert_array_equal(np.isfinite(series[:, 1]), rows & (np.arange(N) > 0))
+    assert np.nanmean(series[:, 1]) / 6 == pytest.approx(found["nees_per_dof"])
+
+
+def test_nothing_tracked_gives_no_accuracy_and_is_no_fault():
+    found, _ = measured({k: FrameStatus.FAILED for k in range(N)})
+    assert (found["tracked"], found["frames_failed"]) == (0, 1)
+    assert not {"ate_online_m", "nees_per_dof", "rpe_1s_m"} & set(found)
