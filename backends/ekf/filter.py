@@ -22,7 +22,7 @@ from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import require_in_front, require_known
+from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
@@ -175,10 +175,11 @@ class EkfBackend:
     @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
-        require_known(self._form.name, ids, positions, covariances)
-        s, anchors = self.state, distant_anchors(positions, covariances)
-        s.landmarks.require_new(ids)
-        new = FilterLandmarks.at(self._coordinates, ids.astype(np.int64), anchors, positions.astype(float), s.frame)
+        s = self.state
+        known = known_landmarks(self._form.name, s.landmarks, ids, positions, covariances, False)
+        ids, positions, covariances = known
+        anchors = distant_anchors(positions, covariances)
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame)
         D = self._coordinates.inverse_jacobian(anchors, new.c)
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
@@ -186,10 +187,8 @@ class EkfBackend:
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
-        require_known(self._form.name, ids, local, covariances)
-        require_in_front(self._form.name, ids, local)
-        s.landmarks.require_new(ids)
-        self.state = s.placed(self._coordinates, ids, local, covariances)
+        known = known_landmarks(self._form.name, s.landmarks, ids, local, covariances, True)
+        self.state = s.placed(self._coordinates, *known)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -205,9 +204,7 @@ class EkfBackend:
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
             rows = np.flatnonzero(stereo.rectified_rig.rig.left.in_image(z[:, :2]))
-            z = correct(z[rows])
-            if not np.isfinite(z).all():
-                raise MeasurementError(f"{self._form.name}: a mended measurement is not finite")
+            z = stereo.corrected(self._form.name, z[rows], correct)
             points = se3.transform(s.pose, stereo.triangulate(z))
             good = np.isfinite(points).all(axis=1)
             rows, points = rows[good], points[good]

@@ -13,7 +13,7 @@ from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
 from backends.smoother.mending import corrected, path_solved, rebuilt
 from backends.smoother.path import Path
-from backends.smoother.state import State
+from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
@@ -21,7 +21,7 @@ from slam.errors import CopyError, MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import require_in_front, require_known
+from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
@@ -53,13 +53,13 @@ class SmootherBackend:
         self._steps = Steps(rig, models, self.config)
         self._make = FactorMaker(self._steps.stereo, models)
         self._graph = Graph(self._make, self.config.lag)
-        self._state = State.empty()
+        self._state = SmootherState.empty()
         self._path = Path()
         self._mended = False  # whether measurements were revised while poses were kept
-        self._answer: tuple[State, Trajectory] | None = None  # the last path, and the state that it is of
+        self._answer: tuple[SmootherState, Trajectory] | None = None  # the last path, and the state that it is of
 
     @property
-    def state(self) -> State:
+    def state(self) -> SmootherState:
         """All that is kept: poses, measurements, landmarks."""
         return self._state
 
@@ -167,9 +167,7 @@ class SmootherBackend:
     @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
-        require_known("smoother", ids, positions, covariances)
-        self._state.landmarks.require_new(ids)
-        arguments = np.array(ids, np.int64), np.array(positions, float), np.array(covariances, float)
+        arguments = known_landmarks("smoother", self._state.landmarks, ids, positions, covariances, False)
         if len(ids):
             self._state = self._steps.inserted(self._state, *arguments)
 
@@ -177,10 +175,7 @@ class SmootherBackend:
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
-        require_known("smoother", ids, local, covariances)
-        require_in_front("smoother", ids, local)
-        s.landmarks.require_new(ids)
-        arguments = np.array(ids, np.int64), np.array(local, float), np.array(covariances, float)
+        arguments = known_landmarks("smoother", s.landmarks, ids, local, covariances, True)
         if len(ids):
             self._state = self._steps.placed(s, *arguments)
 
@@ -219,7 +214,7 @@ class SmootherBackend:
 
     # --- parts ---
 
-    def _started(self, what: str) -> State:
+    def _started(self, what: str) -> SmootherState:
         if not self._state.started:
             raise MeasurementError(f"smoother: {what} before the first predict")
         return self._state

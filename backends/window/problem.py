@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.window.state import State
+from backends.window.state import WindowState
 from slam.data import IndexArray
 from slam.models import EstimatorModels
 from slam.window.motion import LONGEST, RATIO, velocity_sigmas
@@ -15,14 +15,14 @@ from slam.window.stereo import RectifiedStereo
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class ActiveWindow:
     """A window and the landmarks' rows that its points are (N,)."""
 
     window: Window
     points: IndexArray
 
 
-def motion_between(s: State, models: EstimatorModels) -> Motion:
+def motion_between(s: WindowState, models: EstimatorModels) -> Motion:
     """The motion model between all poses of the window that follow each other."""
     f, dt = s.frames, np.minimum(np.diff(s.stamps), LONGEST)
     follows = (np.diff(f) == 1) & (f[1:] != s.begun)
@@ -38,9 +38,9 @@ def motion_between(s: State, models: EstimatorModels) -> Motion:
 
 
 def problem(
-    s: State, stereo: RectifiedStereo, models: EstimatorModels, rows: Rows | None = None, places: Places | None = None,
-    motion: Motion | None = None,
-) -> Problem:  # fmt: skip
+    s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, rows: Rows | None = None,
+    places: Places | None = None, motion: Motion | None = None,
+) -> ActiveWindow:  # fmt: skip
     """The problem of a state; some of its rows, places and motions if they are given."""
     rows, places = s.rows if rows is None else rows, s.places if places is None else places
     marks = s.landmarks
@@ -56,4 +56,4 @@ def problem(
         motion=motion_between(s, models) if motion is None else motion,
         prior=replace(s.prior, points=index[s.prior.points]),
     )  # fmt: skip
-    return Problem(window, points)
+    return ActiveWindow(window, points)

@@ -9,7 +9,7 @@ import numpy as np
 from backends.window.config import WindowConfig
 from backends.window.past import Left
 from backends.window.problem import motion_between, problem
-from backends.window.state import State
+from backends.window.state import WindowState
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
@@ -17,7 +17,7 @@ from slam.window.marginal import Conditional, marginalised
 from slam.window.stereo import RectifiedStereo
 
 
-def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: WindowConfig) -> State:
+def slid(s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, config: WindowConfig) -> WindowState:
     """The state with one pose less.
 
     The oldest pose is the one that the prior is relative to, and stays for some frames; the next one leaves. Landmarks
@@ -75,7 +75,7 @@ def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: Win
     return _compact(s)
 
 
-def _left(s: State, leaving: int, stayed: IndexArray, ended: IndexArray, conditional: Conditional) -> Left:
+def _left(s: WindowState, leaving: int, stayed: IndexArray, ended: IndexArray, conditional: Conditional) -> Left:
     """The record of what leaves."""
     marks, stay = s.landmarks, np.arange(len(s.frames)) != leaving
     return Left(
@@ -85,7 +85,7 @@ def _left(s: State, leaving: int, stayed: IndexArray, ended: IndexArray, conditi
 
 
 def _without_oldest(
-    surplus: int, s: State, members: BoolArray, joins: BoolArray, ends: BoolArray, there: BoolArray
+    surplus: int, s: WindowState, members: BoolArray, joins: BoolArray, ends: BoolArray, there: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
     """More landmarks end, and fewer join: members out of view that were measured longest ago, then those that join.
 
@@ -113,7 +113,7 @@ def _without(P: Array, leaving: int) -> Array:
     return P[np.ix_(keep, keep)]
 
 
-def _compact(s: State) -> State:
+def _compact(s: WindowState) -> WindowState:
     """Without landmarks that were removed and take no part any more."""
     marks = s.landmarks
     used = marks.ids >= 0

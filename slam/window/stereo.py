@@ -6,6 +6,7 @@ is no right pixel. The body frame is the rig's own left camera, the sensor its r
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,7 +16,7 @@ from slam.data import IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.rig_kernels import project_rectified, triangulate_rectified
-from slam.geometry.se3 import Array, inverse
+from slam.geometry.se3 import Array, adjoint, inverse
 from slam.models import EstimatorModels
 from slam.window.agreement import landmarks_pose
 from slam.window.gating import with_noise
@@ -75,6 +76,18 @@ class RectifiedStereo:
             z[:, 2] = self.rectified_rig.rectify_right(observations.uv_right)[:, 0]
         z[:, 2] -= self.doffs
         return z
+
+    @staticmethod
+    def corrected(owner: str, z: Array, correct: Callable[[Array], Array]) -> Array:
+        """Measurements (M, 3) as they are corrected by a back end of this name; a missing right pixel stays NaN.
+
+        Raises:
+            MeasurementError: a corrected one is not finite.
+        """
+        out = np.asarray(correct(z.copy()), float)
+        if out.shape != z.shape or not (np.isfinite(out) == np.isfinite(z)).all():
+            raise MeasurementError(f"{owner}: a corrected measurement is not finite")
+        return out
 
     def project(self, local: Array) -> tuple[Array, Array]:
         """Measurements (N, 3) and Jacobians (N, 3, 3) of points (N, 3) in the left camera's coordinates.
@@ -154,3 +167,17 @@ class RectifiedMeasurement:
         rows, turned = z + np.array([0.0, 0.0, self.stereo.doffs]), T @ rectified.T_left_rectified
         found = landmarks_pose(rectified.rig, points, rows, self.models, turned, seed)
         return None if found is None else found @ inverse(rectified.T_left_rectified)
+
+
+def relative_covariance(P: Array, earlier: Array, later: Array) -> Array:
+    """Covariance (6, 6) of a pose where another one is known, from their joint covariance (12, 12).
+
+    Args:
+        P: of the pose that is known, then the other, both perturbed on the right.
+        earlier: the pose that is known (4, 4).
+        later: the other (4, 4).
+    """
+    A = adjoint(inverse(later) @ earlier)
+    cross = A @ P[:6, 6:]
+    C = P[6:, 6:] + A @ P[:6, :6] @ A.T - cross - cross.T
+    return np.asarray(0.5 * (C + C.T))
