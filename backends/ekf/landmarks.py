@@ -16,7 +16,7 @@ import numpy as np
 
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array, hat
-from slam.window.table import LandmarkTable
+from slam.table import LandmarkTable
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update

@@ -10,8 +10,8 @@ import numpy as np
 from backends.smoother.landmark_kernels import carried_by, information_of
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array, points_by_pose
+from slam.table import LandmarkTable
 from slam.window.stereo import RectifiedStereo
-from slam.window.table import LandmarkTable
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
 _GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less

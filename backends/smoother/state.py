@@ -10,7 +10,7 @@ import numpy as np
 from backends.smoother.landmarks import SmootherLandmarks
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, inverse
-from slam.window.table import Table
+from slam.table import Table
 
 
 @dataclass(frozen=True, eq=False)

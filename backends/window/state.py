@@ -9,9 +9,9 @@ import numpy as np
 from backends.window.past import Past
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
+from slam.table import LandmarkTable
 from slam.window.problem import Places, RelativePrior, Rows
 from slam.window.stereo import relative_covariance
-from slam.window.table import LandmarkTable
 
 
 @dataclass(frozen=True, eq=False)

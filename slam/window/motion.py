@@ -47,10 +47,10 @@ def predicted(
         whether the velocity was unknown, with mean zero.
     """
     J: Array = np.zeros((6, 12))
-    T: Array = poses[-1]
-    first = is_first(before, dt)
+    T: Array = poses[-1].copy()
+    first, by_velocity = is_first(before, dt), np.zeros_like(J[:, :6])
     if before is None or first:
-        J[:, 6:], by_velocity = np.eye(6), np.zeros((6, 6))
+        J[:, 6:] = np.eye(6)
         by_velocity[:3, :3], by_velocity[3:, 3:] = dt * np.eye(3), dt * T[:3, :3].T
     else:
         T, J[:, :6], J[:, 6:], by_velocity = predict(poses[0], poses[1], before, dt)

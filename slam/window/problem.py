@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from slam.geometry.arrays import Array, IndexArray
+from slam.table import Table
 from slam.window import kernels
 from slam.window.stereo import RectifiedStereo
-from slam.window.table import Table
 
 KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
 
