@@ -37,14 +37,11 @@ _DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determ
 class BatchConfig:
     """Options of `BatchBackend`.
 
-    Attributes:
-        online: whether the pose alone is the solved one as well, and not the smoother's.
-
     Raises:
         ConfigurationError: it is neither true nor false.
     """
 
-    online: bool = False
+    online: bool = False  # whether the pose alone is the solved one as well, and not the smoother's
 
     def __post_init__(self) -> None:
         require_not_negative(self, {}, "batch")

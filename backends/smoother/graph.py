@@ -66,17 +66,11 @@ class GraphProblem:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The last poses as the graph has them.
+    """The last poses as the graph has them."""
 
-    Attributes:
-        first: number of the first one.
-        poses: (L, 4, 4).
-        covariance: joint covariance (12, 12) of the last two poses; (6, 6) of a single one.
-    """
-
-    first: int
-    poses: Array
-    covariance: Array
+    first: int  # number of the first one
+    poses: Array  # (L, 4, 4)
+    covariance: Array  # joint covariance (12, 12) of the last two poses; (6, 6) of a single one
 
 
 class Tracks:

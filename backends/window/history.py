@@ -49,15 +49,10 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """The calls since a state, in parts.
+    """The calls since a state, in parts."""
 
-    Attributes:
-        parts: at least one.
-        anchored: whether landmarks were ever known in the world: then the path may not be moved in it.
-    """
-
-    parts: tuple[Part, ...] = field(default_factory=lambda: (Part(WindowState.empty()),))
-    anchored: bool = False
+    parts: tuple[Part, ...] = field(default_factory=lambda: (Part(WindowState.empty()),))  # at least one
+    anchored: bool = False  # whether landmarks were ever known in the world: then the path may not be moved in it
 
     @property
     def start(self) -> WindowState:

@@ -18,7 +18,7 @@ from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother", "window")
+BACKENDS = ("ekf", "iekf", "smoother", "window")
 NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
 CONFIG = SystemConfig(
     models=EstimatorModels(pixel_sigma=0.3),
