@@ -174,7 +174,7 @@ class _BatchSolution:
             problem.values.insert(key, to_pose3(T))
         for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), smoother.models):
             problem.factors.add(factor)
-        places = _places(s, smoother.stereo, numbers)
+        places = _places(s, make.stereo, numbers)
         known = {serial: one for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
         self.landmarks = {*places, *known}
         for serial in sorted(self.landmarks):

@@ -45,7 +45,8 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "self.cross[CAMERA:] - V @ V_left.T + shift", "self.cross[CAMERA:] + shift",
+        "head, rest = J @ (self.cross[:CAMERA] - V_camera @ V_left.T), self.cross[CAMERA:] - V @ V_left.T",
+        "head, rest = J @ self.cross[:CAMERA], self.cross[CAMERA:]",
         "tests/backends/test_ekf_parts.py tests/backends/test_rest.py tests/backends/test_ekf.py",
     ),
     Fault(

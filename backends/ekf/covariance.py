@@ -140,6 +140,6 @@ class Covariance:
             marks = dsyr2k(1.0, shift, half, beta=1.0, c=marks, lower=1, overwrite_c=1).T
             kernels.mirror(marks)
         camera = np.concatenate([own, rows + own[:, :POSE] @ shift.T], axis=1)
-        head = J @ (self.cross[:CAMERA] - V_camera @ V_left.T)
-        cross = np.concatenate([head, self.cross[CAMERA:] - V @ V_left.T + shift @ head[:POSE]])
+        head, rest = J @ (self.cross[:CAMERA] - V_camera @ V_left.T), self.cross[CAMERA:] - V @ V_left.T
+        cross = np.concatenate([head, rest + shift @ head[:POSE]])
         return replace(self, camera=camera, marks=marks, cross=cross)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,14 +12,6 @@ from slam.models import EstimatorModels
 from slam.window.motion import LONGEST, RATIO, velocity_sigmas
 from slam.window.problem import Motion, Places, Rows, Window
 from slam.window.stereo import RectifiedStereo
-
-
-@dataclass(frozen=True, eq=False)
-class ActiveWindow:
-    """A window and the landmarks' rows that its points are (N,)."""
-
-    window: Window
-    points: IndexArray
 
 
 def motion_between(s: WindowState, models: EstimatorModels) -> Motion:
@@ -40,8 +32,11 @@ def motion_between(s: WindowState, models: EstimatorModels) -> Motion:
 def problem(
     s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, rows: Rows | None = None,
     places: Places | None = None, motion: Motion | None = None,
-) -> ActiveWindow:  # fmt: skip
-    """The problem of a state; some of its rows, places and motions if they are given."""
+) -> tuple[Window, IndexArray]:  # fmt: skip
+    """The problem of a state, and rows of the landmarks that its points are (N,).
+
+    With some of the rows, places and motions alone, if they are given.
+    """
     rows, places = s.rows if rows is None else rows, s.places if places is None else places
     marks = s.landmarks
     used = np.zeros(len(marks), bool)
@@ -56,4 +51,4 @@ def problem(
         motion=motion_between(s, models) if motion is None else motion,
         prior=replace(s.prior, points=index[s.prior.points]),
     )  # fmt: skip
-    return ActiveWindow(window, points)
+    return window, points

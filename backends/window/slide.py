@@ -52,16 +52,15 @@ def slid(s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, confi
     motion = motion_between(s, models)
     motion = motion.select((motion.poses == leaving).any(axis=1))
 
-    part = problem(s, stereo, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
-    w = part.window
-    keeps = (member | joins | ends)[part.points]
+    w, active = problem(s, stereo, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
+    keeps = (member | joins | ends)[active]
     w = replace(
-        w, information=np.where(keeps[:, None, None], marks.information[part.points], 0.0),
-        joining=np.flatnonzero(joins[part.points]),
+        w, information=np.where(keeps[:, None, None], marks.information[active], 0.0),
+        joining=np.flatnonzero(joins[active]),
     )  # fmt: skip
     ending = ends[s.prior.points]
     prior, conditional, cost = marginalised(w, leaving, ending)
-    past = s.past.with_one(_left(s, leaving, part.points[prior.points], s.prior.points[ending], conditional))
+    past = s.past.with_one(_left(s, leaving, active[prior.points], s.prior.points[ending], conditional))
     stays = ~absorbed_row & (rows.pose != leaving)
     free = marks.information.copy()
     free[joins | ends] = 0.0
@@ -69,7 +68,7 @@ def slid(s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, confi
         s, frames=np.delete(s.frames, leaving), stamps=np.delete(s.stamps, leaving),
         poses=np.delete(s.poses, leaving, axis=0), covariance=_without(s.covariance, leaving),
         rows=_earlier(rows.select(stays), leaving), places=_earlier(places.select(~absorbed_place), leaving),
-        prior=replace(prior, points=part.points[prior.points]), cost=s.cost - cost, past=past,
+        prior=replace(prior, points=active[prior.points]), cost=s.cost - cost, past=past,
         landmarks=replace(marks, information=free), solved=s.solved - (s.solved > leaving),
     )  # fmt: skip
     return _compact(s)

@@ -153,10 +153,11 @@ class Steps(RectifiedMeasurement):
             s = _restarted(s, found.T, points)
         s = replace(s, poses=np.concatenate([s.poses[:-1], T[None]]))
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
-        p = problem(replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used]))), self.stereo, self.models)
-        w = p.window
+        w, active = problem(
+            replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used]))), self.stereo, self.models
+        )
         for again in range(_SOLVED_AGAIN + 1):
-            solution, distances = self._tested(w, np.searchsorted(p.points, points[used]), z[used])
+            solution, distances = self._tested(w, np.searchsorted(active, points[used]), z[used])
             bad = distances > limits[used]
             if not bad.any() or again == _SOLVED_AGAIN:
                 break
@@ -168,7 +169,7 @@ class Steps(RectifiedMeasurement):
         s = replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used])))
         local, world = solution.point_covariances(len(s.frames) - 1)
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
-        return _after(s, solution, p.points, local, world, points[used]), used, nis
+        return _after(s, solution, active, local, world, points[used]), used, nis
 
     def _tested(self, w: Window, at: IndexArray, z: Array) -> tuple[Solution, Array]:
         """The solution, and how far points `at` (M,) are from their measurements z (M, 3) in the newest pose."""
