@@ -255,7 +255,7 @@ class EkfBackend:
             s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure.sigma, self._measure.stereo,
             self._coordinates, self._form.iterations, self.models.gate_probability, guess,
         )  # fmt: skip
-        noises = [factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0]
+        noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)
 
         def search() -> Array | None:
             T = s.pose if guess is None else guess

@@ -12,7 +12,7 @@ Then the prediction is wrong, not the observations. There are three cases, tried
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from slam.window.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN
 Search = Callable[[], "Array | None"]
 
 
-def agreement(update: Update, noises: Sequence[Array], search: Search, models: EstimatorModels) -> Posterior | None:
+def agreement(update: Update, noises: Iterable[Array], search: Search, models: EstimatorModels) -> Posterior | None:
     """Solve with the prior that most observations agree with; None where there is none.
 
     Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
@@ -75,7 +75,7 @@ def _agreed(update: Update, gated: Gated) -> Posterior | None:
     return None if bdtrc(used - 1, count, share) > 1 - update.gate_probability else found
 
 
-def _gated(update: Update, noises: Sequence[Array]) -> tuple[Update, Gated]:
+def _gated(update: Update, noises: Iterable[Array]) -> tuple[Update, Gated]:
     """The update, with more noise and seen from the guess if most pass the gate only then, and its gate.
 
     What still disagrees is taken out later by `solve`.

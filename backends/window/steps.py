@@ -153,16 +153,15 @@ class Steps(RectifiedMeasurement):
             s = _restarted(s, found.T, points)
         s = replace(s, poses=np.concatenate([s.poses[:-1], T[None]]))
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
-        w, active = problem(
-            replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used]))), self.stereo, self.models
-        )
+        rows = s.rows.joined(self._rows(s, points[used], z[used]))
+        w, active = problem(replace(s, rows=rows), self.stereo, self.models)
         for again in range(_SOLVED_AGAIN + 1):
             solution, distances = self._tested(w, np.searchsorted(active, points[used]), z[used])
             bad = distances > limits[used]
             if not bad.any() or again == _SOLVED_AGAIN:
                 break
-            rows = np.append(np.ones(len(s.rows), bool), ~bad)
-            w = replace(solution.window, rows=solution.window.rows.select(rows))
+            keep = np.append(np.ones(len(s.rows), bool), ~bad)
+            w = replace(solution.window, rows=solution.window.rows.select(keep))
             used[np.flatnonzero(used)[bad]] = False
             if not used.any():
                 raise np.linalg.LinAlgError("no observation agrees with the others")
