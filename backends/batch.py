@@ -16,8 +16,8 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key, to_pose3, velocity_change
-from backends.smoother.graph import FAILURES, Problem, Tracks, minimised
-from backends.smoother.state import State
+from backends.smoother.graph import FAILURES, GraphProblem, Tracks, minimised
+from backends.smoother.state import SmootherState
 from slam.bounds import require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig
@@ -37,14 +37,11 @@ _DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determ
 class BatchConfig:
     """Options of `BatchBackend`.
 
-    Attributes:
-        online: whether the pose alone is the solved one as well, and not the smoother's.
-
     Raises:
         ConfigurationError: it is neither true nor false.
     """
 
-    online: bool = False
+    online: bool = False  # whether the pose alone is the solved one as well, and not the smoother's
 
     def __post_init__(self) -> None:
         require_not_negative(self, {}, "batch")
@@ -73,7 +70,7 @@ class BatchBackend:
         self.models = models
         self.config = from_options(BatchConfig, "batch", options)
         self._smoother = SmootherBackend(rig, models, motion=0.0, lag=None)
-        self._solution: _Solution | None = None
+        self._solution: _BatchSolution | None = None
 
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`: the smoother's."""
@@ -141,14 +138,14 @@ class BatchBackend:
         found.poses[-len(solved) :] = solved
         return found
 
-    def _solved(self) -> _Solution:
+    def _solved(self) -> _BatchSolution:
         """The solution for what is known now."""
         if self._solution is None or self._solution.state is not self._smoother.state:
-            self._solution = _Solution(self._smoother)
+            self._solution = _BatchSolution(self._smoother)
         return self._solution
 
 
-class _Solution:
+class _BatchSolution:
     """A solved problem.
 
     Attributes:
@@ -170,14 +167,14 @@ class _Solution:
             pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
             for i, number in enumerate(hangs.tolist())
         ]
-        problem, tracks = Problem(), Tracks(make, None)
+        problem, tracks = GraphProblem(), Tracks(make, None)
         problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.spread[s.of(s.begun)]))
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))
         for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), smoother.models):
             problem.factors.add(factor)
-        places = _places(s, smoother.stereo, numbers)
+        places = _places(s, make.stereo, numbers)
         known = {serial: one for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
         self.landmarks = {*places, *known}
         for serial in sorted(self.landmarks):
@@ -230,7 +227,7 @@ class _Solution:
             return otherwise
 
 
-def _places(s: State, stereo: RectifiedStereo, numbers: range) -> dict[int, Array]:
+def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[int, Array]:
     """Where landmarks (3,) begin that measurements determine, by serial number: where their nearest sight puts them."""
     count = np.zeros(s.serials, np.int64)
     nearest: dict[int, tuple[float, Array]] = {}  # largest disparity, and where that puts the landmark

@@ -62,16 +62,16 @@ CLOSINGS = ((5, 340, 0.07), (10, 345, 0.04), (5, 345, 0.52), (10, 340, 0.50))
 
 
 #: What follows landmarks to know how they depend on the rig.
-_FOLLOWING = ("observe", "change", "replace_landmarks")
+_FOLLOWING = ("observe", "change")
 
 
 def exact_rig() -> AbstractContextManager[object]:
     """The rig's uncertainty is added to nothing."""
     stack = ExitStack()
     for name, put in (
-        *((f"slam.calibration.consider.SchmidtFilter.{m}", lambda *_: None) for m in _FOLLOWING),
-        ("slam.calibration.remaining.RemainingRigError.added_to", lambda _, estimate: estimate),
-        ("slam.calibration.remaining.RemainingRigError.common", lambda *_, **__: CommonError()),
+        *((f"slam.calibration.consider.SchmidtFilter.{m}", lambda *_, **__: None) for m in _FOLLOWING),
+        ("slam.calibration.consider.RemainingRigError.added_to", lambda _, estimate: estimate),
+        ("slam.calibration.consider.RemainingRigError.common", lambda *_, **__: CommonError()),
     ):
         stack.enter_context(mock.patch(name, put))
     return stack

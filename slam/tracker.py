@@ -153,7 +153,7 @@ class Tracker:
         if seen_again is not None:
             step = session.mapper.restore(state.backend, step, seen_again)
             back = np.sort(step.returned.ids)
-            rig_error.uncertainty.replace_landmarks(back, _positions(state, back))
+            rig_error.uncertainty.change(back, _positions(state, back), back[:0], again=True)
         return replace(step, atlas=atlas)
 
     def roll_back(self, state: State, stage: str | None) -> State:

@@ -45,12 +45,13 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "X = self.cross - V @ V_left.T", "X = self.cross.copy()",
+        "head, rest = J @ (self.cross[:CAMERA] - V_camera @ V_left.T), self.cross[CAMERA:] - V @ V_left.T",
+        "head, rest = J @ self.cross[:CAMERA], self.cross[CAMERA:]",
         "tests/backends/test_ekf_parts.py tests/backends/test_rest.py tests/backends/test_ekf.py",
     ),
     Fault(
         "no process noise", "backends/ekf/covariance.py",
-        "own = rows[:, :CAMERA] @ J.T + noise", "own = rows[:, :CAMERA] @ J.T",
+        "own = camera[:, :CAMERA] @ J.T + noise", "own = camera[:, :CAMERA] @ J.T",
         "tests/backends/test_ekf.py tests/backends/test_ekf_parts.py",
     ),
     Fault(

@@ -40,7 +40,17 @@ MAY_IMPORT = {
 
 #: The root's modules by room; all others are "base".
 ROOT_ROOMS = {
-    "data": {"checks", "third_party", "data", "interfaces", "models", "object_data", "object_models", "rig_error"},
+    "data": {
+        "checks",
+        "third_party",
+        "data",
+        "interfaces",
+        "models",
+        "object_data",
+        "object_models",
+        "rig_error",
+        "table",
+    },
     "system": {"system", "session", "tracker", "config", "results"},
     "commands": {"__main__"},
     "outside": {"__init__"},

@@ -4,57 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from backends.ekf.config import EkfConfig
 from backends.ekf.covariance import CAMERA
-from backends.ekf.landmarks import COORDINATES, Coordinates, Landmarks, distant_anchors
-from backends.ekf.measurement import Jacobian, Measurement
+from backends.ekf.landmarks import COORDINATES, Coordinates, FilterLandmarks, distant_anchors
 from backends.ekf.motion import Camera, EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
-from backends.ekf.solve import Problem, UnsolvableError
-from backends.ekf.state import State
+from backends.ekf.solve import Jacobian, UnsolvableError, Update
+from backends.ekf.state import FilterState
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
-from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
+from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import require_in_front, require_known
+from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
-from slam.window.agreement import INFLATION, landmarks_pose
-from slam.window.gating import with_noise
+from slam.window.agreement import INFLATION
+from slam.window.stereo import RectifiedMeasurement
 
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """What a filter is of: the camera and its error, and the landmarks' coordinates.
+    """What a filter is of: the camera and its error, and the landmarks' coordinates."""
 
-    Attributes:
-        name: of the back end, for messages.
-        config: its options.
-        camera: the first one.
-        covariance: of its error (12, 12).
-        coordinates: of the landmarks.
-        iterations: most linearisations of an update.
-        stereo: whether the right pixel is measured.
-    """
-
-    name: str
-    config: Any
-    camera: Camera
-    covariance: Array
-    coordinates: Coordinates
-    iterations: int
-    stereo: bool = True
+    name: str  # of the back end, for messages
+    config: Any  # its options
+    camera: Camera  # the first one
+    covariance: Array  # of its error (12, 12)
+    coordinates: Coordinates  # of the landmarks
+    iterations: int  # most linearisations of an update
+    stereo: bool = True  # whether the right pixel is measured
 
 
 def papers_form(models: EstimatorModels, options: dict[str, Any]) -> Form:
@@ -67,18 +55,24 @@ def papers_form(models: EstimatorModels, options: dict[str, Any]) -> Form:
 
 
 class EkfBackend:
-    """Extended Kalman filter over the camera's motion and the landmarks, the papers' state estimator.
+    """Extended Kalman filter over the camera's motion and the landmarks: the papers' state estimator, made consistent.
 
     The state is ``[r, φ, v, ω]`` (12), world position, Euler angles, world velocity and angle rates (paper B, section
     2), then three coordinates per landmark. The camera moves at constant velocity disturbed by impulses, with
-    the printed A and W. A landmark enters with its full cross-covariance (paper A, Eqs. 8 and 10). See
-    `backends.ekf.angles` for the angles' world and for what the Euler model costs, `backends.ekf.landmarks` for the
-    landmarks' coordinates, `backends.ekf.solve` for the update and `State.corrected` for what keeps it consistent.
+    the printed A and W. A landmark enters with its full cross-covariance (paper A, Eqs. 8 and 10).
+
+    By default this is not the papers' plain filter. It differs in what it measures (the right pixel as well as the
+    left), in the landmarks' coordinates (inverse depth, `backends.ekf.landmarks`), in updates that are linearised again
+    where the first time is not enough, in landmarks tested against all others and in recovery (`backends.ekf.solve`,
+    `backends.ekf.recovery`), and in a covariance that is transported to each corrected state, so that nothing seems to
+    be learnt of where the world is (`backends.ekf.state`). The option ``papers=True`` gives the plain filter: the left
+    pixel alone, one linearisation, landmarks in the world, no transport. The angles refer to a world of their own in
+    both (`backends.ekf.angles`).
 
     Args:
-        rig: the cameras.
+        rig: the cameras; measurements of any rig are rectified first.
         models: noise, priors, motion and gate.
-        form: makes what the filter is of, by models and options: the papers' Euler angles, or another error.
+        form: makes what the filter is of, by models and options: the papers' Euler angles, or another camera.
         options: of the form; see `EkfConfig`.
 
     Attributes:
@@ -105,8 +99,10 @@ class EkfBackend:
             )
         self._form = form(models, options)
         self.config, self._coordinates = self._form.config, self._form.coordinates
-        self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
-        self.state = State.first(self._form.camera, self._form.covariance)
+        self._measure = RectifiedMeasurement(rig, models)
+        stereo = self._measure.stereo
+        self._farthest = stereo.f * stereo.baseline / _DISPARITY  # depth of a new landmark [m]
+        self.state = FilterState.first(self._form.camera, self._form.covariance)
         self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
@@ -137,13 +133,8 @@ class EkfBackend:
         """See `slam.interfaces.Backend.add`."""
         s = self._started("add")
         s.landmarks.require_new(observations.ids)
-        h = self.rig.triangulate(observations.uv_left, observations.uv_right)  # paper A, Eq. (8)
-        bad = ~np.isfinite(h).all(axis=1)
-        if bad.any():
-            what = f"landmark {observations.ids[bad][0]} has no right pixel or no positive depth"
-            raise MeasurementError(f"{self._form.name}: {what}")
-        h = h * np.minimum(1.0, self._farthest / h[:, 2:])
-        covariances = self.rig.triangulation_covariance(h, self.models.pixel_sigma)
+        z = self._measure.stereo.measure(observations)
+        h, covariances = self._measure.first_sight(observations.ids, z, self._farthest)
         self.state = s.placed(self._coordinates, observations.ids, h, covariances)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
@@ -154,10 +145,10 @@ class EkfBackend:
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         s = self._started("estimate")
-        rows = np.argsort(s.landmarks.ids) if landmarks else np.zeros(0, np.intp)
-        marks = s.landmarks.take(rows)
+        rows = s.landmarks.order if landmarks else s.landmarks.order[:0]
+        marks = s.landmarks.select(rows)
         D = self._coordinates.jacobian(marks.anchors, marks.c)
-        blocks = D @ (s.landmark_covariances(rows) if landmarks else np.zeros((0, 3, 3))) @ D.transpose(0, 2, 1)
+        blocks = D @ (s.covariance.marginals()[0][rows] if landmarks else np.zeros((0, 3, 3))) @ D.transpose(0, 2, 1)
         covariances = 0.5 * (blocks + blocks.transpose(0, 2, 1))
         return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, covariances)
 
@@ -184,10 +175,11 @@ class EkfBackend:
     @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
-        require_known(self._form.name, ids, positions, covariances)
-        s, anchors = self.state, distant_anchors(positions, covariances)
-        s.landmarks.require_new(ids)
-        new = Landmarks.at(self._coordinates, ids.astype(np.int64), anchors, positions.astype(float), s.frame)
+        s = self.state
+        known = known_landmarks(self._form.name, s.landmarks, ids, positions, covariances, False)
+        ids, positions, covariances = known
+        anchors = distant_anchors(positions, covariances)
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame)
         D = self._coordinates.inverse_jacobian(anchors, new.c)
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
@@ -195,10 +187,8 @@ class EkfBackend:
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
-        require_known(self._form.name, ids, local, covariances)
-        require_in_front(self._form.name, ids, local)
-        s.landmarks.require_new(ids)
-        self.state = s.placed(self._coordinates, ids, local, covariances)
+        known = known_landmarks(self._form.name, s.landmarks, ids, local, covariances, True)
+        self.state = s.placed(self._coordinates, *known)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -210,16 +200,12 @@ class EkfBackend:
         The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
         were corrected before, and seen at pixels as they are now, would look as if the camera had moved.
         """
-        s, rectified_rig = replace(self.state, measured=True), self.rig.rectified
+        s, stereo = replace(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
-            T = s.pose @ rectified_rig.T_left_rectified
-            local = se3.transform(se3.inverse(T), s.landmarks.points)
-            z, _ = rectified_rig.rig.project_stereo(local, jacobian=False)
-            rows = np.flatnonzero(rectified_rig.rig.left.in_image(z[:, :2]))
-            z = correct(z[rows])
-            if not np.isfinite(z).all():
-                raise MeasurementError(f"{self._form.name}: a mended measurement is not finite")
-            points = se3.transform(T, rectified_rig.rig.triangulate(z[:, :2], z[:, [2, 1]]))
+            z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
+            rows = np.flatnonzero(stereo.rectified_rig.rig.left.in_image(z[:, :2]))
+            z = stereo.corrected(self._form.name, z[rows], correct)
+            points = se3.transform(s.pose, stereo.triangulate(z))
             good = np.isfinite(points).all(axis=1)
             rows, points = rows[good], points[good]
             change = self._coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
@@ -231,7 +217,7 @@ class EkfBackend:
 
     def _advanced(self, camera: Camera, dt: float) -> Motion:
         """The camera after a step by the motion model."""
-        return camera.advanced(self.models, self.state.covariance.dense[:CAMERA, :CAMERA], dt)
+        return camera.advanced(self.models, self.state.covariance.camera[:, :CAMERA], dt)
 
     def _predicted(self, stamp: float, moved: Callable[[Camera, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""
@@ -246,59 +232,48 @@ class EkfBackend:
         self.state = after
         return prediction
 
-    def _prediction(self, s: State) -> Prediction:
-        """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
-        marks, T = s.landmarks, s.pose
-        rows = np.flatnonzero(self.rig.left.in_view((marks.points - T[:3, 3]) @ T[:3, :3]))
-        blocks, cross = (part[rows] for part in s.covariance.marginals())
-        z, own = Measurement(self.rig, self._coordinates, marks.anchors[rows]).linearise(T, marks.c[rows])
-        H = Jacobian.of(own, s.relative(rows), rows)
-        right = z[:, [2, 1]]
-        if not self.rig.is_rectified:
-            right = self.rig.project((marks.points[rows] - T[:3, 3]) @ T[:3, :3])[1]
-        S = with_noise(H.own_covariances(s.covariance.pose, cross, blocks)[:, :2, :2], self.models.pixel_sigma)
-        return Prediction(s.stamp, T.copy(), s.pose_covariance(), marks.ids[rows], z[:, :2], right, S)
+    def _prediction(self, s: FilterState) -> Prediction:
+        """Pose, and what is in the angle of view with its innovation covariance."""
+        T, rows = s.pose, self._measure.visible(s.pose, s.landmarks.points)
+        marks, (blocks, cross) = s.landmarks.select(rows), (part[rows] for part in s.covariance.marginals())
+        toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
+        H = Jacobian(toward, marks.gauge @ s.camera.world(), rows)  # of where landmarks are as seen from the camera
+        seen = H.own_covariances(s.covariance.pose, cross, blocks)
+        left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], seen)
+        return Prediction(s.stamp, T.copy(), s.pose_covariance(), marks.ids, left, right, S)
 
-    def _updated(self, s: State, observations: Observations, guess: Array | None) -> tuple[State, UpdateReport]:
-        """The state after an update, and its report; all that was observed is in the state's dense part."""
+    def _updated(
+        self, s: FilterState, observations: Observations, guess: Array | None
+    ) -> tuple[FilterState, UpdateReport]:
+        """The state after an update, and its report; all that was observed is in the state."""
         if not len(observations):
             return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-        rows = s.landmarks.rows_of(observations.ids)
-        problem = self._problem(s, observations, rows, guess)
-        noises = []
-        if s.frame > 0:
-            noises = [factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION]
+        rows, z = s.landmarks.rows_of(observations.ids), self._measure.stereo.measure(observations)
+        if not self._form.stereo:
+            z[:, 2] = np.nan
+        update = Update(
+            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure.sigma, self._measure.stereo,
+            self._coordinates, self._form.iterations, self.models.gate_probability, guess,
+        )  # fmt: skip
+        noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)
+
+        def search() -> Array | None:
+            T = s.pose if guess is None else guess
+            return self._measure.landmarks_pose(update.landmarks.points, z, T, s.frame + 1)
+
         try:
-            found = agreement(problem, noises, lambda: self._landmarks_pose(s, problem, rows), self.models)
+            found = agreement(update, noises, search, self.models)
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
-            after = State.corrected(self._coordinates, found, rows)
+            after = s.corrected(found)
         except UnsolvableError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self._form.name}: {error}")
         used, w = found.used, found.system.w
-        dof = int(np.isfinite(problem.z[used]).sum())
-        return after, UpdateReport(
-            UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], float(w @ w), dof
-        )
+        dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
+        return after, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], float(w @ w), dof)
 
-    def _problem(self, s: State, observations: Observations, rows: IndexArray, guess: Array | None) -> Problem:
-        """The update by landmarks of some rows (M,) of the table."""
-        z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
-        if not self._form.stereo:
-            z[:, 2] = np.nan
-        view, model = partial(s.view, rows), Measurement(self.rig, self._coordinates, s.landmarks.anchors[rows])
-        return Problem(
-            view, s.landmarks.c[rows], CAMERA + 3 * rows, z, self.models.pixel_sigma, model, self._form.iterations,
-            self.models.gate_probability, guess,
-        )  # fmt: skip
-
-    def _landmarks_pose(self, s: State, problem: Problem, rows: IndexArray) -> Array | None:
-        """The pose (4, 4) on which most of the landmarks agree, if there is one."""
-        T = s.pose if problem.guess is None else problem.guess
-        return landmarks_pose(self.rig, s.landmarks.points[rows], problem.z, self.models, T, s.frame + 1)
-
-    def _started(self, what: str) -> State:
+    def _started(self, what: str) -> FilterState:
         if self.state.frame < 0:
             raise MeasurementError(f"{self._form.name}: {what} before the first predict")
         return self.state

@@ -11,39 +11,50 @@ _BLOCK = 64  # cost: rows and columns that are copied at a time
 
 
 @kernel
-def times(by_pose, own, first, X, out):
-    """``H X`` into `out` (3M, N).
+def times(by_pose, own, marks, camera, P, with_camera, with_marks):
+    """``H`` times the covariance of camera and landmarks.
 
     Args:
         by_pose: derivatives (M, 3, 6) of landmarks' measurements by [r, φ].
         own: derivatives (M, 3, 3) by the landmarks' own coordinates.
-        first: rows (M,) of X with these coordinates begin here; [r, φ] are the first six.
-        X: rows of the state (n, N).
-        out: filled in.
+        marks: which landmarks these are (M,).
+        camera: the camera's rows of the covariance (12, 12 + 3A).
+        P: the landmarks' (3A, 3A).
+        with_camera: filled in (3M, 12).
+        with_marks: filled in (3M, 3A).
     """
+    size, n = len(camera), len(P)
+    p, q, r = camera[0][size:], camera[1][size:], camera[2][size:]
+    s, t, u = camera[3][size:], camera[4][size:], camera[5][size:]
     for i in range(len(own)):
-        x = first[i]
+        x = 3 * marks[i]
         for j in range(3):
-            row = 3 * i + j
+            out, row = with_marks[3 * i + j], with_camera[3 * i + j]
             a, b, c = own[i, j, 0], own[i, j, 1], own[i, j, 2]
-            for k in range(X.shape[1]):
-                out[row, k] = a * X[x, k] + b * X[x + 1, k] + c * X[x + 2, k]
+            for k in range(size):
+                row[k] = a * camera[k, size + x] + b * camera[k, size + x + 1] + c * camera[k, size + x + 2]
+            for k in range(n):
+                out[k] = a * P[x, k] + b * P[x + 1, k] + c * P[x + 2, k]
             a, b, c = by_pose[i, j, 0], by_pose[i, j, 1], by_pose[i, j, 2]
             d, e, f = by_pose[i, j, 3], by_pose[i, j, 4], by_pose[i, j, 5]
-            for k in range(X.shape[1]):
-                out[row, k] += a * X[0, k] + b * X[1, k] + c * X[2, k] + d * X[3, k] + e * X[4, k] + f * X[5, k]
+            for k in range(size):
+                row[k] += a * camera[0, k] + b * camera[1, k] + c * camera[2, k]
+                row[k] += d * camera[3, k] + e * camera[4, k] + f * camera[5, k]
+            for k in range(n):
+                out[k] += a * p[k] + b * q[k] + c * r[k] + d * s[k] + e * t[k] + f * u[k]
 
 
 @kernel
-def innovation_covariance(by_pose, own, first, HP, variance, out):
-    """``S = H (H P)ᵀ + variance 1`` (3M, 3M): its lower triangle into `out`; arguments as of `times`."""
-    for row in range(len(HP)):
+def innovation_covariance(by_pose, own, marks, with_camera, with_marks, variance, out):
+    """``S = H (H P)ᵀ + variance 1``: its lower triangle into `out` (3M, 3M); arguments as of `times`."""
+    for row in range(len(out)):
         for i in range(row // 3 + 1):
-            x = first[i]
+            x = 3 * marks[i]
             for j in range(3):
-                value = own[i, j, 0] * HP[row, x] + own[i, j, 1] * HP[row, x + 1] + own[i, j, 2] * HP[row, x + 2]
+                value = own[i, j, 0] * with_marks[row, x] + own[i, j, 1] * with_marks[row, x + 1]
+                value += own[i, j, 2] * with_marks[row, x + 2]
                 for k in range(6):
-                    value += by_pose[i, j, k] * HP[row, k]
+                    value += by_pose[i, j, k] * with_camera[row, k]
                 out[row, 3 * i + j] = value
         out[row, row] += variance
 
@@ -94,20 +105,24 @@ def mirror(P):
 
 
 @kernel
-def gather(dense, cross, left, rows, columns):
-    """Part (R, C) of the matrix ``[[dense, cross, 0], [crossᵀ, left, 0], [0, 0, 0]]``; numbers of its rows and columns.
+def gather(camera, marks, cross, left, rows, columns):
+    """Part (R, C) of the whole covariance by numbers of its rows and columns: camera, landmarks, what has left.
 
-    A number −1 stands for the last part, what is independent of all else.
+    A number −1 stands for what is independent of all else.
     """
-    n, out = len(dense), np.empty((len(rows), len(columns)))
+    size, n, out = camera.shape[0], camera.shape[1], np.zeros((len(rows), len(columns)))
     for i in range(len(rows)):
         r = rows[i]
         for j in range(len(columns)):
             c = columns[j]
             if r < 0 or c < 0:
-                out[i, j] = 0.0
-            elif r < n:
-                out[i, j] = dense[r, c] if c < n else cross[r, c - n]
-            else:
+                continue
+            if r >= n:
                 out[i, j] = cross[c, r - n] if c < n else left[r - n, c - n]
+            elif c >= n:
+                out[i, j] = cross[r, c - n]
+            elif r < size:
+                out[i, j] = camera[r, c]
+            else:
+                out[i, j] = camera[c, r] if c < size else marks[r - size, c - size]
     return out

@@ -10,16 +10,13 @@ state has three numbers a landmark as before and everything else stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from slam.data import IdArray, IndexArray
-from slam.errors import MeasurementError
-from slam.geometry.se3 import Array, hat, transform
+from slam.geometry.se3 import Array, hat
+from slam.table import LandmarkTable
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
@@ -95,92 +92,44 @@ COORDINATES: dict[str, Coordinates] = {"inverse_depth": InverseDepth(), "euclide
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
-    """The map in rows: landmarks of the filter's state, in its order; those that left it; those that are only known.
+class FilterLandmarks(LandmarkTable):
+    """The map in rows: landmarks of the filter's state, in its order; those that left it; those that are only known."""
 
-    Attributes:
-        ids: (N,).
-        anchors: (N, 3, 4), constants.
-        c: coordinates (N, 3).
-        points: positions (N, 3) [m] in the world, which follow from the two.
-        gauge: derivatives (N, 3, 6) of the coordinates by a displacement of the whole world (shifted by t, turned by δ
-            about the origin).
-        seen: number of the frame (N,) that measured each last; that of its first sight at least.
-    """
-
-    ids: IdArray
-    anchors: Array
-    c: Array
-    points: Array
-    gauge: Array
-    seen: IndexArray
+    anchors: Array  # (N, 3, 4), constants
+    c: Array  # coordinates (N, 3)
+    points: Array  # positions (N, 3) [m] in the world, which follow from the two
+    gauge: (
+        Array  # derivatives (N, 3, 6) of the coordinates by a displacement of the world: shift, turn about its origin
+    )
+    seen: IndexArray  # number of the frame (N,) that measured each last; that of its first sight at least
 
     @classmethod
-    def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int) -> Landmarks:
+    def at(cls, coordinates: Coordinates, ids: IdArray, anchors: Array, points: Array, frame: int) -> FilterLandmarks:
         """New ones at positions (M, 3)."""
         c = coordinates.of(anchors, points)
         seen = np.full(len(ids), frame)
         return cls(ids, anchors, c, points, gauge_jacobian(coordinates, anchors, c, points), seen)
 
     @classmethod
-    def none(cls) -> Landmarks:
+    def none(cls) -> FilterLandmarks:
         """No landmarks."""
         return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)), 0)
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    @cached_property
-    def _rows(self) -> dict[int, int]:
-        return {id_: row for row, id_ in enumerate(self.ids.tolist())}
-
-    def rows_of(self, ids: IdArray | Sequence[int]) -> IndexArray:
-        """Rows (M,) of landmarks; raises MeasurementError for one that is not in the map."""
-        try:
-            return np.array([self._rows[int(i)] for i in ids], np.intp)
-        except KeyError as error:
-            raise MeasurementError(f"landmark {error.args[0]} is not in the map") from None
-
-    def require_new(self, ids: IdArray) -> None:
-        """Raise MeasurementError where a landmark is in the map already."""
-        for i in ids.tolist():
-            if i in self._rows:
-                raise MeasurementError(f"landmark {i} is in the map already")
-
-    @property
-    def _columns(self) -> tuple[Any, ...]:
-        return self.ids, self.anchors, self.c, self.points, self.gauge, self.seen
-
-    def take(self, rows: IndexArray | slice) -> Landmarks:
-        """Some rows."""
-        return Landmarks(*(column[rows] for column in self._columns))
-
-    def with_rows(self, at: int, new: Landmarks) -> Landmarks:
+    def with_rows(self, at: int, new: FilterLandmarks) -> FilterLandmarks:
         """With more rows, which begin at `at`."""
-        return Landmarks(*(np.concatenate([a[:at], b, a[at:]]) for a, b in zip(self._columns, new._columns)))
+        return self.select(slice(at)).joined(new).joined(self.select(slice(at, None)))
 
-    def moved(self, coordinates: Coordinates, rows: IndexArray, change: Array) -> Landmarks:
+    def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""
-        c = self.c.copy()
+        c, points, gauge, anchors = self.c.copy(), self.points.copy(), self.gauge.copy(), self.anchors[rows]
         c[rows] = coordinates.moved(self.c[rows], change, _NEARER)
-        return replace(self, c=c)._placed(coordinates, rows)
-
-    def displaced(self, coordinates: Coordinates, rows: IndexArray, T: Array) -> Landmarks:
-        """With some rows where a displacement T (4, 4) of the world brings them; their anchors stay."""
-        c = self.c.copy()
-        c[rows] = coordinates.of(self.anchors[rows], transform(T, self.points[rows]))
-        return replace(self, c=c)._placed(coordinates, rows)
-
-    def _placed(self, coordinates: Coordinates, rows: IndexArray) -> Landmarks:
-        """With points and gauge of some rows as their coordinates say."""
-        points, gauge, anchors, c = self.points.copy(), self.gauge.copy(), self.anchors[rows], self.c[rows]
-        points[rows] = coordinates.points(anchors, c)
-        gauge[rows] = gauge_jacobian(coordinates, anchors, c, points[rows])
-        return replace(self, points=points, gauge=gauge)
+        points[rows] = coordinates.points(anchors, c[rows])
+        gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
+        return replace(self, c=c, points=points, gauge=gauge)
 
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:
-    """Derivatives (M, 3, 6) of coordinates c (M, 3) by a displacement of the world; see `Landmarks`."""
+    """Derivatives (M, 3, 6) of coordinates c (M, 3) by a displacement of the world; see `FilterLandmarks`."""
     inverse = coordinates.inverse_jacobian(anchors, c)
     return np.concatenate([inverse, -inverse @ hat(points)], axis=2)
 

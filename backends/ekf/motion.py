@@ -25,14 +25,13 @@ class Camera(Protocol):
     """The camera's part of a filter's state, and what its error (12,) means: of the pose (6), of velocity and rate (6).
 
     - `pose`: ``T_world_left`` (4, 4).
-    - `invariant`: whether landmarks' errors are what is left when the world is displaced by the error of the pose.
     - `transports`: whether the covariance is transported to the corrected state after an update.
     - `by_error`: derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error.
     - `world`: the displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose.
-    - `plain`: the error (12, 12) by errors of position, attitude (a turn about the world's axes), velocity, and rate.
     - `moved`: after an error (12,) is corrected. `at`: at another pose (4, 4), with the same velocities.
     - `seen_from`: the error (12,) that would bring the other camera here.
-    - `transport`: the error as seen from another camera, by the error (12, 12).
+    - `transport`: an error as seen from another camera, by the error (12, 12): the same displacement of the world,
+      where it `transports`.
     - `advanced`: after `dt` [s], with the error's covariance P (12, 12).
     - `at_rest`: after a step of a camera that stands: the pose stays, and the velocity is zero for certain.
     - `settled`: in coordinates in which nothing is near a singularity.
@@ -41,12 +40,9 @@ class Camera(Protocol):
     @property
     def pose(self) -> Array: ...  # noqa: D102
     @property
-    def invariant(self) -> bool: ...  # noqa: D102
-    @property
     def transports(self) -> bool: ...  # noqa: D102
     def by_error(self) -> Array: ...  # noqa: D102
     def world(self) -> Array: ...  # noqa: D102
-    def plain(self) -> Array: ...  # noqa: D102
     def moved(self, error: Array) -> Any: ...  # noqa: D102
     def at(self, T: Array) -> Any: ...  # noqa: D102
     def seen_from(self, other: Any) -> Array: ...  # noqa: D102
@@ -58,17 +54,11 @@ class Camera(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A camera that has moved.
+    """A camera that has moved."""
 
-    Attributes:
-        camera: where it is.
-        J: its error is J (12, 12) times what it was before,
-        noise: plus a Gaussian of this covariance (12, 12).
-    """
-
-    camera: Any
-    J: Array = field(default_factory=lambda: np.eye(CAMERA))
-    noise: Array = field(default_factory=lambda: np.zeros((CAMERA, CAMERA)))
+    camera: Any  # where it is
+    J: Array = field(default_factory=lambda: np.eye(CAMERA))  # its error is J (12, 12) times what it was before,
+    noise: Array = field(default_factory=lambda: np.zeros((CAMERA, CAMERA)))  # plus a Gaussian of this covariance
 
     def then(self, camera: Any, J: Array, noise: Array | float = 0.0) -> Motion:
         """Followed by another one."""
@@ -77,18 +67,11 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class EulerCamera:
-    """The papers' [r, φ, v, ω]: position, Euler angles, and their rates; the error is that of these numbers.
+    """The papers' [r, φ, v, ω]: position, Euler angles, and their rates; the error is that of these numbers."""
 
-    Attributes:
-        x: the state (12,) [m], [rad], [m/s], [rad/s].
-        R_world_angles: the angles' world (3, 3), see `backends.ekf.angles`.
-        transports: keep the error of the attitude as a turn about the world's axes, and the covariance with it.
-    """
-
-    x: Array
-    R_world_angles: Array
-    transports: bool
-    invariant = False
+    x: Array  # (12,) [m], [rad], [m/s], [rad/s]
+    R_world_angles: Array  # the angles' world (3, 3), see `backends.ekf.angles`
+    transports: bool  # keep the error of the attitude as a turn about the world's axes, and the covariance with it
 
     @classmethod
     def first(cls, models: EstimatorModels, consistent: bool) -> tuple[EulerCamera, Array]:
@@ -109,9 +92,6 @@ class EulerCamera:
         W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ A, A
         return W
 
-    def plain(self) -> Array:  # noqa: D102
-        return np.eye(CAMERA)  # with turns about the angles' axes, which matters nowhere
-
     def moved(self, error: Array) -> EulerCamera:  # noqa: D102
         return replace(self, x=self.x + error)
 
@@ -127,7 +107,7 @@ class EulerCamera:
         return self.x - other.x
 
     def transport(self, to: EulerCamera) -> Array:
-        """The displacement of the world is kept: see `backends.ekf.state.State.corrected`."""
+        """The displacement of the world is kept: see `backends.ekf.state.FilterState.corrected`."""
         J = np.eye(CAMERA)
         if self.transports:
             A, A_before = turning(self.R_world_angles, to.x), turning(self.R_world_angles, self.x)

@@ -2,7 +2,7 @@
 
 In the papers' order: the innovation ν and its covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain
 ``K = P Hᵀ S⁻¹``, the corrected state ``x + K ν`` and covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is
-``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for g = [pose, measured landmarks] alone.
+``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for the pose and measured landmarks alone.
 
 A component that is not measured (or gated) keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
 """
@@ -10,7 +10,6 @@ A component that is not measured (or gated) keeps its row with a zero Jacobian a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,11 +20,12 @@ from scipy.linalg.blas import dgemm, dtrmm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
 from backends.ekf import kernels
-from backends.ekf.covariance import POSE
-from backends.ekf.measurement import Jacobian, Measurement
+from backends.ekf.covariance import CAMERA, POSE, Covariance
+from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
+from slam.window.stereo import RectifiedStereo
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
@@ -42,112 +42,176 @@ class UnsolvableError(ArithmeticError):
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """The prior as seen from a pose: errors of the state are taken from there.
+class Measurement:
+    """(uL, vL, uR) of landmarks, by the camera's pose and their coordinates (paper A, Eqs. 5-10; B, Eqs. 1-5)."""
 
-    Attributes:
-        state: the prior itself (`backends.ekf.state.State`), with its covariance as seen from there.
-        T: the pose T_world_left (4, 4).
-        P: the covariance (n, n) of the state's error.
-        mean: that of the state's error (n,): zero at the prior's own pose.
-        lever: an error x (6,) of the pose moves a measured landmark as seen from the camera by ``−lever x`` (M, 3, 6).
-        go: the pose, and the changes (M, 3) of the measured landmarks' coordinates, after an error (n,).
-    """
+    stereo: RectifiedStereo
+    coordinates: Coordinates
+    anchors: Array  # of the landmarks (M, 3, 4)
 
-    state: Any
-    T: Array
-    P: Array
-    mean: Array
-    lever: Array
-    go: Callable[[Array], tuple[Array, Array]]
+    def at(self, T: Array, c: Array) -> tuple[Array, Array]:
+        """Predicted (M, 3) [px] at a pose T (4, 4) and coordinates c (M, 3), NaN behind a camera.
+
+        And derivatives (M, 3, 3) by the coordinates. A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
+        """
+        z, J = self.stereo.project((self.coordinates.points(self.anchors, c) - T[:3, 3]) @ T[:3, :3])
+        return z, J @ (T[:3, :3].T @ self.coordinates.jacobian(self.anchors, c))
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """One update.
+class Jacobian:
+    """H (3M, n) of the measurements by the state's error, as products with it.
 
-    Attributes:
-        view: gives the prior as seen from a pose (4, 4), by default its own, with more noise (12, 12) of the camera.
-        c: the prior's coordinates (M, 3) of the measured landmarks.
-        first: where these begin in the state (M,).
-        z: measurements (M, 3) [px], NaN where a component is not measured.
-        sigma: pixel noise [px].
-        model: what is predicted, and its derivatives.
-        iterations: most linearisations.
-        gate_probability: quantile of χ² beyond which a landmark's measurement is rejected.
-        guess: a pose (4, 4) worth trying where the prior is far off, or None.
-        noise: of the camera (12, 12), which joins the prior's, or None.
+    A landmark's measurement depends on where it is as seen from the camera alone. An error x of the camera's pose moves
+    it there by ``−lever x`` in its own coordinates, so that ``H = own [−lever, 1]`` has columns for the pose and
+    the landmark: a displacement of both together is no row's business, wherever H is taken.
     """
 
-    view: Callable[[Array | None, Array | None], View]
-    c: Array
-    first: IndexArray
-    z: Array
-    sigma: float
-    model: Measurement
-    iterations: int
-    gate_probability: float
-    guess: Array | None = None
-    noise: Array | None = None
+    own: Array  # derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
+    lever: Array  # (M, 3, 6)
+    marks: IndexArray  # which landmarks of the state these are (M,)
 
     @cached_property
-    def prior(self) -> View:
-        """Seen from its own pose."""
-        return self.view(None, self.noise)
+    def by_pose(self) -> Array:
+        """Derivatives (M, 3, 6) by the pose's error."""
+        return np.asarray(-self.own @ self.lever)
+
+    def times(self, P: Covariance) -> tuple[Array, Array]:
+        """``H P``: with the camera (3M, 12), and with the landmarks of the state (3M, 3A)."""
+        with_camera, with_marks = (np.empty((3 * len(self.own), n)) for n in (CAMERA, len(P.marks)))
+        kernels.times(self.by_pose, self.own, self.marks, P.camera, P.marks, with_camera, with_marks)
+        return with_camera, with_marks
+
+    def times_rows(self, X: Array) -> Array:
+        """``H X`` (3M, N) for X (n, N)."""
+        landmarks = X[CAMERA:].reshape(len(X) // 3 - CAMERA // 3, 3, X.shape[1])[self.marks]
+        return np.asarray(self.own @ landmarks + self.by_pose @ X[:POSE]).reshape(3 * len(self.own), X.shape[1])
+
+    def covariance(self, with_camera: Array, with_marks: Array, variance: float) -> Array:
+        """``H (H P)ᵀ + variance 1`` (3M, 3M), by the parts of H P: its lower triangle, and zero."""
+        S = np.zeros((len(with_camera), len(with_camera)))
+        kernels.innovation_covariance(self.by_pose, self.own, self.marks, with_camera, with_marks, variance, S)
+        return S
+
+    def own_covariances(self, pose: Array, cross: Array, blocks: Array) -> Array:
+        """Covariances (M, 3, 3) [px²] of each landmark's innovation by itself, without the measurement's noise.
+
+        Args:
+            pose: covariance (6, 6) of the pose's error.
+            cross: covariances (M, 3, 6) of the landmarks' own coordinates with it.
+            blocks: covariances (M, 3, 3) of these coordinates.
+        """
+        A, B = self.by_pose, self.own
+        S = (A @ pose + 2 * (B @ cross)) @ A.transpose(0, 2, 1)
+        return np.asarray(0.5 * (S + S.transpose(0, 2, 1)) + B @ blocks @ B.transpose(0, 2, 1))
+
+    def transposed_times(self, y: Array) -> Array:
+        """``Hᵀ y`` (6 + 3M,) of [pose, measured landmarks], for y (3M,); it is zero elsewhere."""
+        m = len(self.own)
+        return np.concatenate([y @ self.by_pose.reshape(3 * m, 6), (y.reshape(m, 1, 3) @ self.own).reshape(3 * m)])
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """One update: the prior, and what was measured."""
+
+    camera: Any  # `backends.ekf.motion.Camera`
+    covariance: Covariance
+    landmarks: FilterLandmarks  # those that were measured (M,)
+    marks: IndexArray  # which of the state these are (M,)
+    z: Array  # measurements (M, 3) [px], NaN where a component is not measured
+    sigma: float  # pixel noise [px]
+    stereo: RectifiedStereo
+    coordinates: Coordinates
+    iterations: int  # most linearisations
+    gate_probability: float  # quantile of χ² beyond which a landmark's measurement is rejected
+    guess: Array | None = None  # a pose (4, 4) worth trying where the prior is far off
+
+    def wider(self, noise: Array) -> Update:
+        """With more noise (12, 12) of the camera."""
+        return replace(self, covariance=self.covariance.camera_moved(np.eye(CAMERA), noise))
 
     @cached_property
-    def g(self) -> IndexArray:
+    def numbers(self) -> IndexArray:
         """Where the pose and the measured landmarks stand in the state (6 + 3M,)."""
-        return np.concatenate([np.arange(POSE), (self.first[:, None] + np.arange(3)).reshape(-1)])
+        landmarks = CAMERA + 3 * self.marks[:, None] + np.arange(3)
+        return np.concatenate([np.arange(POSE), landmarks.reshape(-1)])
+
+    @cached_property
+    def measurement(self) -> Measurement:
+        """What is predicted."""
+        return Measurement(self.stereo, self.coordinates, self.landmarks.anchors)
+
+    def at(self, T: Array | None, change: Array | None = None, from_prior: float = 0.0) -> Iterate:
+        """Linearised at a pose (4, 4), or the prior's own, and a change (M, 3) of the landmarks' coordinates."""
+        camera, J, mean, c = self.camera, np.eye(CAMERA), np.zeros(CAMERA), self.landmarks.c
+        if T is not None:
+            camera = camera.at(T)
+            J = self.camera.transport(camera)
+            mean = np.linalg.solve(J, self.camera.seen_from(camera))
+        change = np.zeros_like(c) if change is None else change
+        z, own = self.measurement.at(camera.pose, self.coordinates.moved(c, change))
+        lever = self.landmarks.gauge @ (camera.world() @ J[:POSE, :POSE])
+        return Iterate(camera, J, mean, change, z, own, lever, from_prior)
 
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """Where measurements are linearised: a view, and a change (M, 3) of the landmarks' coordinates.
+    """Where measurements are linearised."""
 
-    Also what is predicted (M, 3), its derivatives (M, 3, 3) by the coordinates, the squared distance from the prior.
-    """
+    camera: Any
+    J: Array  # (12, 12): an error of the prior's camera is J times that, as an error of this one
+    mean: Array  # the error (12,) of the prior's camera less that of this one
+    change: Array  # of the landmarks' coordinates (M, 3)
+    z: Array  # what is predicted here (M, 3) [px]
+    own: Array  # its derivatives (M, 3, 3) by the coordinates
+    lever: Array  # see `Jacobian`
+    from_prior: float  # squared distance from the prior
 
-    view: View
-    change: Array
-    z: Array
-    own: Array
-    from_prior: float = 0.0
+    def cost(self, update: Update, rows: BoolArray) -> float:
+        """Squared distance from prior and measurements; ∞ where one cannot be seen."""
+        residual = np.where(rows, update.z - self.z, 0.0)
+        cost = self.from_prior + float(np.vdot(residual, residual)) / update.sigma**2
+        return cost if math.isfinite(cost) else math.inf
+
+    def camera_after(self, change: Array) -> Any:
+        """The camera after a change of the state (n,), from here."""
+        return self.camera.moved(self.J @ change[:CAMERA])
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A linear update, not factorised yet."""
+
+    rows: BoolArray  # mask of its rows (M, 3)
+    H: Jacobian
+    HP: tuple[Array, Array]  # see `Jacobian.times`
+    nu: Array  # innovation of the prior's mean (3M,)
+    S: Array  # its covariance, lower triangle (3M, 3M)
 
     @classmethod
-    def at(cls, problem: Problem, view: View, change: Array, from_prior: float = 0.0) -> Iterate:
-        """With its linearisation."""
-        c = problem.model.coordinates.moved(problem.c, change)
-        return cls(view, change, *problem.model.linearise(view.T, c), from_prior)
-
-    def cost(self, problem: Problem, rows: BoolArray) -> float:
-        """Squared distance from prior and measurements; ∞ where one cannot be seen."""
-        residual = np.where(rows, problem.z - self.z, 0.0)
-        cost = self.from_prior + float(np.vdot(residual, residual)) / problem.sigma**2
-        return cost if math.isfinite(cost) else math.inf
+    def of(cls, update: Update, rows: BoolArray, at: Iterate) -> Linear:
+        """Linearised at an iterate."""
+        H = Jacobian(at.own if rows.all() else np.where(rows[:, :, None], at.own, 0.0), at.lever, update.marks)
+        nu = np.where(rows, update.z - at.z, 0.0).reshape(-1)
+        nu += (H.own @ at.change[:, :, None]).reshape(-1) - H.by_pose.reshape(-1, POSE) @ at.mean[:POSE]
+        HP = H.times(update.covariance)
+        return cls(rows, H, HP, nu, H.covariance(*HP, update.sigma**2))
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """The linear update at an iterate, in whitened innovations: ``w = L⁻¹ ν`` has covariance 1.
+    """A linear update in whitened innovations: ``w = L⁻¹ ν`` has covariance 1.
 
     To take out measurements is to project w on what is orthogonal to the columns of L⁻¹ that belong to them: that gives
     what a factorisation without them would.
-
-    Attributes:
-        rows: its rows, a mask (M, 3).
-        H, HP: the Jacobian, and its product with the covariance (3M, n).
-        nu: the innovation taken back to the prior through H (3M,).
-        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
-        taken: orthonormal directions (3M, K) of what has been taken out.
     """
 
-    rows: BoolArray
-    H: Jacobian
-    HP: Array
-    nu: Array
-    inverse: Array
-    taken: Array
+    linear: Linear
+    rows: BoolArray  # mask of its rows (M, 3)
+    nu: Array  # (3M,)
+    inverse: Array  # L⁻¹ (3M, 3M), lower triangular
+    taken: Array  # orthonormal directions (3M, K) of what has been taken out
 
     @classmethod
     def of(cls, linear: Linear, gone: BoolArray) -> System:
@@ -165,13 +229,14 @@ class System:
             raise UnsolvableError("the innovation covariance is not positive definite")
         inverse = _inverse(upper).T
         inverse[out, out] = 0.0
-        return cls(linear.rows & ~gone, linear.H, linear.HP, nu, inverse, np.zeros((len(nu), 0)))
+        return cls(linear, linear.rows & ~gone, nu, inverse, np.zeros((len(nu), 0)))
 
     def without(self, gone: BoolArray) -> System:
-        """Without some more rows (mask (M, 3))."""
-        columns = self.inverse[:, np.flatnonzero(gone & self.rows)]
+        """Without some more landmarks (mask (M,))."""
+        columns = self.inverse[:, np.flatnonzero(gone[:, None] & self.rows)]
         more = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))[0]
-        return replace(self, rows=self.rows & ~gone, taken=np.concatenate([self.taken, more], axis=1))
+        taken = np.concatenate([self.taken, more], axis=1)
+        return replace(self, rows=self.rows & ~gone[:, None], taken=taken)
 
     def whiten(self, X: Array) -> Array:
         """``L⁻¹ X``, as far as it is not taken out, for X (3M, ...)."""
@@ -180,6 +245,8 @@ class System:
 
     def whitened(self, HX: Array) -> Array:
         """`whiten` of H X, transposed (N, 3M), in Fortran's order: P shrinks by ``V Vᵀ``, where V is this of H P."""
+        if not HX.size:
+            return np.zeros(HX.T.shape)
         V = dtrmm(1.0, self.inverse.T, HX.T, side=1)
         if self.taken.size:
             V = dgemm(-1.0, V @ self.taken, self.taken, beta=1.0, c=V, trans_b=1, overwrite_c=1)
@@ -198,11 +265,7 @@ class System:
     @cached_property
     def by_pose(self) -> Array:
         """The whitened innovation's covariance (3M, 6) with the pose."""
-        return self.whiten(self.HP[:, :POSE])
-
-    def variances(self, P: Array) -> Array:
-        """Of the pose's error (6,) after the update; rounding may leave one that is not positive."""
-        return np.asarray(P.diagonal()[:POSE] - (self.by_pose**2).sum(axis=0))
+        return self.whiten(self.linear.HP[0][:, :POSE])
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -218,72 +281,40 @@ class System:
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
-    """Of a linear update: mask of its rows (M, 3), H, H P (3M, n), ν (3M,), lower triangle of S (3M, 3M)."""
+class Posterior:
+    """The maximum of the posterior (or one step towards it)."""
 
-    rows: BoolArray
-    H: Jacobian
-    HP: Array
-    nu: Array
-    S: Array
-
-    @classmethod
-    def at(cls, problem: Problem, rows: BoolArray, at: Iterate) -> Linear:
-        """Linearised at an iterate; ν and S are those of the prior's mean."""
-        H = Jacobian.of(at.own, at.view.lever, problem.first, rows)
-        nu = np.where(rows, problem.z - at.z, 0.0).reshape(-1)
-        if at.change.any():
-            nu += (H.own @ at.change[:, :, None]).reshape(-1)
-        if at.view.mean.any():
-            nu -= H.times(at.view.mean[:, None])[:, 0]
-        HP = H.times(at.view.P)
-        return cls(rows, H, HP, nu, H.covariance(HP, problem.sigma**2))
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """The maximum of the posterior (or one step towards it).
-
-    Attributes:
-        used: which landmarks (M,) it is made of.
-        view: of the last linearisation.
-        change: the error (n,) to correct, as seen from there.
-        system: the last linear update, from which the covariance follows.
-    """
-
-    used: BoolArray
-    view: View
-    change: Array
-    system: System
+    update: Update
+    used: BoolArray  # which landmarks (M,) it is made of
+    at: Iterate  # the last linearisation
+    change: Array  # of the state (n,), see `Iterate.camera_after`
+    system: System  # the last linear update, from which the covariance follows
 
 
 @dataclass(frozen=True, eq=False)
 class Gated:
-    """Which landmarks (M,) each lie within the gate of their own innovation covariance, linearised at `start`.
+    """Which landmarks each lie within the gate of their own innovation covariance."""
 
-    The limits (M,) are the gate's, of the squared distances (M,) of the innovations; NaN where none is predicted.
-    """
-
-    used: BoolArray
-    limits: Array
-    distances: Array
-    start: Iterate
+    used: BoolArray  # (M,)
+    limits: Array  # of the gate (M,)
+    distances: Array  # squared, of the innovations (M,); NaN where none is predicted
+    start: Iterate  # where they were linearised
     linear: Linear
 
 
-def gate(problem: Problem, at_guess: bool = False) -> Gated:
+def gate(update: Update, at_guess: bool = False) -> Gated:
     """Test each landmark by itself, with its innovation linearised at the prior or at the guess.
 
     Raises:
         UnsolvableError: the prior is not finite, or S is not positive definite.
     """
-    view = problem.view(problem.guess, problem.noise) if at_guess else problem.prior
-    if not (np.isfinite(view.T).all() and math.isfinite(view.P.trace())):
+    start, measured = update.at(update.guess if at_guess else None), np.isfinite(update.z)
+    P = update.covariance
+    if not (np.isfinite(start.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
         raise UnsolvableError("the predicted state is not finite")
-    start, measured = Iterate.at(problem, view, np.zeros_like(problem.c)), np.isfinite(problem.z)
     visible = np.asarray(np.isfinite(start.z).all(axis=1))
-    linear = Linear.at(problem, measured & visible[:, None], start)
-    limits = chi_square_limits(measured.sum(axis=1), problem.gate_probability)
+    linear = Linear.of(update, measured & visible[:, None], start)
+    limits = chi_square_limits(measured.sum(axis=1), update.gate_probability)
     own = kernels.own_distances(linear.nu, linear.S)
     if not np.isfinite(own).all():
         raise UnsolvableError("the predicted innovations are not finite or not positive definite")
@@ -291,7 +322,7 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     return Gated(np.asarray(distances <= limits), limits, distances, start, linear)
 
 
-def solve(problem: Problem, gated: Gated) -> Solution | None:
+def solve(update: Update, gated: Gated) -> Posterior | None:
     """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
@@ -304,41 +335,42 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
         return None
     used, first = gated.used, System.of(gated.linear, gated.linear.rows & ~gated.used[:, None])
     while used.any():
-        view, change, system = _iterate(problem, gated.start, first)
+        at, change, system = _iterate(update, gated.start, first)
         excess = system.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            left = view.P[:POSE, :POSE] - system.by_pose.T @ system.by_pose
+            left = update.covariance.pose - system.by_pose.T @ system.by_pose
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
-            return Solution(used, view, change, system)
+            return Posterior(update, used, at, change, system)
         used = used & (excess <= max(1.0, 0.5 * worst))
-        first = first.without(~used[:, None] & np.ones(3, bool))
+        first = first.without(~used)
     return None
 
 
-def _iterate(problem: Problem, now: Iterate, system: System) -> tuple[View, Array, System]:
-    """The change of the state (n,), seen from a view, by an update whose first linearisation is `system`, and the last.
+def _iterate(update: Update, now: Iterate, system: System) -> tuple[Iterate, Array, System]:
+    """The change of the state (n,), from where, by an update whose first linearisation is `system`, and the last.
 
     Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
     is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
     """
     rows, reached = system.rows, None
-    for iteration in range(1, problem.iterations + 1):
-        s, change = system.H.transposed_times(system.y), system.y @ system.HP + now.view.mean
+    for iteration in range(1, update.iterations + 1):
+        s, HP = system.linear.H.transposed_times(system.y), system.linear.HP
+        change = np.concatenate([now.mean + system.y @ HP[0], system.y @ HP[1]])
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
-        if problem.iterations == 1 or _linear(problem, system, now, change):
-            return now.view, change, system
-        following, step = _descend(problem, rows, now, s, change)
-        if iteration == 1 and problem.guess is not None:
-            following = min(following, _at_guess(problem), key=lambda iterate: iterate.cost(problem, rows))
+        if update.iterations == 1 or _linear(update, system, now, change):
+            return now, change, system
+        following, step = _descend(update, rows, now, s, change)
+        if iteration == 1 and update.guess is not None:
+            following = min(following, _at_guess(update), key=lambda iterate: iterate.cost(update, rows))
         if following is now:
             break
-        reached = now.view, step, system
-        if iteration < problem.iterations:
+        reached = now, step, system
+        if iteration < update.iterations:
             now = following
-            system = System.of(Linear.at(problem, rows, now), np.zeros_like(rows))
+            system = System.of(Linear.of(update, rows, now), np.zeros_like(rows))
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
@@ -356,44 +388,45 @@ def _inverse(U: Array) -> Array:
     return out
 
 
-def _linear(problem: Problem, system: System, now: Iterate, change: Array) -> bool:
+def _linear(update: Update, system: System, now: Iterate, change: Array) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
-    seen = change[problem.first[:, None] + np.arange(3)] - now.view.lever @ change[:POSE]
-    T, moved = now.view.go(change)
-    z = problem.model.predict(T, problem.model.coordinates.moved(problem.c, moved))
-    expected = (now.own @ (seen - now.change)[:, :, None])[:, :, 0]
-    errors = np.where(system.rows, z - now.z - expected, 0.0)
-    if not np.abs(errors).max() < _LINEAR * problem.sigma:
+    moved = change[update.numbers[POSE:]].reshape(-1, 3)
+    T, c = now.camera_after(change).pose, update.coordinates.moved(update.landmarks.c, moved)
+    z, _ = update.measurement.at(T, c)
+    seen = moved - now.lever @ change[:POSE] - now.change
+    errors = np.where(system.rows, z - now.z - (now.own @ seen[:, :, None])[:, :, 0], 0.0)
+    if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    moved = system.whiten(errors.reshape(-1)) @ system.by_pose
-    return bool((moved**2 <= _POSE_SHARE**2 * system.variances(now.view.P)).all())
+    shift = system.whiten(errors.reshape(-1)) @ system.by_pose
+    variances = update.covariance.pose.diagonal() - (system.by_pose**2).sum(axis=0)
+    return bool((shift**2 <= _POSE_SHARE**2 * variances).all())
 
 
-def _at_guess(problem: Problem) -> Iterate:
+def _at_guess(update: Update) -> Iterate:
     """The guess, with the landmarks where they are believed: its distance from the prior is that of the pose alone."""
-    view, distance = problem.view(problem.guess, problem.noise), math.inf
+    there, distance = update.at(update.guess), math.inf
     with suppress(np.linalg.LinAlgError):  # a pose that is known exactly cannot be moved
-        mean = view.mean[:POSE]
-        distance = float(mean @ np.linalg.solve(view.P[:POSE, :POSE], mean))
-    return Iterate.at(problem, view, np.zeros_like(problem.c), distance)
+        mean = there.mean[:POSE]
+        distance = float(mean @ np.linalg.solve(update.covariance.pose, mean))
+    return replace(there, from_prior=distance)
 
 
-def _descend(problem: Problem, rows: BoolArray, now: Iterate, s: Array, change: Array) -> tuple[Iterate, Array]:
+def _descend(update: Update, rows: BoolArray, now: Iterate, s: Array, change: Array) -> tuple[Iterate, Array]:
     """The longest of the steps 1, 1/2, 1/4, ... towards ``change = mean + P s`` that does not raise the cost, else now.
 
     Where it ends, and the step (n,). The next linearisation is at the pose reached: the camera turns, and the landmarks
     stay. On the way the distance from the prior, with d at the start and d' at the end, is that of (1 − a) d + a d'.
     """
-    there = (change - now.view.mean)[problem.g]
+    numbers = update.numbers
     start = np.concatenate([np.zeros(POSE), now.change.reshape(-1)])
-    end, between = float(s @ there), float(s @ (start - now.view.mean[problem.g]))
-    cost, step = now.cost(problem, rows), change.copy()
+    mean = np.concatenate([now.mean[:POSE], np.zeros(now.change.size)])
+    end, between = float(s @ (change[numbers] - mean)), float(s @ (start - mean))
+    cost, step = now.cost(update, rows), change.copy()
     for halving in range(_HALVINGS):
         a = 0.5**halving
-        step[problem.g] = start + a * (change[problem.g] - start)
+        step[numbers] = start + a * (change[numbers] - start)
         distance = (1 - a) ** 2 * now.from_prior + 2 * a * (1 - a) * between + a * a * end
-        T, moved = now.view.go(step)
-        following = Iterate.at(problem, problem.view(T, problem.noise), moved, distance)
-        if following.cost(problem, rows) <= cost * (1 + 1e-9):
+        following = update.at(now.camera_after(step).pose, step[numbers[POSE:]].reshape(-1, 3), distance)
+        if following.cost(update, rows) <= cost * (1 + 1e-9):
             return following, step
     return now, step

@@ -13,7 +13,7 @@ from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
 from backends.smoother.mending import corrected, path_solved, rebuilt
 from backends.smoother.path import Path
-from backends.smoother.state import State
+from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
@@ -21,11 +21,10 @@ from slam.errors import CopyError, MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import require_in_front, require_known
+from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
-from slam.window.stereo import RectifiedStereo
 
 
 class SmootherBackend:
@@ -42,6 +41,11 @@ class SmootherBackend:
         models: noise, priors, motion and gate.
         options: see `SmootherConfig`.
 
+    Attributes:
+        state: all that is kept: poses, measurements, landmarks.
+        path: how the frames hang at the poses of the graph.
+        factor_maker: makes factors with this back end's rig and models.
+
     Raises:
         ConfigurationError: an option is unknown or out of range.
     """
@@ -51,32 +55,12 @@ class SmootherBackend:
         self.models = models
         self.config = from_options(SmootherConfig, "smoother", options)
         self._steps = Steps(rig, models, self.config)
-        self._make = FactorMaker(self._steps.stereo, models)
-        self._graph = Graph(self._make, self.config.lag)
-        self._state = State.empty()
-        self._path = Path()
+        self.factor_maker = FactorMaker(self._steps.stereo, models)
+        self._graph = Graph(self.factor_maker, self.config.lag)
+        self.state = SmootherState.empty()
+        self.path = Path()
         self._mended = False  # whether measurements were revised while poses were kept
-        self._answer: tuple[State, Trajectory] | None = None  # the last path, and the state that it is of
-
-    @property
-    def state(self) -> State:
-        """All that is kept: poses, measurements, landmarks."""
-        return self._state
-
-    @property
-    def path(self) -> Path:
-        """How the frames hang at the poses of the graph."""
-        return self._path
-
-    @property
-    def factor_maker(self) -> FactorMaker:
-        """Makes factors with this back end's rig and models."""
-        return self._make
-
-    @property
-    def stereo(self) -> RectifiedStereo:
-        """The rectified rig that measures."""
-        return self._steps.stereo
+        self._answer: tuple[SmootherState, Trajectory] | None = None  # the last path, and the state that it is of
 
     @property
     def rebuilds(self) -> int:
@@ -93,16 +77,16 @@ class SmootherBackend:
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
         """See `slam.interfaces.RestingBackend.predict_at_rest`."""
-        return self._predict(stamp, rests=self._state.started)
+        return self._predict(stamp, rests=self.state.started)
 
     def _predict(self, stamp: float, rests: bool) -> Prediction:
-        s = self._state
+        s = self.state
         require_stamp("smoother", stamp, float(s.stamps[1]) if s.started else None)
         s = self._steps.predicted(s, float(stamp), rests)
         rows, left, right, S = self._steps.in_view(s)
         found = Prediction(float(stamp), s.last[1].copy(), s.covariance, s.landmarks.ids[rows], left, right, S)
-        self._path.extend(s)
-        self._state = s
+        self.path.extend(s)
+        self.state = s
         return found
 
     @one_blas_thread
@@ -113,8 +97,8 @@ class SmootherBackend:
         require_not_measured("smoother", s.measured)
         z = self._steps.stereo.measure(observations)
         s, report = self._steps.updated(s, self._graph, observations.ids.copy(), z, guess)
-        self._path.follow(s)
-        self._state = s
+        self.path.follow(s)
+        self.state = s
         return report
 
     @one_blas_thread
@@ -122,11 +106,11 @@ class SmootherBackend:
         """See `slam.interfaces.Backend.add`."""
         s = self._started("add")
         if len(observations):
-            self._state = self._steps.added(s, observations.ids.copy(), self._steps.stereo.measure(observations))
+            self.state = self._steps.added(s, observations.ids.copy(), self._steps.stereo.measure(observations))
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What its measurements said about the poses is kept."""
-        self._state = self._steps.removed(self._state, np.unique(np.asarray(ids, np.int64)))
+        self.state = self._steps.removed(self.state, np.unique(np.asarray(ids, np.int64)))
 
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
@@ -141,13 +125,13 @@ class SmootherBackend:
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
-        marks = self._state.landmarks
+        marks = self.state.landmarks
         return marks.position[marks.rows_of(ids)]
 
     @one_blas_thread
     def recent(self, n: int) -> RecentPoses:
         """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
-        return self._path.recent(self._started("recent"), self._graph, require_recent("smoother", n))
+        return self.path.recent(self._started("recent"), self._graph, require_recent("smoother", n))
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
@@ -156,10 +140,10 @@ class SmootherBackend:
         After a revision of the measurements, all poses whose measurements are kept are solved for together. The newest
         pose stays where it is and the path before it moves, but where landmarks are known in the world.
         """
-        s = self._state
+        s = self.state
         if self._answer is None or self._answer[0] is not s:
-            graph = path_solved(s, self._make, self._path.graph(s.first)) if self._mended else None
-            self._answer = s, self._path.trajectory(s, graph)
+            graph = path_solved(s, self.factor_maker, self.path.graph(s.first)) if self._mended else None
+            self._answer = s, self.path.trajectory(s, graph)
         return Trajectory(self._answer[1].stamps.copy(), self._answer[1].poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
@@ -167,29 +151,24 @@ class SmootherBackend:
     @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
-        require_known("smoother", ids, positions, covariances)
-        self._state.landmarks.require_new(ids)
-        arguments = np.array(ids, np.int64), np.array(positions, float), np.array(covariances, float)
+        arguments = known_landmarks("smoother", self.state.landmarks, ids, positions, covariances, False)
         if len(ids):
-            self._state = self._steps.inserted(self._state, *arguments)
+            self.state = self._steps.inserted(self.state, *arguments)
 
     @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
-        require_known("smoother", ids, local, covariances)
-        require_in_front("smoother", ids, local)
-        s.landmarks.require_new(ids)
-        arguments = np.array(ids, np.int64), np.array(local, float), np.array(covariances, float)
+        arguments = known_landmarks("smoother", s.landmarks, ids, local, covariances, True)
         if len(ids):
-            self._state = self._steps.placed(s, *arguments)
+            self.state = self._steps.placed(s, *arguments)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
     @property
     def revises_path(self) -> bool:
         """See `slam.interfaces.RevisingBackend`: True while the first frame's measurements are still known."""
-        return self._state.first == self._state.begun == 0
+        return self.state.first == self.state.begun == 0
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
@@ -198,11 +177,11 @@ class SmootherBackend:
         The graph is built anew from corrected measurements, and landmarks move to where they put them. The path is
         found anew when it is asked for.
         """
-        s = self._state
+        s = self.state
         if s.started:
             before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph)
-            path = self._path.moved(s, s.poses[0] @ inverse(before.poses[0]))
-            self._path, self._state, self._mended = path, replace(s, measured=True), True
+            path = self.path.moved(s, s.poses[0] @ inverse(before.poses[0]))
+            self.path, self.state, self._mended = path, replace(s, measured=True), True
 
     # --- copies ---
 
@@ -219,7 +198,7 @@ class SmootherBackend:
 
     # --- parts ---
 
-    def _started(self, what: str) -> State:
-        if not self._state.started:
+    def _started(self, what: str) -> SmootherState:
+        if not self.state.started:
             raise MeasurementError(f"smoother: {what} before the first predict")
-        return self._state
+        return self.state

@@ -72,7 +72,7 @@ class FactorMaker:
 
     def __init__(self, stereo: RectifiedStereo, models: EstimatorModels) -> None:
         self.sigma = models.pixel_sigma * stereo.scale
-        self._stereo, self._models = stereo, models
+        self.stereo, self._models = stereo, models
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
         rectified = stereo.rectified_rig.original.is_rectified
@@ -82,7 +82,7 @@ class FactorMaker:
 
     @cached_property
     def _mono(self) -> tuple[gtsam.Cal3_S2, gtsam.noiseModel.Base]:
-        s = self._stereo
+        s = self.stereo
         return gtsam.Cal3_S2(s.f, s.f, 0.0, s.u0, s.v0), gtsam.noiseModel.Isotropic.Sigma(2, self.sigma)
 
     def prior(self, pose: int, T: Array, covariance: Array) -> gtsam.NonlinearFactor:

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.state import State
+from backends.smoother.state import SmootherState
 from slam.errors import SlamError
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 
@@ -31,7 +31,7 @@ class Track:
     """A landmark's smart factor.
 
     Attributes:
-        begun: see `Landmarks.begun`.
+        begun: see `SmootherLandmarks.begun`.
         poses: numbers of the poses that measured it.
         keys, points: their variables, and the measurements.
         stereo: whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only.
@@ -47,7 +47,7 @@ class Track:
 
 
 @dataclass
-class Problem:
+class GraphProblem:
     """Factors and first values, and what grew.
 
     Attributes:
@@ -66,25 +66,19 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The last poses as the graph has them.
+    """The last poses as the graph has them."""
 
-    Attributes:
-        first: number of the first one.
-        poses: (L, 4, 4).
-        covariance: joint covariance (12, 12) of the last two poses; (6, 6) of a single one.
-    """
-
-    first: int
-    poses: Array
-    covariance: Array
+    first: int  # number of the first one
+    poses: Array  # (L, 4, 4)
+    covariance: Array  # joint covariance (12, 12) of the last two poses; (6, 6) of a single one
 
 
 class Tracks:
     """Landmarks as factors: which measurement goes into which. Each is used once.
 
-    A landmark is a smart factor that grows until the landmark goes on in a new one (`Landmarks.measured`): factors end
-    before their first pose leaves the lag. A landmark of which more is known than what was measured is a variable of
-    its own.
+    A landmark is a smart factor that grows until the landmark goes on in a new one (`SmootherLandmarks.measured`):
+    factors end before their first pose leaves the lag. A landmark of which more is known than what was measured is a
+    variable of its own.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
@@ -92,7 +86,7 @@ class Tracks:
         self._smart: dict[int, Track] = {}
         self._variables: dict[int, int] = {}  # numbers of the poses that measured them last
 
-    def add_pose(self, problem: Problem, s: State, number: int, first: int) -> None:
+    def add_pose(self, problem: GraphProblem, s: SmootherState, number: int, first: int) -> None:
         """A pose, and its tie to the one before it, if it is not the first one."""
         row = s.of(number)
         tie = s.ties[row]
@@ -106,7 +100,7 @@ class Tracks:
         problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
         problem.stamps[pose_key(number)] = float(number)
 
-    def add_rows(self, problem: Problem, s: State, number: int, first: int, begin: int = 0) -> None:
+    def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, first: int, begin: int = 0) -> None:
         """What was measured from a pose, from some row on."""
         sight, make, known = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
         key = pose_key(number)
@@ -127,7 +121,7 @@ class Tracks:
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
             problem.grown[serial, begun] = track
 
-    def _is_variable(self, problem: Problem, s: State, serial: int, number: int, first: int) -> bool:
+    def _is_variable(self, problem: GraphProblem, s: SmootherState, serial: int, number: int, first: int) -> bool:
         """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
         if serial in self._variables:
             return self._lag is None or self._variables[serial] >= number - 1 - self._lag
@@ -137,7 +131,7 @@ class Tracks:
         self.add_known(problem, s, serial)
         return True
 
-    def add_known(self, problem: Problem, s: State, serial: int) -> None:
+    def add_known(self, problem: GraphProblem, s: SmootherState, serial: int) -> None:
         """A landmark of which something is known, as a variable."""
         known = s.known[serial]
         if known.pose < 0:
@@ -148,7 +142,7 @@ class Tracks:
             place = transform(s.poses[s.of(known.pose)], known.position[None])[0]
         problem.values.insert(landmark_key(serial), place)
 
-    def make_smart(self, problem: Problem, careful: bool = True) -> list[tuple[Track, int]]:
+    def make_smart(self, problem: GraphProblem, careful: bool = True) -> list[tuple[Track, int]]:
         """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""
         made = []
         for track in problem.grown.values():
@@ -168,8 +162,8 @@ class Tracks:
 class Graph:
     """gtsam's incremental fixed-lag smoother, and what is in it.
 
-    It follows a `State`, and nothing is in it alone: where it cannot go on from one state to the next, or gtsam fails,
-    it is built anew from what the state keeps.
+    It follows a `SmootherState`, and nothing is in it alone: where it cannot go on from one state to the next, or gtsam
+    fails, it is built anew from what the state keeps.
 
     Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
     world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
@@ -205,7 +199,7 @@ class Graph:
         self._first = np.eye(4)
         self._kind = False, 0
 
-    def followed(self, s: State) -> tuple[Solved, str]:
+    def followed(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with one pose more than the last one; and why the graph was built anew, if it was.
 
         Raises:
@@ -221,7 +215,7 @@ class Graph:
                 self._careful = s.number + (self._lag or _CAREFUL)
         return self.rebuilt(s), why
 
-    def rebuilt(self, s: State, again: int = 0) -> Solved:
+    def rebuilt(self, s: SmootherState, again: int = 0) -> Solved:
         """The solution with all anew, from what the state keeps; `again` so many times linearised again.
 
         Raises:
@@ -232,21 +226,23 @@ class Graph:
         try:
             self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
             prior, self._base = held(s, oldest)
-            begin = Problem()
+            begin = GraphProblem()
             begin.factors.add(self._make.prior(oldest, self._first, prior))
             return self._update(s, range(oldest, s.number + 1), oldest, begin, again)
         except FAILURES as error:
             raise SolverError(_line(error)) from error
 
-    def oldest(self, s: State, newest: int | None = None) -> int:
+    def oldest(self, s: SmootherState, newest: int | None = None) -> int:
         """Number of the oldest pose in the graph, where the newest one is that of the state, or has another number."""
         least = max(s.begun, s.first)
         return least if self._lag is None else max(least, (s.number if newest is None else newest) - self._lag)
 
-    def _stepped(self, s: State, number: int) -> Solved:
-        return self._update(s, range(number + 1, s.number + 1), self.oldest(s), Problem())
+    def _stepped(self, s: SmootherState, number: int) -> Solved:
+        return self._update(s, range(number + 1, s.number + 1), self.oldest(s), GraphProblem())
 
-    def _update(self, s: State, numbers: Iterable[int], first: int, problem: Problem, again: int = 0) -> Solved:
+    def _update(
+        self, s: SmootherState, numbers: Iterable[int], first: int, problem: GraphProblem, again: int = 0
+    ) -> Solved:
         """The solution after a problem, and some poses with what was measured from them; solved `again` so often."""
         for number in numbers:
             if number > first:
@@ -273,7 +269,7 @@ class Graph:
         self._number = s.number
         return solved
 
-    def joint_covariance(self, s: State, first: int | None = None) -> tuple[int, Array]:
+    def joint_covariance(self, s: SmootherState, first: int | None = None) -> tuple[int, Array]:
         """Number of the first pose, and the joint covariance (6 K, 6 K) of all poses from there on.
 
         From `first` on, or the oldest in the graph; of the newest pose alone, if the graph is not the state's.
@@ -291,12 +287,12 @@ class Graph:
         return np.asarray(0.5 * (P + P.T))
 
 
-def _kind(s: State) -> tuple[bool, int]:
+def _kind(s: SmootherState) -> tuple[bool, int]:
     """What a graph cannot follow: that landmarks become known in the world, and that measurements are revised."""
     return s.anchored, s.revisions
 
 
-def held(s: State, number: int) -> tuple[Array, Array]:
+def held(s: SmootherState, number: int) -> tuple[Array, Array]:
     """Covariance of the prior of a pose that comes first (6, 6), and what is known of it in the world besides."""
     P = s.spread[s.of(number)]
     if s.anchored:
@@ -306,7 +302,7 @@ def held(s: State, number: int) -> tuple[Array, Array]:
     return prior, (vectors * values.clip(min=0)) @ vectors.T
 
 
-def minimised(problem: Problem, iterations: int) -> gtsam.Values:
+def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
     """The values that fit all factors best, by Levenberg-Marquardt.
 
     Raises:

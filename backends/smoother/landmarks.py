@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from backends.smoother.landmark_kernels import carried_by, information_of
 from slam.data import BoolArray, IdArray, IndexArray
-from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, points_by_pose
+from slam.table import LandmarkTable
 from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
@@ -20,39 +20,22 @@ _BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies b
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
-    """The map, a row for each landmark.
+class SmootherLandmarks(LandmarkTable):
+    """The map, a row for each landmark."""
 
-    Attributes:
-        ids: (S,).
-        serial: number of each in the order of their coming (S,); an id may come back, a serial number not.
-        position: in world coordinates (S, 3) [m].
-        own: its covariance where all poses are known (S, 3, 3) [m²], in world axes.
-        away: what the camera's drift adds to that since it was last measured (S, 3, 3) [m²].
-        mean, information: what was known of it besides its measurements, in world coordinates: position (S, 3) and
-            information (S, 3, 3), zero for nothing.
-        world: whether that does not depend on any pose (S,).
-        z, pose: its last measurements (S, RECENT, 3), and the numbers of their poses (S, RECENT), −1 for none.
-        begun: number of the pose from which its present smart factor counts (S,); the factor may begin later.
-    """
-
-    ids: IdArray
-    serial: IdArray
-    position: Array
-    own: Array
-    away: Array
-    mean: Array
-    information: Array
-    world: BoolArray
-    z: Array
-    pose: IndexArray
-    begun: IndexArray
-
-    def __len__(self) -> int:
-        return len(self.ids)
+    serial: IdArray  # number of each in the order of their coming (S,); an id may come back, a serial number not
+    position: Array  # in world coordinates (S, 3) [m]
+    own: Array  # its covariance where all poses are known (S, 3, 3) [m²], in world axes
+    away: Array  # what the camera's drift adds to that since it was last measured (S, 3, 3) [m²]
+    mean: Array  # what was known of it besides its measurements, in world coordinates: position (S, 3) [m]
+    information: Array  # and information (S, 3, 3) [1/m²], zero for nothing
+    world: BoolArray  # whether that does not depend on any pose (S,)
+    z: Array  # its last measurements (S, RECENT, 3)
+    pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
+    begun: IndexArray  # number of the pose from which its present smart factor counts (S,); it may begin later
 
     @classmethod
-    def of(cls, ids: IdArray, first: int, position: Array, own: Array, information: Array, world: bool) -> Landmarks:
+    def of(cls, ids: IdArray, first: int, position: Array, own: Array, information: Array, world: bool) -> Self:
         """Landmarks that are known, but not measured yet; `first` is the first one's serial number."""
         n = len(ids)
         return cls(
@@ -61,51 +44,17 @@ class Landmarks:
         )  # fmt: skip
 
     @classmethod
-    def none(cls) -> Landmarks:
+    def none(cls) -> Self:
         """No landmark."""
         nine = np.zeros((0, 3, 3))
         return cls.of(np.zeros(0, np.int64), 0, np.zeros((0, 3)), nine, nine, False)
-
-    def joined(self, other: Landmarks) -> Landmarks:
-        """These and others."""
-        names = self.__dataclass_fields__
-        return Landmarks(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
-
-    def select(self, keep: np.ndarray) -> Landmarks:
-        """Some of the rows (a mask or indices)."""
-        return Landmarks(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
-
-    @cached_property
-    def order(self) -> IndexArray:
-        """Rows by ascending id."""
-        return np.argsort(self.ids, kind="stable")
-
-    def rows_of(self, ids: IdArray) -> IndexArray:
-        """Rows of landmarks.
-
-        Raises:
-            MeasurementError: one is not in the map.
-        """
-        ids = np.asarray(ids, np.int64)
-        known = self.ids[self.order]
-        at = np.searchsorted(known, ids).clip(0, max(len(known) - 1, 0))
-        bad = known[at] != ids if len(known) else np.ones(len(ids), bool)
-        if bad.any():
-            raise MeasurementError(f"smoother: landmark {ids[bad][0]} is not in the map")
-        return self.order[at]
-
-    def require_new(self, ids: IdArray) -> None:
-        """Raise MeasurementError if one of the ids is in the map."""
-        taken = np.isin(ids, self.ids)
-        if taken.any():
-            raise MeasurementError(f"smoother: landmark {ids[taken][0]} is in the map already")
 
     @property
     def from_newest(self) -> Array:
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
 
-    def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0) -> Landmarks:
+    def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0) -> SmootherLandmarks:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number.
 
         A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
@@ -131,7 +80,7 @@ class Landmarks:
         zs[rows, oldest], poses[rows, oldest] = z, pose
         return replace(self, z=zs, pose=poses, away=away, begun=begun)
 
-    def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Landmarks:
+    def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Self:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""
         unseen = ~self.world
         unseen[rows] = False
@@ -140,7 +89,7 @@ class Landmarks:
         away[unseen] += by_pose @ drift @ np.swapaxes(by_pose, 1, 2)
         return replace(self, away=away)
 
-    def without_measurements(self) -> Landmarks:
+    def without_measurements(self) -> Self:
         """As they stand, with what is known of them now in place of their measurements."""
         information = np.where(self.world[:, None, None], self.information, inverses(self.from_newest))
         mean = np.where(self.world[:, None], self.mean, self.position)
@@ -148,7 +97,7 @@ class Landmarks:
             self, mean=mean, information=information, z=np.full_like(self.z, np.nan), pose=-1 + 0 * self.pose
         )
 
-    def refined(self, stereo: RectifiedStereo, sigma: float, first: int, poses: Array) -> Landmarks:
+    def refined(self, stereo: RectifiedStereo, sigma: float, first: int, poses: Array) -> Self:
         """Where their measurements put them, given the poses (K, 4, 4) from number `first` on.
 
         Each landmark by Levenberg-Marquardt for itself: a plain step from a distant start may end behind the camera.
@@ -219,11 +168,12 @@ class Landmarks:
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
 
 
-def _put(marks: Landmarks, chosen: BoolArray, others: Landmarks) -> Landmarks:
+def _put(marks: SmootherLandmarks, chosen: BoolArray, others: SmootherLandmarks) -> SmootherLandmarks:
     """Landmarks with some rows (S,) taken from others."""
-    names = marks.__dataclass_fields__
-    columns = ((getattr(marks, name), getattr(others, name)) for name in names)
-    return Landmarks(*(np.where(chosen.reshape(-1, *[1] * (mine.ndim - 1)), its, mine) for mine, its in columns))
+    columns = zip(marks.columns, others.columns)
+    return SmootherLandmarks(
+        *(np.where(chosen.reshape(-1, *[1] * (mine.ndim - 1)), its, mine) for mine, its in columns)
+    )
 
 
 def _regular(H: Array) -> Array:

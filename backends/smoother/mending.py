@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, pose_key
-from backends.smoother.graph import Graph, Problem, SolverError, Tracks, held, minimised
-from backends.smoother.state import State
+from backends.smoother.graph import Graph, GraphProblem, SolverError, Tracks, held, minimised
+from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
-from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, inverse, transform
+from slam.window.stereo import RectifiedStereo
 
 _AGAIN = 2  # numerics: steps of Gauss and Newton after the first
 _ITERATIONS = 20  # numerics: of Levenberg-Marquardt at most
 
 
-def corrected(s: State, correct: Callable[[Array], Array]) -> State:
+def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherState:
     """With corrected measurements.
 
     Raises:
@@ -28,16 +28,14 @@ def corrected(s: State, correct: Callable[[Array], Array]) -> State:
     marks, shape = s.landmarks, s.landmarks.z.shape
     counts = np.cumsum([0, *map(len, s.sights)])
     rows = np.concatenate([*(sight.z for sight in s.sights), marks.z.reshape(-1, 3)[marks.pose.ravel() >= 0]])
-    out = np.asarray(correct(rows.copy()), float)
-    if out.shape != rows.shape or not (np.isfinite(out) == np.isfinite(rows)).all():
-        raise MeasurementError("smoother: a corrected measurement is not finite")
+    out = RectifiedStereo.corrected("smoother", rows, correct)
     sights = tuple(replace(sight, z=out[a:b]) for sight, a, b in zip(s.sights, counts, counts[1:]))
     z = marks.z.reshape(-1, 3).copy()
     z[marks.pose.ravel() >= 0] = out[counts[-1] :]
     return replace(s, sights=sights, landmarks=replace(marks, z=z.reshape(shape)), revisions=s.revisions + 1)
 
 
-def rebuilt(s: State, steps: Steps, graph: Graph) -> State:
+def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
     first = graph.oldest(s)
     try:
@@ -63,7 +61,7 @@ def rebuilt(s: State, steps: Steps, graph: Graph) -> State:
     return s
 
 
-def path_solved(s: State, make: FactorMaker, before: Array) -> Array:
+def path_solved(s: SmootherState, make: FactorMaker, before: Array) -> Array:
     """All poses of the graph, those that are kept solved for together; as they are where that fails.
 
     The newest pose stays where it is, and the path moves, but where landmarks are known in the world.
@@ -77,13 +75,13 @@ def path_solved(s: State, make: FactorMaker, before: Array) -> Array:
     return M @ np.concatenate([before, kept])
 
 
-def optimised(s: State, make: FactorMaker, first: int) -> Array:
+def optimised(s: SmootherState, make: FactorMaker, first: int) -> Array:
     """Poses from number `first` on that fit their measurements best; the first has a prior.
 
     Raises:
         SolverError: gtsam failed, or found nothing better.
     """
-    problem, tracks = Problem(), Tracks(make, None)
+    problem, tracks = GraphProblem(), Tracks(make, None)
     problem.factors.add(make.prior(first, s.poses[s.of(first)], held(s, first)[0]))
     numbers = range(first, s.number + 1)
     for number in numbers:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from backends.smoother.graph import Graph
-from backends.smoother.state import State
+from backends.smoother.state import SmootherState
 from slam.data import IndexArray, RecentPoses
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
@@ -21,7 +21,7 @@ class Path:
         self._own: list[Array] = []  # covariance of that (6, 6)
         self._poses: list[Array] = []  # of the graph, by number
 
-    def extend(self, s: State) -> None:
+    def extend(self, s: SmootherState) -> None:
         """Take in a new frame. An earlier try at the same frame is overwritten."""
         f = s.frame
         self._stamps[f:], self._number[f:], self._relative[f:], self._own[f:] = (
@@ -32,7 +32,7 @@ class Path:
         )
         self.follow(s)
 
-    def follow(self, s: State) -> None:
+    def follow(self, s: SmootherState) -> None:
         """Take in what has become of the last two frames and of the graph."""
         self._poses[s.first :] = list(s.poses)
         f = s.frame
@@ -40,7 +40,7 @@ class Path:
         if s.since and not s.inside and self._number[f - 1] == s.number:
             self._relative[f - 1], self._own[f - 1] = inverse(s.poses[-1]) @ s.last[0], s.pair[:6, :6]
 
-    def moved(self, s: State, D: Array) -> Path:
+    def moved(self, s: SmootherState, D: Array) -> Path:
         """The path of a state whose oldest poses were moved by D (4, 4) in the world, as all before them are."""
         other = Path()
         for name, rows in vars(self).items():
@@ -58,7 +58,7 @@ class Path:
         """Poses of the graph before the one with number `first` (N, 4, 4)."""
         return np.array(self._poses[:first]).reshape(-1, 4, 4)
 
-    def trajectory(self, s: State, graph: Array | None = None) -> Trajectory:
+    def trajectory(self, s: SmootherState, graph: Array | None = None) -> Trajectory:
         """Poses of all frames; with other poses (N, 4, 4) for those of the graph, if they are given."""
         if not self._stamps:
             return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
@@ -67,7 +67,7 @@ class Path:
             poses[-1] = s.last[1]
         return Trajectory(np.array(self._stamps), poses)
 
-    def recent(self, s: State, graph: Graph, count: int) -> RecentPoses:
+    def recent(self, s: SmootherState, graph: Graph, count: int) -> RecentPoses:
         """The last frames, at most so many, that hang at poses of the graph that are still smoothed."""
         first, joint = graph.joint_covariance(s, self._number[max(0, s.frame + 1 - count)])
         frames = [f for f in range(max(0, s.frame + 1 - count), s.frame + 1) if self._number[f] >= first]

@@ -8,29 +8,24 @@ import numpy as np
 
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import Graph, Solved, SolverError
-from backends.smoother.landmarks import Landmarks, inverses
-from backends.smoother.state import Known, Sight, State, Tie, relative_covariance
+from backends.smoother.landmarks import SmootherLandmarks, inverses
+from backends.smoother.state import Known, Sight, SmootherState, Tie
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
-from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
 from slam.window import motion, pose_only
-from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
-from slam.window.gating import squared_distances, with_noise
+from slam.window.agreement import MIN_CONSENSUS
+from slam.window.gating import squared_distances
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
-from slam.window.stereo import RectifiedMeasurement
+from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
 _STANDS = 1e-5  # numerics: step [rad], [m] of a camera that stands; none at all would leave no information matrix
 
 
 @dataclass(frozen=True, eq=False)
 class Steps(RectifiedMeasurement):
-    """What the steps need besides the state.
+    """What the steps need besides the state."""
 
-    Attributes:
-        config: limits.
-    """
-
-    config: SmootherConfig
+    config: SmootherConfig  # limits
 
     @property
     def past(self) -> int | None:
@@ -44,7 +39,7 @@ class Steps(RectifiedMeasurement):
 
     # --- prediction ---
 
-    def predicted(self, s: State, stamp: float, rests: bool = False) -> State:
+    def predicted(self, s: SmootherState, stamp: float, rests: bool = False) -> SmootherState:
         """With the newest frame at `stamp` [s], by the motion model. The very first one is a pose of the graph."""
         if not s.started:
             T = self.models.initial_pose
@@ -53,15 +48,9 @@ class Steps(RectifiedMeasurement):
             return _begun(s, T, np.diag(sigmas**2), Sight.none())
         dt = min(stamp - s.stamps[1], motion.LONGEST)
         before = None if s.since == 0 else min(s.stamps[1] - s.stamps[0], motion.LONGEST)
-        first, J, T = motion.is_first(before, dt), np.zeros((6, 12)), s.last[1]
+        T, J, noise, first = motion.predicted(self.models, s.last, before, dt)
         if rests:
-            J[:, 6:], noise = np.eye(6), _STANDS**2 * np.eye(6)
-        else:
-            if before is None or first:
-                T, J[:, 6:], Jw = motion.predict_from_rest(T, dt)
-            else:
-                T, J[:, :6], J[:, 6:], Jw = motion.predict(s.last[0], s.last[1], before, dt)
-            noise = (Jw * motion.velocity_sigmas(self.models, dt, first) ** 2) @ Jw.T
+            T, J, noise = s.last[1], np.eye(6, 12, 6), _STANDS**2 * np.eye(6)
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
         own = 0.5 * (own + own.T)
@@ -73,24 +62,21 @@ class Steps(RectifiedMeasurement):
             pair=np.block([[s.own, cross.T], [cross, own]]), since=s.since + 1, inside=False, measured=False, tie=tie,
         )  # fmt: skip
 
-    def in_view(self, s: State) -> tuple[IndexArray, Array, Array, Array]:
+    def in_view(self, s: SmootherState) -> tuple[IndexArray, Array, Array, Array]:
         """Landmarks in the angle of view (paper A, Fig. 3), their pixels, and innovation covariances (M, 2, 2)."""
-        T, marks, rig = s.last[1], s.landmarks, self.rig
-        rows = marks.order
-        rows = rows[rig.left.in_view((marks.position[rows] - T[:3, 3]) @ T[:3, :3])]
+        T, marks, rows = s.last[1], s.landmarks, s.landmarks.order
+        rows = rows[self.visible(T, marks.position[rows])]
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         by_pose = points_by_pose(local)
         by_motion = np.where(marks.world[rows, None, None], s.covariance, s.own)
         C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
-        uv, J = rig.left.project_with_jacobian(local)
-        S = with_noise(J @ C @ np.swapaxes(J, 1, 2), self.models.pixel_sigma)
-        return rows, uv, rig.right.project((local + rig.b) @ rig.R.T), S
+        return rows, *self.pixels(local, C)
 
     # --- update ---
 
     def updated(
-        self, s: State, graph: Graph, ids: IdArray, z: Array, guess: Array | None
-    ) -> tuple[State, UpdateReport]:
+        self, s: SmootherState, graph: Graph, ids: IdArray, z: Array, guess: Array | None
+    ) -> tuple[SmootherState, UpdateReport]:
         """After measurements z (M, 3) of landmarks."""
         rows, s = s.landmarks.rows_of(ids), replace(s, measured=True)
         if not len(rows):
@@ -108,7 +94,7 @@ class Steps(RectifiedMeasurement):
         reason = f"smoother: built anew after {why}" if why else ""
         return after, UpdateReport(UpdateStatus.OK, reason, ids[used], ids[~used], nis, int(np.isfinite(z[used]).sum()))
 
-    def _problem(self, s: State, rows: IndexArray, z: Array) -> pose_only.PoseProblem:
+    def _problem(self, s: SmootherState, rows: IndexArray, z: Array) -> pose_only.PoseProblem:
         """The newest pose alone, with the motion model as its prior, and landmarks as they stand."""
         T, marks = s.last[1], s.landmarks
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
@@ -118,23 +104,19 @@ class Steps(RectifiedMeasurement):
         return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
 
     def _agreement(
-        self, s: State, one: pose_only.PoseProblem, rows: IndexArray, z: Array, guess: Array | None
+        self, s: SmootherState, one: pose_only.PoseProblem, rows: IndexArray, z: Array, guess: Array | None
     ) -> Agreement:
         """Initial value of the newest pose, and which measurements agree with it."""
 
         def search() -> Array | None:
-            rectified = self.stereo.rectified_rig
-            pixels = z + np.array([0.0, 0.0, self.stereo.doffs])
-            turned = one.predicted @ rectified.T_left_rectified
-            found = landmarks_pose(rectified.rig, one.points, pixels, self.models, turned, s.number)
-            return None if found is None else found @ inverse(rectified.T_left_rectified)
+            return self.landmarks_pose(one.points, z, one.predicted, s.number)
 
         lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(s.spread[-1])
         return agreement(one, one.predicted if guess is None else guess, search, s.contradicted, lost)
 
     def _corrected(
-        self, s: State, graph: Graph, one: pose_only.PoseProblem, found: Agreement, rows: IndexArray, z: Array
-    ) -> tuple[State, float, str]:
+        self, s: SmootherState, graph: Graph, one: pose_only.PoseProblem, found: Agreement, rows: IndexArray, z: Array
+    ) -> tuple[SmootherState, float, str]:
         """The state after an update, its NIS, and why the graph was built anew, if it was."""
         used, marks = found.used, s.landmarks
         seen, number = rows[used], s.number + (found.jump is not None or not s.inside)
@@ -168,7 +150,7 @@ class Steps(RectifiedMeasurement):
         drift = _drift(solved.covariance, after.poses[-2], after.poses[-1])
         return replace(after, landmarks=after.landmarks.left_behind(seen, after.poses[-1], drift)), nis, why
 
-    def _is_chosen(self, s: State, T: Array, seen: IndexArray) -> bool:
+    def _is_chosen(self, s: SmootherState, T: Array, seen: IndexArray) -> bool:
         """Whether the newest frame, at T (4, 4), becomes a pose of the graph: see `SmootherConfig`."""
         if self.config.motion == 0:
             return True
@@ -181,7 +163,7 @@ class Steps(RectifiedMeasurement):
             moved = np.linalg.norm(here[:, :2] / here[:, 2:] - there[:, :2] / there[:, 2:], axis=1)
         return bool(np.nanmedian(moved) >= self.config.motion)
 
-    def settled(self, s: State, solved: Solved) -> State:
+    def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest frame is a pose of it."""
         poses = np.concatenate([s.poses[: s.of(solved.first)], solved.poses])
         P, pair, last = solved.covariance, np.zeros((12, 12)), s.last.copy()
@@ -200,19 +182,14 @@ class Steps(RectifiedMeasurement):
 
     # --- landmarks ---
 
-    def added(self, s: State, ids: IdArray, z: Array) -> State:
+    def added(self, s: SmootherState, ids: IdArray, z: Array) -> SmootherState:
         """With new landmarks at their first sight z (M, 3) in the newest pose (paper A, Eqs. 8 and 10).
 
         Raises:
             MeasurementError: one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
-        local = self.stereo.triangulate(z)
-        bad = ~np.isfinite(local).all(axis=1)
-        if bad.any():
-            raise MeasurementError(f"smoother: landmark {ids[bad][0]} has no right pixel or no positive depth")
-        back = np.linalg.inv(self.stereo.project(local)[1])
-        marks = _seen_from_newest(s, ids, local, self.sigma**2 * back @ np.swapaxes(back, 1, 2))
+        marks = _seen_from_newest(s, ids, *self.first_sight(ids, z))
         if s.inside:
             nothing = np.zeros_like(marks.information)
             new = np.arange(len(ids))
@@ -220,13 +197,13 @@ class Steps(RectifiedMeasurement):
             s = replace(s, sights=(*s.sights[:-1], s.sights[-1].joined(Sight.of(marks, new, z))))
         return _with(s, marks)
 
-    def inserted(self, s: State, ids: IdArray, positions: Array, covariances: Array) -> State:
+    def inserted(self, s: SmootherState, ids: IdArray, positions: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
-        marks = Landmarks.of(ids, s.serials, positions, covariances, inverses(covariances), True)
+        marks = SmootherLandmarks.of(ids, s.serials, positions, covariances, inverses(covariances), True)
         known = {serial: Known(x, P, -1) for serial, x, P in zip(marks.serial.tolist(), positions, covariances)}
         return replace(_with(s, marks), known={**s.known, **known}, measured=s.measured)
 
-    def placed(self, s: State, ids: IdArray, local: Array, covariances: Array) -> State:
+    def placed(self, s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
         marks = _seen_from_newest(s, ids, local, covariances)
         T, by_pose = inverse(s.poses[-1]) @ s.last[1], points_by_pose(local)
@@ -236,7 +213,7 @@ class Steps(RectifiedMeasurement):
             _with(s, marks), known={**s.known, **{serial: Known(x, P, s.number) for serial, x, P in relative}}
         )
 
-    def removed(self, s: State, ids: IdArray) -> State:
+    def removed(self, s: SmootherState, ids: IdArray) -> SmootherState:
         """Without landmarks; what their measurements say of the poses stays.
 
         Raises:
@@ -246,14 +223,14 @@ class Steps(RectifiedMeasurement):
         keep[s.landmarks.rows_of(ids)] = False
         return replace(s, landmarks=s.landmarks.select(keep))
 
-    def landmark_covariances(self, s: State, graph: Graph, rows: IndexArray) -> Array:
+    def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks in the world."""
         first, joint = graph.joint_covariance(s)
         poses = s.poses[s.of(first) :]
         return s.landmarks.covariances(self.stereo, self.sigma, rows, first, poses, joint)
 
 
-def _begun(s: State, T: Array, covariance: Array, sight: Sight) -> State:
+def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> SmootherState:
     """With the newest frame, at T (4, 4), as the pose of the graph with which the problem begins (anew)."""
     number = s.number + 1 if s.started else 0
     return replace(
@@ -263,7 +240,7 @@ def _begun(s: State, T: Array, covariance: Array, sight: Sight) -> State:
     )  # fmt: skip
 
 
-def _hung(s: State, T: Array, information: Array) -> State:
+def _hung(s: SmootherState, T: Array, information: Array) -> SmootherState:
     """With the newest frame at T (4, 4), by measurements with an information (6, 6), but as no pose of the graph."""
     own = np.linalg.inv(information + np.linalg.inv(s.own))
     gain = s.pair[:6, 6:] @ np.linalg.inv(s.own)
@@ -291,11 +268,11 @@ def _information(J: Array, noise: Array, z: Array) -> Array:
     return information
 
 
-def _with(s: State, marks: Landmarks) -> State:
+def _with(s: SmootherState, marks: SmootherLandmarks) -> SmootherState:
     return replace(s, landmarks=s.landmarks.joined(marks), serials=s.serials + len(marks), measured=True)
 
 
-def _seen_from_newest(s: State, ids: IdArray, local: Array, covariances: Array) -> Landmarks:
+def _seen_from_newest(s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherLandmarks:
     """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes.
 
     From a frame that is no pose of the graph they are as uncertain as it is itself, given the newest pose of the graph.
@@ -306,7 +283,7 @@ def _seen_from_newest(s: State, ids: IdArray, local: Array, covariances: Array) 
         covariances = covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)
     own = T[:3, :3] @ covariances @ T[:3, :3].T
     own = 0.5 * (own + np.swapaxes(own, 1, 2))
-    return Landmarks.of(ids, s.serials, transform(T, local), own, inverses(own), False)
+    return SmootherLandmarks.of(ids, s.serials, transform(T, local), own, inverses(own), False)
 
 
 def _carried(J: Array, P: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from backends.window.config import WindowConfig
 from backends.window.history import Call, History, state_corrected
-from backends.window.state import State, settle
+from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
@@ -18,7 +18,7 @@ from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import require_in_front, require_known
+from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
@@ -49,12 +49,12 @@ class WindowBackend:
         self.models = models
         self.config = from_options(WindowConfig, "window", options)
         self._steps = Steps(rig, models, self.config)
-        self._state = State.empty()
+        self._state = WindowState.empty()
         self._stamps: list[float] = []
         self._final: list[Array] = []  # poses by frame; those of the window and of its past are in the state
         self._history = History()
         self._revised = -1  # number of the newest frame when measurements were revised last, −1 for never
-        self._path: tuple[State, Trajectory] | None = None  # the last answer, and the state that it is of
+        self._path: tuple[WindowState, Trajectory] | None = None  # the last answer, and the state that it is of
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
@@ -147,9 +147,7 @@ class WindowBackend:
     @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
-        require_known("window", ids, positions, covariances)
-        self._state.landmarks.require_new(ids)
-        arguments = np.array(ids, np.int64), np.array(positions, float), np.array(covariances, float)
+        arguments = known_landmarks("window", self._state.landmarks, ids, positions, covariances, False)
         if len(ids):
             self._done(self._steps.inserted(self._state, *arguments), "inserted", *arguments)
 
@@ -157,10 +155,7 @@ class WindowBackend:
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
-        require_known("window", ids, local, covariances)
-        require_in_front("window", ids, local)
-        s.landmarks.require_new(ids)
-        arguments = np.array(ids, np.int64), np.array(local, float), np.array(covariances, float)
+        arguments = known_landmarks("window", s.landmarks, ids, local, covariances, True)
         if len(ids):
             self._done(self._steps.placed(s, *arguments), "placed", *arguments)
 
@@ -185,11 +180,11 @@ class WindowBackend:
 
     # --- parts ---
 
-    def _started(self, what: str) -> State:
+    def _started(self, what: str) -> WindowState:
         if not len(self._state.frames):
             raise MeasurementError(f"window: {what} before the first predict")
         return self._state
 
-    def _done(self, s: State, step: str, *arguments: Any) -> None:
+    def _done(self, s: WindowState, step: str, *arguments: Any) -> None:
         """Take over the state after a step, and remember the step."""
         self._history, self._state = self._history.then(Call(step, arguments), s, self.config.lag), s

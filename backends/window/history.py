@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from backends.window.state import State, settle
+from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
-from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 from slam.window import kernels
 from slam.window.stereo import RectifiedStereo
@@ -44,24 +43,19 @@ class Call:
 class Part:
     """Some successive calls, and the state before them."""
 
-    state: State
+    state: WindowState
     calls: tuple[Call, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """The calls since a state, in parts.
+    """The calls since a state, in parts."""
 
-    Attributes:
-        parts: at least one.
-        anchored: whether landmarks were ever known in the world: then the path may not be moved in it.
-    """
-
-    parts: tuple[Part, ...] = field(default_factory=lambda: (Part(State.empty()),))
-    anchored: bool = False
+    parts: tuple[Part, ...] = field(default_factory=lambda: (Part(WindowState.empty()),))  # at least one
+    anchored: bool = False  # whether landmarks were ever known in the world: then the path may not be moved in it
 
     @property
-    def start(self) -> State:
+    def start(self) -> WindowState:
         """The state before the first call."""
         return self.parts[0].state
 
@@ -70,7 +64,7 @@ class History:
         """Number of the newest frame before the first call, −1 for none."""
         return int(self.start.frames[-1]) if len(self.start.frames) else -1
 
-    def then(self, call: Call, after: State, lag: int) -> History:
+    def then(self, call: Call, after: WindowState, lag: int) -> History:
         """With one more call, after which the state is `after`; without calls that are more than `lag` frames old."""
         last, parts = self.parts[-1], self.parts[:-1]
         parts = (*parts, replace(last, calls=(*last.calls, call)))
@@ -89,13 +83,13 @@ class History:
         """
         measured = [call.measured for part in self.parts for call in part.calls]
         ends = np.cumsum([len(z) for z in measured])[:-1]
-        rows = iter(np.split(_corrected(np.concatenate(measured), correct), ends) if measured else ())
+        rows = iter(np.split(stereo.corrected("window", np.concatenate(measured), correct), ends) if measured else ())
         return replace(self, parts=tuple(
             Part(state_corrected(part.state, stereo, correct), tuple(c.with_measured(next(rows)) for c in part.calls))
             for part in self.parts
         ))  # fmt: skip
 
-    def repeated(self, steps: Steps, final: Sequence[Array]) -> tuple[State, list[Array]]:
+    def repeated(self, steps: Steps, final: Sequence[Array]) -> tuple[WindowState, list[Array]]:
         """The state after all calls, and all frames' final poses."""
         s, final = self.start, list(final)
         for part in self.parts:
@@ -108,15 +102,7 @@ class History:
         return s, final
 
 
-def _corrected(z: Array, correct: Callable[[Array], Array]) -> Array:
-    """Measurements (M, 3) as they are corrected; a missing right pixel stays NaN."""
-    out = np.asarray(correct(z), float)
-    if out.shape != z.shape or not (np.isfinite(out) == np.isfinite(z)).all():
-        raise MeasurementError("window: a corrected measurement is not finite")
-    return out
-
-
-def state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> State:
+def state_corrected(s: WindowState, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> WindowState:
     """A state whose measurements are corrected, and whose landmarks are where the newest camera sees them corrected."""
     if not len(s.frames):
         return s
@@ -126,7 +112,7 @@ def state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array]
     seen = np.isfinite(z).all(axis=1) & stereo.rectified_rig.rig.left.in_image(z[:, :2])
     seen &= marks.information[:, 0, 0] == 0  # what is known in the world stays
     there = local.copy()
-    there[seen] = stereo.triangulate(_corrected(z[seen], correct))
+    there[seen] = stereo.triangulate(stereo.corrected("window", z[seen], correct))
     there = np.where(np.isfinite(there), there, local)
     position = there @ T[:3, :3].T + T[:3, 3]
     prior, members = s.prior, s.prior.points
@@ -136,6 +122,6 @@ def state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array]
             kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0] for p in (marks.position, position)
         )
         prior = replace(prior, origin=prior.origin + np.nan_to_num(after - before))  # NaN: behind its chart
-    rows = replace(s.rows, z=_corrected(s.rows.z, correct))
+    rows = replace(s.rows, z=stereo.corrected("window", s.rows.z, correct))
     past = s.past.displaced(marks.serial, position - marks.position) if len(marks) else s.past
     return replace(s, rows=rows, landmarks=replace(marks, position=position), prior=prior, past=past)

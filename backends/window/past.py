@@ -14,25 +14,17 @@ from slam.window.marginal import Conditional
 
 @dataclass(frozen=True, eq=False)
 class Left:
-    """A pose that left the window, and landmarks that left the prior with it, given all that stayed.
+    """A pose that left the window, and landmarks that left the prior with it, given all that stayed."""
 
-    Attributes:
-        frame, pose: number of its frame, and T_world_left (4, 4) then.
-        serials, points: of landmarks that left (G,), and positions then (G, 3).
-        frames, poses: of poses that stayed (K,), (K, 4, 4).
-        stayed, positions: of landmarks that stayed (D,), (D, 3).
-        conditional: changes of the pose and of landmarks that left, by those of what stayed.
-    """
-
-    frame: int
+    frame: int  # number of its frame, and T_world_left (4, 4) then
     pose: Array
-    serials: IdArray
+    serials: IdArray  # of landmarks that left (G,), and positions then (G, 3)
     points: Array
-    frames: IndexArray
+    frames: IndexArray  # of poses that stayed (K,), (K, 4, 4)
     poses: Array
-    stayed: IdArray
+    stayed: IdArray  # of landmarks that stayed (D,), (D, 3)
     positions: Array
-    conditional: Conditional
+    conditional: Conditional  # changes of the pose and of landmarks that left, by those of what stayed
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from backends.window.state import State
+from backends.window.state import WindowState
 from slam.data import IndexArray
 from slam.models import EstimatorModels
 from slam.window.motion import LONGEST, RATIO, velocity_sigmas
@@ -14,15 +14,7 @@ from slam.window.problem import Motion, Places, Rows, Window
 from slam.window.stereo import RectifiedStereo
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """A window and the landmarks' rows that its points are (N,)."""
-
-    window: Window
-    points: IndexArray
-
-
-def motion_between(s: State, models: EstimatorModels) -> Motion:
+def motion_between(s: WindowState, models: EstimatorModels) -> Motion:
     """The motion model between all poses of the window that follow each other."""
     f, dt = s.frames, np.minimum(np.diff(s.stamps), LONGEST)
     follows = (np.diff(f) == 1) & (f[1:] != s.begun)
@@ -38,10 +30,13 @@ def motion_between(s: State, models: EstimatorModels) -> Motion:
 
 
 def problem(
-    s: State, stereo: RectifiedStereo, models: EstimatorModels, rows: Rows | None = None, places: Places | None = None,
-    motion: Motion | None = None,
-) -> Problem:  # fmt: skip
-    """The problem of a state; some of its rows, places and motions if they are given."""
+    s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, rows: Rows | None = None,
+    places: Places | None = None, motion: Motion | None = None,
+) -> tuple[Window, IndexArray]:  # fmt: skip
+    """The problem of a state, and rows of the landmarks that its points are (N,).
+
+    With some of the rows, places and motions alone, if they are given.
+    """
     rows, places = s.rows if rows is None else rows, s.places if places is None else places
     marks = s.landmarks
     used = np.zeros(len(marks), bool)
@@ -56,4 +51,4 @@ def problem(
         motion=motion_between(s, models) if motion is None else motion,
         prior=replace(s.prior, points=index[s.prior.points]),
     )  # fmt: skip
-    return Problem(window, points)
+    return window, points

@@ -9,7 +9,7 @@ import numpy as np
 from backends.window.config import WindowConfig
 from backends.window.past import Left
 from backends.window.problem import motion_between, problem
-from backends.window.state import State
+from backends.window.state import WindowState
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
@@ -17,7 +17,7 @@ from slam.window.marginal import Conditional, marginalised
 from slam.window.stereo import RectifiedStereo
 
 
-def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: WindowConfig) -> State:
+def slid(s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, config: WindowConfig) -> WindowState:
     """The state with one pose less.
 
     The oldest pose is the one that the prior is relative to, and stays for some frames; the next one leaves. Landmarks
@@ -52,16 +52,15 @@ def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: Win
     motion = motion_between(s, models)
     motion = motion.select((motion.poses == leaving).any(axis=1))
 
-    part = problem(s, stereo, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
-    w = part.window
-    keeps = (member | joins | ends)[part.points]
+    w, active = problem(s, stereo, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
+    keeps = (member | joins | ends)[active]
     w = replace(
-        w, information=np.where(keeps[:, None, None], marks.information[part.points], 0.0),
-        joining=np.flatnonzero(joins[part.points]),
+        w, information=np.where(keeps[:, None, None], marks.information[active], 0.0),
+        joining=np.flatnonzero(joins[active]),
     )  # fmt: skip
     ending = ends[s.prior.points]
     prior, conditional, cost = marginalised(w, leaving, ending)
-    past = s.past.with_one(_left(s, leaving, part.points[prior.points], s.prior.points[ending], conditional))
+    past = s.past.with_one(_left(s, leaving, active[prior.points], s.prior.points[ending], conditional))
     stays = ~absorbed_row & (rows.pose != leaving)
     free = marks.information.copy()
     free[joins | ends] = 0.0
@@ -69,13 +68,13 @@ def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: Win
         s, frames=np.delete(s.frames, leaving), stamps=np.delete(s.stamps, leaving),
         poses=np.delete(s.poses, leaving, axis=0), covariance=_without(s.covariance, leaving),
         rows=_earlier(rows.select(stays), leaving), places=_earlier(places.select(~absorbed_place), leaving),
-        prior=replace(prior, points=part.points[prior.points]), cost=s.cost - cost, past=past,
+        prior=replace(prior, points=active[prior.points]), cost=s.cost - cost, past=past,
         landmarks=replace(marks, information=free), solved=s.solved - (s.solved > leaving),
     )  # fmt: skip
     return _compact(s)
 
 
-def _left(s: State, leaving: int, stayed: IndexArray, ended: IndexArray, conditional: Conditional) -> Left:
+def _left(s: WindowState, leaving: int, stayed: IndexArray, ended: IndexArray, conditional: Conditional) -> Left:
     """The record of what leaves."""
     marks, stay = s.landmarks, np.arange(len(s.frames)) != leaving
     return Left(
@@ -85,7 +84,7 @@ def _left(s: State, leaving: int, stayed: IndexArray, ended: IndexArray, conditi
 
 
 def _without_oldest(
-    surplus: int, s: State, members: BoolArray, joins: BoolArray, ends: BoolArray, there: BoolArray
+    surplus: int, s: WindowState, members: BoolArray, joins: BoolArray, ends: BoolArray, there: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
     """More landmarks end, and fewer join: members out of view that were measured longest ago, then those that join.
 
@@ -113,7 +112,7 @@ def _without(P: Array, leaving: int) -> Array:
     return P[np.ix_(keep, keep)]
 
 
-def _compact(s: State) -> State:
+def _compact(s: WindowState) -> WindowState:
     """Without landmarks that were removed and take no part any more."""
     marks = s.landmarks
     used = marks.ids >= 0

@@ -10,14 +10,12 @@ from backends.window.config import WindowConfig
 from backends.window.past import Past
 from backends.window.problem import problem
 from backends.window.slide import slid
-from backends.window.state import Landmarks, State, between
+from backends.window.state import WindowLandmarks, WindowState, between
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
-from slam.errors import MeasurementError
-from slam.geometry.se3 import Array, inverse, points_by_pose
+from slam.geometry.se3 import Array, points_by_pose
 from slam.window import kernels, motion, pose_only
-from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
-from slam.window.gating import with_noise
+from slam.window.agreement import MIN_CONSENSUS
 from slam.window.problem import Places, RelativePrior, Rows, Window
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.solver import CLOSE, Solution, solve
@@ -32,15 +30,11 @@ _SOLVED_AGAIN = 2  # numerics: how often an update is solved again without obser
 
 @dataclass(frozen=True, eq=False)
 class Steps(RectifiedMeasurement):
-    """What the steps need besides the state.
+    """What the steps need besides the state."""
 
-    Attributes:
-        config: limits.
-    """
+    config: WindowConfig  # limits
 
-    config: WindowConfig
-
-    def predicted(self, s: State, stamp: float) -> State:
+    def predicted(self, s: WindowState, stamp: float) -> WindowState:
         """With a pose at `stamp` [s], by the motion model. Where the window is full, a pose leaves it first."""
         if not len(s.frames):
             T = self.models.initial_pose
@@ -54,14 +48,10 @@ class Steps(RectifiedMeasurement):
             except np.linalg.LinAlgError:  # covariances that differ by more than their digits, as after long gaps
                 s = _begun_anew(s, s.poses[-1], s.covariance[-6:, -6:])
         K, t = len(s.frames), s.stamps
-        dt = min(stamp - t[-1], motion.LONGEST)
         before = None if s.frames[-1] == s.begun else min(t[-1] - t[-2], motion.LONGEST)
-        first, J = motion.is_first(before, dt), np.zeros((6, 6 * K))
-        if before is None or first:
-            T, J[:, -6:], Jw = motion.predict_from_rest(s.poses[-1], dt)
-        else:
-            T, J[:, -12:-6], J[:, -6:], Jw = motion.predict(s.poses[-2], s.poses[-1], before, dt)
-        noise = (Jw * motion.velocity_sigmas(self.models, dt, first) ** 2) @ Jw.T
+        T, by_last, noise, _ = motion.predicted(self.models, s.poses[-2:], before, min(stamp - t[-1], motion.LONGEST))
+        J = np.zeros((6, 6 * K))
+        J[:, -12:] = by_last[:, -6 * K :]
         cross = J @ s.covariance
         own = cross @ J.T + noise
         P = np.block([[s.covariance, cross.T], [cross, 0.5 * (own + own.T)]])
@@ -70,21 +60,18 @@ class Steps(RectifiedMeasurement):
             poses=np.concatenate([s.poses, T[None]]), covariance=P, measured=False,
         )  # fmt: skip
 
-    def in_view(self, s: State) -> tuple[IndexArray, Array, Array, Array]:
+    def in_view(self, s: WindowState) -> tuple[IndexArray, Array, Array, Array]:
         """Landmarks in the angle of view (paper A, Fig. 3), their pixels, and innovation covariances (M, 2, 2)."""
-        T, marks, rig = s.poses[-1], s.landmarks, self.rig
-        rows = marks.order
-        rows = rows[rig.left.in_view((marks.position[rows] - T[:3, 3]) @ T[:3, :3])]
+        marks, rows = s.landmarks, s.landmarks.order
+        rows = rows[self.visible(s.poses[-1], marks.position[rows])]
         local, own = seen_from_newest(s, rows)
         by_pose = points_by_pose(local)
         in_world = (marks.information[rows, 0, 0] > 0)[:, None, None]
         by_motion = np.where(in_world, s.covariance[-6:, -6:], between(s, s.solved))
         C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
-        uv, J = rig.left.project_with_jacobian(local)
-        S = with_noise(J @ C @ np.swapaxes(J, 1, 2), self.models.pixel_sigma)
-        return rows, uv, rig.right.project((local + rig.b) @ rig.R.T), S
+        return rows, *self.pixels(local, C)
 
-    def updated(self, s: State, ids: IdArray, z: Array, guess: Array | None) -> tuple[State, UpdateReport]:
+    def updated(self, s: WindowState, ids: IdArray, z: Array, guess: Array | None) -> tuple[WindowState, UpdateReport]:
         """After measurements z (M, 3) of landmarks."""
         points, s = s.landmarks.rows_of(ids), replace(s, measured=True)
         if not len(points):
@@ -99,23 +86,18 @@ class Steps(RectifiedMeasurement):
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"window: the pose cannot be solved for: {error}")
         return s, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], nis, int(np.isfinite(z[used]).sum()))
 
-    def added(self, s: State, ids: IdArray, z: Array) -> State:
+    def added(self, s: WindowState, ids: IdArray, z: Array) -> WindowState:
         """With new landmarks at their first sight z (M, 3) in the newest pose (paper A, Eqs. 8 and 10).
 
         Raises:
             MeasurementError: one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
-        local = self.stereo.triangulate(z)
-        bad = ~np.isfinite(local).all(axis=1)
-        if bad.any():
-            raise MeasurementError(f"window: landmark {ids[bad][0]} has no right pixel or no positive depth")
-        back = np.linalg.inv(self.stereo.project(local)[1])
-        s = _with_new(s, ids, local, self.sigma**2 * back @ np.swapaxes(back, 1, 2))
+        s = _with_new(s, ids, *self.first_sight(ids, z))
         points = np.arange(len(s.landmarks) - len(z), len(s.landmarks))
         return replace(s, rows=s.rows.joined(self._rows(s, points, z)))
 
-    def removed(self, s: State, ids: IdArray) -> State:
+    def removed(self, s: WindowState, ids: IdArray) -> WindowState:
         """Without landmarks; what their measurements say of the poses stays.
 
         Raises:
@@ -125,18 +107,18 @@ class Steps(RectifiedMeasurement):
         left[s.landmarks.rows_of(ids)] = -1
         return replace(s, landmarks=replace(s.landmarks, ids=left))
 
-    def inserted(self, s: State, ids: IdArray, positions: Array, covariances: Array) -> State:
+    def inserted(self, s: WindowState, ids: IdArray, positions: Array, covariances: Array) -> WindowState:
         """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
         R = (s.poses[s.solved] if len(s.poses) else self.models.initial_pose)[:3, :3]
         information = np.linalg.inv(covariances)
         information = 0.5 * (information + np.swapaxes(information, 1, 2))
-        new = Landmarks(
+        new = WindowLandmarks(
             ids, s.serials + np.arange(len(ids)), positions, R.T @ covariances @ R, covariances, np.full(len(ids), -1),
             positions, information,
         )  # fmt: skip
         return _with(s, new)
 
-    def placed(self, s: State, ids: IdArray, local: Array, covariances: Array) -> State:
+    def placed(self, s: WindowState, ids: IdArray, local: Array, covariances: Array) -> WindowState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
         s = _with_new(s, ids, local, covariances)
         points = np.arange(len(s.landmarks) - len(ids), len(s.landmarks))
@@ -144,11 +126,11 @@ class Steps(RectifiedMeasurement):
 
     # --- parts of an update ---
 
-    def _rows(self, s: State, points: IndexArray, z: Array) -> Rows:
+    def _rows(self, s: WindowState, points: IndexArray, z: Array) -> Rows:
         """Measurements from the newest pose."""
         return Rows(np.full(len(points), len(s.frames) - 1), points, z, np.full(len(points), 1 / self.sigma))
 
-    def _agreement(self, s: State, points: IndexArray, z: Array, guess: Array | None) -> Agreement:
+    def _agreement(self, s: WindowState, points: IndexArray, z: Array, guess: Array | None) -> Agreement:
         """Initial value of the newest pose, and which measurements agree with it."""
         T, position = s.poses[-1], s.landmarks.position[points]
         local, own = seen_from_newest(s, points)
@@ -158,37 +140,35 @@ class Steps(RectifiedMeasurement):
         one = pose_only.PoseProblem(self.stereo, position, z, noise, T, information, self.models.gate_probability)
 
         def search() -> Array | None:
-            rectified = self.stereo.rectified_rig
-            rows = z + np.array([0.0, 0.0, self.stereo.doffs])
-            turned = T @ rectified.T_left_rectified
-            found = landmarks_pose(rectified.rig, position, rows, self.models, turned, int(s.frames[-1]))
-            return None if found is None else found @ inverse(rectified.T_left_rectified)
+            return self.landmarks_pose(position, z, T, int(s.frames[-1]))
 
         return agreement(one, T if guess is None else guess, search, s.contradicted, _lost(s))
 
-    def _solved(self, s: State, found: Agreement, points: IndexArray, z: Array) -> tuple[State, BoolArray, float]:
+    def _solved(
+        self, s: WindowState, found: Agreement, points: IndexArray, z: Array
+    ) -> tuple[WindowState, BoolArray, float]:
         """The state after an update, which observations were used, and their NIS."""
         used, T = found.used.copy(), found.T
         if found.jump is not None:
             s = _restarted(s, found.T, points)
         s = replace(s, poses=np.concatenate([s.poses[:-1], T[None]]))
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
-        p = problem(replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used]))), self.stereo, self.models)
-        w = p.window
+        rows = s.rows.joined(self._rows(s, points[used], z[used]))
+        w, active = problem(replace(s, rows=rows), self.stereo, self.models)
         for again in range(_SOLVED_AGAIN + 1):
-            solution, distances = self._tested(w, np.searchsorted(p.points, points[used]), z[used])
+            solution, distances = self._tested(w, np.searchsorted(active, points[used]), z[used])
             bad = distances > limits[used]
             if not bad.any() or again == _SOLVED_AGAIN:
                 break
-            rows = np.append(np.ones(len(s.rows), bool), ~bad)
-            w = replace(solution.window, rows=solution.window.rows.select(rows))
+            keep = np.append(np.ones(len(s.rows), bool), ~bad)
+            w = replace(solution.window, rows=solution.window.rows.select(keep))
             used[np.flatnonzero(used)[bad]] = False
             if not used.any():
                 raise np.linalg.LinAlgError("no observation agrees with the others")
         s = replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used])))
         local, world = solution.point_covariances(len(s.frames) - 1)
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
-        return _after(s, solution, p.points, local, world, points[used]), used, nis
+        return _after(s, solution, active, local, world, points[used]), used, nis
 
     def _tested(self, w: Window, at: IndexArray, z: Array) -> tuple[Solution, Array]:
         """The solution, and how far points `at` (M,) are from their measurements z (M, 3) in the newest pose."""
@@ -204,38 +184,38 @@ class Steps(RectifiedMeasurement):
         return solution, distances
 
 
-def _lost(s: State) -> bool:
+def _lost(s: WindowState) -> bool:
     """Whether the orientation in the world of the newest pose that measured landmarks is unknown."""
     i = 6 * s.solved
     enough = np.count_nonzero(s.rows.pose == s.solved) >= MIN_CONSENSUS
     return bool(enough and unknown_turn(s.covariance[i : i + 6, i : i + 6]))
 
 
-def seen_from_newest(s: State, rows: IndexArray) -> tuple[Array, Array]:
+def seen_from_newest(s: WindowState, rows: IndexArray) -> tuple[Array, Array]:
     """Landmarks in the newest camera's coordinates (M, 3), and covariances (M, 3, 3) for a known last solved pose."""
     T, marks = s.poses[-1], s.landmarks
     turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
     return (marks.position[rows] - T[:3, 3]) @ T[:3, :3], turn @ marks.local[rows] @ turn.T
 
 
-def _with(s: State, new: Landmarks) -> State:
+def _with(s: WindowState, new: WindowLandmarks) -> WindowState:
     return replace(s, landmarks=s.landmarks.joined(new), serials=s.serials + len(new))
 
 
-def _with_new(s: State, ids: IdArray, local: Array, covariances: Array) -> State:
+def _with_new(s: WindowState, ids: IdArray, local: Array, covariances: Array) -> WindowState:
     """With new landmarks at `local` (M, 3) in the newest camera."""
     T, n = s.poses[-1], len(ids)
     R = T[:3, :3]
     by_pose = R @ points_by_pose(local)
     world = R @ covariances @ R.T + by_pose @ s.covariance[-6:, -6:] @ np.swapaxes(by_pose, 1, 2)
     turn = s.poses[s.solved][:3, :3].T @ R
-    return _with(replace(s, measured=True), Landmarks(
+    return _with(replace(s, measured=True), WindowLandmarks(
         ids, s.serials + np.arange(n), local @ R.T + T[:3, 3], turn @ covariances @ turn.T,
         0.5 * (world + np.swapaxes(world, 1, 2)), np.full(n, int(s.frames[-1])), np.zeros((n, 3)), np.zeros((n, 3, 3)),
     ))  # fmt: skip
 
 
-def _places(s: State, points: IndexArray, local: Array, covariances: Array) -> Places:
+def _places(s: WindowState, points: IndexArray, local: Array, covariances: Array) -> Places:
     """Landmarks `points` at `local` (M, 3) in the newest camera, with covariances (M, 3, 3)."""
     T = s.poses[-1]
     world = local @ T[:3, :3].T + T[:3, 3]
@@ -246,7 +226,7 @@ def _places(s: State, points: IndexArray, local: Array, covariances: Array) -> P
     return Places(np.full(len(points), len(s.frames) - 1), points, basis, origin, np.ascontiguousarray(root))
 
 
-def _begun_anew(s: State, T: Array, P: Array) -> State:
+def _begun_anew(s: WindowState, T: Array, P: Array) -> WindowState:
     """A window of the newest pose alone, which is T (4, 4) with covariance P (6, 6); landmarks stay as they are."""
     turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
     return replace(
@@ -256,14 +236,16 @@ def _begun_anew(s: State, T: Array, P: Array) -> State:
     )  # fmt: skip
 
 
-def _restarted(s: State, T: Array, points: IndexArray) -> State:
+def _restarted(s: WindowState, T: Array, points: IndexArray) -> WindowState:
     """A window of one pose T (4, 4), where the landmarks say; they are placed relative to it."""
     local, own = seen_from_newest(replace(s, poses=np.concatenate([s.poses[:-1], T[None]])), points)
     one = _begun_anew(s, T, world_covariance(s.covariance[-6:, -6:]))
     return replace(one, places=_places(one, points, local, own))
 
 
-def _after(s: State, solution: Solution, points: IndexArray, local: Array, world: Array, seen: IndexArray) -> State:
+def _after(
+    s: WindowState, solution: Solution, points: IndexArray, local: Array, world: Array, seen: IndexArray
+) -> WindowState:
     """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
     marks, w = s.landmarks, solution.window
     there = replace(s, poses=w.poses, covariance=solution.pose_covariance)

@@ -22,42 +22,46 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slam.calibration.correction import Revision
+from slam.calibration.estimator import SelfCalibration
 from slam.calibration.model import RigModel
 from slam.data import Estimate
-from slam.geometry.arrays import Array, IdArray, isin
+from slam.geometry.arrays import Array, IdArray, IndexArray, isin
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
+from slam.interfaces import Backend, RevisingBackend
 from slam.models import EstimatorModels
+from slam.rig_error import CommonError
+from slam.table import LandmarkTable
 
 #: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
 #: tenths of a percent. It scales the whole world, so images never show it.
 BASELINE = 0.002
+#: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
+_SIGNIFICANT = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkSensitivities(LandmarkTable):
+    """How landmarks depend on m errors of the rig, and what is known of them beside these."""
+
+    by_rig: Array  # L (N, 3, m), in world coordinates
+    own: Array  # P (N, 3, 3), in world axes [m²]
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """How the pose and N landmarks depend on m errors of the rig, and what is known of them beside these.
+    """How the pose and the landmarks depend on m errors of the rig, and what is known of them beside these."""
 
-    Attributes:
-        T_world: the estimated pose of the rectified left camera (4, 4).
-        pose: J (6, m).
-        covariance: of the pose where the landmarks are known (6, 6).
-        ids: of the landmarks (N,), ascending.
-        landmarks: L (N, 3, m).
-        own: P (N, 3, 3), in world axes [m²].
-    """
-
-    T_world: Array
-    pose: Array
-    covariance: Array
-    ids: IdArray
-    landmarks: Array
-    own: Array
+    T_world: Array  # the estimated pose of the rectified left camera (4, 4)
+    pose: Array  # J (6, m)
+    covariance: Array  # of the pose where the landmarks are known (6, 6)
+    landmarks: LandmarkSensitivities
 
     @classmethod
     def start(cls, T_world: Array, m: int) -> Sensitivities:
         """The first pose defines the world; no landmark is known."""
-        none = np.zeros(0, np.int64), np.zeros((0, 3, m)), np.zeros((0, 3, 3))
-        return cls(T_world, np.zeros((6, m)), np.zeros((6, 6)), *none)
+        none = LandmarkSensitivities(np.zeros(0, np.int64), np.zeros((0, 3, m)), np.zeros((0, 3, 3)))
+        return cls(T_world, np.zeros((6, m)), np.zeros((6, 6)), none)
 
     def moved(self, T_world: Array, rotation: float, translation: float) -> Sensitivities:
         """At the next pose (4, 4), with the prior standard deviations of the motion [rad], [m]."""
@@ -65,7 +69,7 @@ class Sensitivities:
         C = A @ self.covariance @ A.T + np.diag(np.repeat(np.square([rotation, translation]), 3))
         return replace(self, T_world=T_world, pose=A @ self.pose, covariance=C)
 
-    def measured(self, rows: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Sensitivities:
+    def measured(self, rows: IndexArray, local: Array, H: Array, field: Array, noise: Array) -> Sensitivities:
         """After measurements of landmarks.
 
         Args:
@@ -75,34 +79,31 @@ class Sensitivities:
             field: F = ∂z/∂δ (M, 3, m).
             noise: covariance of a measurement (3, 3).
         """
-        by_pose, by_point, P = H @ points_by_pose(local), H @ self.T_world[:3, :3].T, self.own[rows]
+        by_pose, by_point, P = H @ points_by_pose(local), H @ self.T_world[:3, :3].T, self.landmarks.own[rows]
         PG = P @ np.swapaxes(by_point, 1, 2)
         W = np.linalg.inv(by_point @ PG + noise)
-        rest = field - by_point @ self.landmarks[rows]
+        rest = field - by_point @ self.landmarks.by_rig[rows]
         AW = (np.swapaxes(by_pose, 1, 2) @ W).transpose(1, 0, 2).reshape(6, -1)
         before = np.linalg.inv(self.covariance)
         C = np.linalg.inv(before + AW @ by_pose.reshape(-1, 6))
         C = 0.5 * (C + C.T)
         J = C @ (before @ self.pose + AW @ rest.reshape(AW.shape[1], -1))
         gain = PG @ W
-        landmarks, own = self.landmarks.copy(), self.own.copy()
-        landmarks[rows] += gain @ (rest - by_pose @ J)
+        by_rig, own = self.landmarks.by_rig.copy(), self.landmarks.own.copy()
+        by_rig[rows] += gain @ (rest - by_pose @ J)
         own[rows] -= gain @ np.swapaxes(PG, 1, 2)
-        return replace(self, pose=J, covariance=C, landmarks=landmarks, own=own)
+        return replace(self, pose=J, covariance=C, landmarks=replace(self.landmarks, by_rig=by_rig, own=own))
 
     def with_new(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Sensitivities:
         """With landmarks (K,) at `local` (K, 3) [m] first seen from this pose; other arguments as in `measured`."""
         back = self.T_world[:3, :3] @ np.linalg.inv(H)
         L = back @ field - self.T_world[:3, :3] @ points_by_pose(local) @ self.pose
-        ids = np.concatenate([self.ids, ids])
-        order = np.argsort(ids, kind="stable")
-        landmarks = np.concatenate([self.landmarks, L])[order]
-        own = np.concatenate([self.own, back @ noise @ np.swapaxes(back, 1, 2)])[order]
-        return replace(self, ids=ids[order], landmarks=landmarks, own=own)
+        new = LandmarkSensitivities(ids, L, back @ noise @ np.swapaxes(back, 1, 2))
+        return replace(self, landmarks=self.landmarks.joined(new))
 
-    def select(self, keep: np.ndarray) -> Sensitivities:
-        """With these landmarks only (N,)."""
-        return replace(self, ids=self.ids[keep], landmarks=self.landmarks[keep], own=self.own[keep])
+    def without(self, gone: np.ndarray) -> Sensitivities:
+        """Without some landmarks (N,)."""
+        return replace(self, landmarks=self.landmarks.select(~gone))
 
 
 class SchmidtFilter:
@@ -118,12 +119,12 @@ class SchmidtFilter:
 
     Attributes:
         kept: the correction (n,) with which the path was made, after all changes told to `path_keeps`.
+        applied: the correction (n,) of the measurements.
     """
 
     def __init__(self, model: RigModel, models: EstimatorModels, applied: Array) -> None:
-        self._model = model
-        self._motion = models.motion
-        self.kept, self._applied = applied, applied
+        self._model, self._motion = model, models.motion
+        self.kept = self.applied = applied
         self._noise = models.pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
         self._columns = len(model.names) + 2
         self._stamp: float | None = None
@@ -141,37 +142,30 @@ class SchmidtFilter:
         """
         T, now = T_world_left @ self._model.rig.rectified.T_left_rectified, self._now
         if self._stamp is None:
-            self._now, self._stamp = Sensitivities.start(T, self._columns), stamp
-            return
-        now = now.moved(T, *self._motion_sigmas(stamp - self._stamp))
-        local = transform(inverse(T), positions)
-        rows = np.searchsorted(now.ids, ids).clip(0, max(len(now.ids) - 1, 0))
-        good = (local[:, 2] > 0) & isin(ids, now.ids)
-        if good.any():
-            now = now.measured(rows[good], local[good], *self._sight(local[good]))
+            now = Sensitivities.start(T, self._columns)
+        else:
+            now = now.moved(T, *self._motion_sigmas(stamp - self._stamp))
+            local = transform(inverse(T), positions)
+            good = (local[:, 2] > 0) & isin(ids, now.landmarks.ids)
+            if good.any():
+                now = now.measured(now.landmarks.rows_of(ids[good]), local[good], *self._sight(local[good]))
         self._now, self._stamp = now, stamp  # one statement, so that an interrupt finds all of it done or nothing
 
-    def change(self, ids: IdArray, positions: Array, erased: IdArray) -> None:
-        """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones."""
-        now = self._now.select(~isin(self._now.ids, erased)) if len(erased) else self._now
-        new = ~isin(ids, np.concatenate([now.ids, erased]))
+    def change(self, ids: IdArray, positions: Array, erased: IdArray, again: bool = False) -> None:
+        """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones.
+
+        With `again`, those that are there already begin anew; else they stay as they are.
+        """
+        now = self._now.without(isin(self._now.landmarks.ids, ids if again else erased))
+        new = ~isin(ids, np.concatenate([now.landmarks.ids, erased]))
         if new.any():
             local = transform(inverse(now.T_world), positions[new])
             now = now.with_new(ids[new], local, *self._sight(local))
         self._now = now
 
-    def replace_landmarks(self, ids: IdArray, positions: Array) -> None:
-        """Take in landmarks (M,) at `positions` (M, 3) [m] as new ones, replacing their former state."""
-        self.change(ids[:0], positions[:0], ids)
-        self.change(ids, positions, ids[:0])
-
     def keep(self, ids: IdArray) -> None:
         """Forget all landmarks but these (M,)."""
-        self._now = self._now.select(isin(self._now.ids, ids))
-
-    def path_follows(self, applied: Array) -> None:
-        """The correction becomes `applied` (n,), and the path was revised accordingly."""
-        self._applied = applied
+        self._now = self._now.without(~isin(self._now.landmarks.ids, ids))
 
     def path_keeps(self, applied: Array, positions: Callable[[IdArray], Array], landmarks_follow: bool) -> None:
         """The correction becomes `applied` (n,), but the path was not revised.
@@ -181,35 +175,31 @@ class SchmidtFilter:
             positions: returns the positions (M, 3) [m] of landmarks by their ids (M,).
             landmarks_follow: the landmarks move to where the new correction places them from the present pose.
         """
-        step, now = applied - self._applied, self._now
+        step, now = applied - self.applied, self._now
         if step.any():
-            pose, landmarks = now.pose.copy(), now.landmarks.copy()
+            pose, marks, by_rig = now.pose.copy(), now.landmarks, now.landmarks.by_rig.copy()
             pose[:, -1] += pose[:, :-2] @ step
             if not landmarks_follow:
-                landmarks[:, :, -1] += landmarks[:, :, :-2] @ step
-            elif len(now.ids):
-                local = transform(inverse(now.T_world), positions(now.ids))
-                landmarks[:, :, -1] = -(points_by_pose(local) @ pose[:, -1]) @ now.T_world[:3, :3].T
-            now = replace(now, pose=pose, landmarks=landmarks)
+                by_rig[:, :, -1] += by_rig[:, :, :-2] @ step
+            elif len(marks):
+                local = transform(inverse(now.T_world), positions(marks.ids))
+                by_rig[:, :, -1] = -(points_by_pose(local) @ pose[:, -1]) @ now.T_world[:3, :3].T
+            now = replace(now, pose=pose, landmarks=replace(marks, by_rig=by_rig))
         # In one statement, so that an interrupt finds all of it done or nothing.
-        self._now, self.kept, self._applied = now, self.kept + step, applied
+        self._now, self.kept, self.applied = now, self.kept + step, applied
 
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
-        factor = self._factor(covariance)
-        J = self._by_left_camera() @ factor
-        positions = estimate.covariances
-        ids, by_rig = self.landmarks()
-        if len(estimate.ids) and len(ids):
-            rows = np.searchsorted(ids, estimate.ids).clip(0, len(ids) - 1)
-            known = ids[rows] == estimate.ids
-            L = by_rig[rows[known]] @ factor
+        factor, marks, positions = self._factor(covariance), self._now.landmarks, estimate.covariances
+        J, known = self._by_left_camera() @ factor, isin(estimate.ids, marks.ids)
+        if known.any():
+            L = marks.by_rig[marks.rows_of(estimate.ids[known])] @ factor
             positions = positions.copy()
             positions[known] += L @ np.swapaxes(L, 1, 2)
         return replace(estimate, covariance=estimate.covariance + J @ J.T, covariances=positions)
 
-    def shared(self, covariance: Array, kept: Array) -> tuple[Array, Array]:
-        """The error that this pose shares with those of other frames, as factors.
+    def shared(self, covariance: Array, kept: Array) -> CommonError:
+        """The error that this pose shares with those of other frames.
 
         The covariance that `added_to` adds to the pose is ``J S Sᵀ Jᵀ``. Poses of several frames have the common errors
         ``J₁ S c``, ``J₂ S c``, …, with the same c of unit variance, where S is of the last frame.
@@ -217,23 +207,21 @@ class SchmidtFilter:
         Args:
             covariance: of the parameters (n, n).
             kept: the correction (n,) that the path was made with, after all changes told to `path_keeps`.
-
-        Returns:
-            J (6, n + 2), in the axes of the left camera, and S (n + 2, n + 2).
         """
         J = self._by_left_camera()
         J[:, -1] -= J[:, :-2] @ kept
         known = np.concatenate([kept, [0.0, 1.0]])
-        return J, np.column_stack([self._factor(covariance)[:, :-1], known])
+        return CommonError(J, np.column_stack([self._factor(covariance)[:, :-1], known]))
 
     @property
     def pose(self) -> Array:
         """Derivative of the pose (6, n + 2) in the axes of the rectified left camera."""
         return self._now.pose
 
-    def landmarks(self) -> tuple[IdArray, Array]:
-        """Ids (N,), ascending, and derivatives (N, 3, n + 2) of their positions in world coordinates."""
-        return self._now.ids, self._now.landmarks
+    @property
+    def landmarks(self) -> LandmarkSensitivities:
+        """Those of landmarks."""
+        return self._now.landmarks
 
     def _by_left_camera(self) -> Array:
         """Derivative of the pose (6, n + 2) in the axes of the left camera."""
@@ -244,15 +232,12 @@ class SchmidtFilter:
 
         It is the symmetric root, so that its columns mean the same in all frames.
         """
-        if self._root is not None and np.array_equal(self._root[0], covariance):
-            return self._root[1]
-        n = self._columns
-        factor = np.zeros((n, n))
-        values, vectors = np.linalg.eigh(covariance)
-        factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
-        factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
-        self._root = covariance, factor
-        return factor
+        if self._root is None or not np.array_equal(self._root[0], covariance):
+            values, vectors = np.linalg.eigh(covariance)
+            factor = np.diag([*np.zeros(len(values)), BASELINE, 1.0])
+            factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
+            self._root = covariance, factor
+        return self._root[1]
 
     def _motion_sigmas(self, dt: float) -> tuple[float, float]:
         """Prior standard deviations of a motion [rad], [m]: twice the velocity's change."""
@@ -275,3 +260,65 @@ class SchmidtFilter:
         field[:, :, :-2] = self._model.field(points)
         field[:, 2, -2] = -points[:, 2]  # with a longer baseline, the nominal one's disparity is smaller
         return H, field, self._noise
+
+
+class RemainingRigError:
+    """The rig's error that is left in a back end's estimate while self-calibration continues.
+
+    Args:
+        calibration: the self-calibration.
+        models: noise of the pixels, and of the motion.
+
+    Attributes:
+        uncertainty: what the rig's uncertainty adds to the covariances of poses and landmarks.
+        measured_with: the correction of all measurements given to the back end.
+    """
+
+    def __init__(self, calibration: SelfCalibration, models: EstimatorModels) -> None:
+        self._calibration, self.measured_with = calibration, calibration.applied
+        self.uncertainty = SchmidtFilter(calibration.model, models, self.measured_with.parameters)
+
+    def apply(self, backend: Backend) -> Revision | None:
+        """Correct features by the present posterior from now on; returns the change, or None.
+
+        For a back end that can revise, a change means processing all its measurements again, so it waits until the
+        change is significant.
+        """
+        return self._calibration.apply(_SIGNIFICANT if isinstance(backend, RevisingBackend) else 0.0)
+
+    def revise(self, backend: Backend, restarted: bool) -> Revision | None:
+        """Correct a back end's earlier measurements, if it can revise them; returns the change, or None.
+
+        Args:
+            backend: the present one.
+            restarted: part of the path is an earlier back end's and cannot be revised.
+        """
+        applied, reviser = self._calibration.applied, backend if isinstance(backend, RevisingBackend) else None
+        if not restarted and reviser is not None and reviser.revises_path:
+            self.uncertainty.applied = applied.parameters
+        else:
+            self.uncertainty.path_keeps(applied.parameters, backend.positions, landmarks_follow=reviser is not None)
+        if reviser is None or applied is self.measured_with:
+            return None
+        revision = Revision(self.measured_with, applied)
+        reviser.revise(revision.rows)
+        self.measured_with = revision.after
+        return revision
+
+    def added_to(self, estimate: Estimate) -> Estimate:
+        """The back end's estimate with the rig's uncertainty added."""
+        if not self._calibration.config.enabled:
+            return estimate
+        return self.uncertainty.added_to(estimate, self._calibration.posterior.covariance)
+
+    def common(self, as_reported: bool) -> CommonError:
+        """The part of the pose's error that it shares with those of other frames.
+
+        Args:
+            as_reported: for poses as reported in each frame, with the correction of that time; else for the present
+                path, in which a back end may have revised earlier poses.
+        """
+        if not self._calibration.config.enabled:
+            return CommonError()
+        made_with = self._calibration.applied.parameters if as_reported else self.uncertainty.kept
+        return self.uncertainty.shared(self._calibration.posterior.covariance, made_with)

@@ -8,6 +8,7 @@ from slam.checks import FARTHEST_POSITION
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
+from slam.table import LandmarkTable
 
 _NEAREST = 1e-3  # guard: least depth [m] of a landmark that a camera sees
 _LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having
@@ -44,6 +45,23 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
         raise MeasurementError(
             f"{backend}: the covariance of landmark {ids[bad][0]} is not symmetric and positive definite"
         )
+
+
+def known_landmarks(
+    backend: str, table: LandmarkTable, ids: IdArray, positions: Array, covariances: Array, seen: bool
+) -> tuple[IdArray, Array, Array]:
+    """Copies of landmarks (N,) handed to `slam.interfaces.MapBackend`, checked; they may not be in the table yet.
+
+    Where they are seen, their positions (N, 3) are in the camera's coordinates, in front of it.
+
+    Raises:
+        MeasurementError: as `require_known` and `require_in_front`; or one is in the table already.
+    """
+    require_known(backend, ids, positions, covariances)
+    if seen:
+        require_in_front(backend, ids, positions)
+    table.require_new(ids)
+    return np.array(ids, np.int64), np.array(positions, float), np.array(covariances, float)
 
 
 def in_front(local: Array) -> BoolArray:

@@ -31,6 +31,32 @@ def is_first(before: float | None, dt: float) -> bool:
     return before is None or dt > RATIO * before
 
 
+def predicted(
+    models: EstimatorModels, poses: Array, before: float | None, dt: float
+) -> tuple[Array, Array, Array, bool]:
+    """The next pose by the motion model.
+
+    Args:
+        models: noise and priors.
+        poses: the last two (2, 4, 4); only the last counts where the velocity is unknown.
+        before: time between them [s]; None where there is no earlier one.
+        dt: time to the next [s].
+
+    Returns:
+        the pose (4, 4), its Jacobian (6, 12) by the perturbations of the last two, the noise (6, 6) that is added, and
+        whether the velocity was unknown, with mean zero.
+    """
+    J: Array = np.zeros((6, 12))
+    T: Array = poses[-1].copy()
+    first, by_velocity = is_first(before, dt), np.zeros_like(J[:, :6])
+    if before is None or first:
+        J[:, 6:] = np.eye(6)
+        by_velocity[:3, :3], by_velocity[3:, 3:] = dt * np.eye(3), dt * T[:3, :3].T
+    else:
+        T, J[:, :6], J[:, 6:], by_velocity = predict(poses[0], poses[1], before, dt)
+    return T, J, (by_velocity * velocity_sigmas(models, dt, first) ** 2) @ by_velocity.T, first
+
+
 def predict(T0: Array, T1: Array, dt01: float, dt12: float) -> tuple[Array, Array, Array, Array]:
     """The pose after T1 at the velocity between T0 and T1.
 
@@ -51,15 +77,3 @@ def predict(T0: Array, T1: Array, dt01: float, dt12: float) -> tuple[Array, Arra
     Jw[:3, :3] = dt12 * right
     Jw[3:, 3:] = dt12 * R2.T
     return pose(R2, T1[:3, 3] + s * (T1[:3, 3] - T0[:3, 3])), J0, J1, Jw
-
-
-def predict_from_rest(T0: Array, dt: float) -> tuple[Array, Array, Array]:
-    """The pose after the first one, whose velocity is unknown with mean zero.
-
-    Returns:
-        T1 (4, 4), its Jacobian (6, 6) by the perturbation of T0, and by the velocity [ω, v].
-    """
-    Jw = np.zeros((6, 6))
-    Jw[:3, :3] = dt * np.eye(3)
-    Jw[3:, 3:] = dt * T0[:3, :3].T
-    return T0.copy(), np.eye(6), Jw

@@ -24,25 +24,15 @@ _CONVERGED = 1e-5  # numerics: [rad, m]; the steps shrink quadratically, so what
 
 @dataclass(frozen=True, eq=False)
 class PoseProblem:
-    """Landmarks, what was measured of them, and what was predicted.
+    """Landmarks, what was measured of them, and what was predicted."""
 
-    Attributes:
-        stereo: the projection.
-        points: landmark positions (M, 3) in world coordinates.
-        z: measurements (M, 3), NaN where missing.
-        noise: covariances (M, 3, 3) of the residuals for a known pose: pixel noise and landmark uncertainty [px²].
-        predicted: pose (4, 4).
-        information: of the predicted pose (6, 6).
-        probability: share of good measurements that the gate shall let pass.
-    """
-
-    stereo: RectifiedStereo
-    points: Array
-    z: Array
-    noise: Array
-    predicted: Array
-    information: Array
-    probability: float
+    stereo: RectifiedStereo  # the projection
+    points: Array  # landmark positions (M, 3) in world coordinates
+    z: Array  # measurements (M, 3), NaN where missing
+    noise: Array  # covariances (M, 3, 3) of the residuals for a known pose: pixel noise and landmark uncertainty [px²]
+    predicted: Array  # pose (4, 4)
+    information: Array  # of the predicted pose (6, 6)
+    probability: float  # share of good measurements that the gate shall let pass
 
 
 def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:

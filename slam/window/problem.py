@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from slam.geometry.arrays import Array, IndexArray
+from slam.table import Table
 from slam.window import kernels
 from slam.window.stereo import RectifiedStereo
 
@@ -15,7 +16,7 @@ KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class Rows(Table):
     """Measurements of points from poses, a row each.
 
     Attributes:
@@ -29,25 +30,14 @@ class Rows:
     z: Array
     weight: Array
 
-    def __len__(self) -> int:
-        return len(self.pose)
-
-    def joined(self, other: Rows) -> Rows:
-        """These and others."""
-        return Rows(*(np.concatenate([mine, its]) for mine, its in zip(vars(self).values(), vars(other).values())))
-
     @classmethod
     def none(cls) -> Rows:
         """No measurement."""
         return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros(0))
 
-    def select(self, keep: np.ndarray) -> Rows:
-        """Some of the rows (a mask or indices)."""
-        return Rows(self.pose[keep], self.point[keep], self.z[keep], self.weight[keep])
-
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class Places(Table):
     """Points that are known relative to a pose, a row each; the error of their inverse distance is Gaussian.
 
     Attributes:
@@ -62,26 +52,15 @@ class Places:
     origin: Array
     root: Array
 
-    def __len__(self) -> int:
-        return len(self.pose)
-
-    def joined(self, other: Places) -> Places:
-        """These and others."""
-        return Places(*(np.concatenate([mine, its]) for mine, its in zip(vars(self).values(), vars(other).values())))
-
     @classmethod
     def none(cls) -> Places:
         """No such point."""
         none = np.zeros(0, np.intp)
         return cls(none, none, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
-    def select(self, keep: np.ndarray) -> Places:
-        """Some of the rows (a mask or indices)."""
-        return Places(self.pose[keep], self.point[keep], self.basis[keep], self.origin[keep], self.root[keep])
-
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class Motion(Table):
     """Constant velocity, disturbed by noise: a row for each two successive intervals (paper B, section 2).
 
     Attributes:
@@ -98,10 +77,6 @@ class Motion:
     def none(cls) -> Motion:
         """No motion model."""
         return cls(np.zeros((0, 3), np.intp), np.zeros((0, 2)), np.zeros((0, 6)))
-
-    def select(self, keep: np.ndarray) -> Motion:
-        """Some of the rows (a mask or indices)."""
-        return Motion(self.poses[keep], self.interval[keep], self.weight[keep])
 
 
 @dataclass(frozen=True, eq=False)

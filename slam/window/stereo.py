@@ -6,16 +6,20 @@ is no right pixel. The body frame is the rig's own left camera, the sensor its r
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from slam.data import Observations
+from slam.data import IdArray, IndexArray, Observations
+from slam.errors import MeasurementError
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.rig_kernels import project_rectified, triangulate_rectified
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, adjoint, inverse
 from slam.models import EstimatorModels
+from slam.window.agreement import landmarks_pose
+from slam.window.gating import with_noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +77,18 @@ class RectifiedStereo:
         z[:, 2] -= self.doffs
         return z
 
+    @staticmethod
+    def corrected(owner: str, z: Array, correct: Callable[[Array], Array]) -> Array:
+        """Measurements (M, 3) as they are corrected by a back end of this name; a missing right pixel stays NaN.
+
+        Raises:
+            MeasurementError: a corrected one is not finite.
+        """
+        out = np.asarray(correct(z.copy()), float)
+        if out.shape != z.shape or not (np.isfinite(out) == np.isfinite(z)).all():
+            raise MeasurementError(f"{owner}: a corrected measurement is not finite")
+        return out
+
     def project(self, local: Array) -> tuple[Array, Array]:
         """Measurements (N, 3) and Jacobians (N, 3, 3) of points (N, 3) in the left camera's coordinates.
 
@@ -91,12 +107,7 @@ class RectifiedStereo:
 
 @dataclass(frozen=True, eq=False)
 class RectifiedMeasurement:
-    """How an estimator measures: the rectified rig, and the noise of its pixels.
-
-    Attributes:
-        rig: the cameras.
-        models: noise, priors, motion and gate.
-    """
+    """How an estimator measures with a rig: what all of them need beside their state."""
 
     rig: StereoRig
     models: EstimatorModels
@@ -110,3 +121,63 @@ class RectifiedMeasurement:
     def sigma(self) -> float:
         """Noise of rectified pixels [px]."""
         return self.models.pixel_sigma * self.stereo.scale
+
+    def first_sight(self, ids: IdArray, z: Array, farthest: float = np.inf) -> tuple[Array, Array]:
+        """New landmarks in the left camera's coordinates (M, 3) [m], with covariances (M, 3, 3) (paper A, Eqs. 8, 10).
+
+        Args:
+            ids: of the landmarks (M,), for the message.
+            z: measurements (M, 3), see `RectifiedStereo.measure`.
+            farthest: depth [m] at which those beyond it are put.
+
+        Raises:
+            MeasurementError: one has no right pixel or no positive depth.
+        """
+        local = self.stereo.triangulate(z)
+        bad = ~np.isfinite(local).all(axis=1)
+        if bad.any():
+            raise MeasurementError(f"landmark {ids[bad][0]} has no right pixel or no positive depth")
+        local = local * np.minimum(1.0, farthest / np.maximum(local[:, 2:], 1e-300))
+        back = np.linalg.inv(self.stereo.project(local)[1])
+        return local, self.sigma**2 * back @ np.swapaxes(back, 1, 2)
+
+    def visible(self, T: Array, points: Array) -> IndexArray:
+        """Which points (N, 3) in the world are in the angle of view from a pose T (4, 4) (paper A, Fig. 3)."""
+        return np.flatnonzero(self.rig.left.in_view((points - T[:3, 3]) @ T[:3, :3]))
+
+    def pixels(self, local: Array, covariances: Array) -> tuple[Array, Array, Array]:
+        """Left and right pixels (M, 2) of points (M, 3) in the camera, and innovation covariances (M, 2, 2) [px²].
+
+        The covariances (M, 3, 3) [m²] are of the points as seen from the camera.
+        """
+        left, J = self.rig.left.project_with_jacobian(local)
+        S = with_noise(J @ covariances @ np.swapaxes(J, 1, 2), self.models.pixel_sigma)
+        return left, self.rig.right.project((local + self.rig.b) @ self.rig.R.T), S
+
+    def landmarks_pose(self, points: Array, z: Array, T: Array, seed: int) -> Array | None:
+        """The pose (4, 4) on which most landmarks agree, if there is one; see `slam.window.agreement.landmarks_pose`.
+
+        Args:
+            points: the landmarks (M, 3) in the world [m].
+            z: measurements (M, 3), see `RectifiedStereo.measure`.
+            T: guess of the pose (4, 4).
+            seed: of the random choice.
+        """
+        rectified = self.stereo.rectified_rig
+        rows, turned = z + np.array([0.0, 0.0, self.stereo.doffs]), T @ rectified.T_left_rectified
+        found = landmarks_pose(rectified.rig, points, rows, self.models, turned, seed)
+        return None if found is None else found @ inverse(rectified.T_left_rectified)
+
+
+def relative_covariance(P: Array, earlier: Array, later: Array) -> Array:
+    """Covariance (6, 6) of a pose where another one is known, from their joint covariance (12, 12).
+
+    Args:
+        P: of the pose that is known, then the other, both perturbed on the right.
+        earlier: the pose that is known (4, 4).
+        later: the other (4, 4).
+    """
+    A = adjoint(inverse(later) @ earlier)
+    cross = A @ P[:6, 6:]
+    C = P[6:, 6:] + A @ P[:6, :6] @ A.T - cross - cross.T
+    return np.asarray(0.5 * (C + C.T))

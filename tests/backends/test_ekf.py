@@ -129,7 +129,8 @@ def test_landmarks_leave_the_state_and_come_back(make, monkeypatch):
 # --- consistency ---
 
 
-def test_nees_and_nis_are_in_their_bands():
+@pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
+def test_nees_and_nis_are_in_their_bands(make):
     """Twelve runs whose motion and noise are as assumed, 30 frames each: the linearisation is fair for so long."""
     runs, frames, motion = 12, 30, MotionModel(0.3, 0.15)
     models = EstimatorModels(motion, pixel_sigma=0.5, initial_angular_velocity_sigma=0.2)
@@ -137,7 +138,7 @@ def test_nees_and_nis_are_in_their_bands():
     for seed in range(runs):
         poses = random_path(frames, 0.1, 0.5 * FORWARD, motion, np.random.default_rng(100 + seed))
         data = scene(poses, points=200, seed=seed, limit=25)
-        backend = EkfBackend(RIG, models)
+        backend = make(RIG, models)
         reports = run(backend, data)
         pose_nees.append(nees(backend, poses[-1]))
         nis, dof = nis + sum(r.nis for r in reports if r.dof), dof + sum(r.dof for r in reports)

@@ -250,10 +250,11 @@ def test_nothing_that_agrees_leaves_the_prediction(drive):
 @pytest.mark.parametrize("where", ["pose", "landmark"])
 def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     backend, seen = predicted(drive, 5)
-    P = backend.state.covariance.dense.copy()
-    row = 1 if where == "pose" else 12 + 3 * int(backend.state.landmarks.rows_of(seen.ids[3:4])[0])
-    P[row, row] = entry
-    backend.state = replace(backend.state, covariance=replace(backend.state.covariance, dense=P))
+    P = backend.state.covariance
+    camera, marks = P.camera.copy(), P.marks.copy()
+    row = 1 if where == "pose" else 3 * int(backend.state.landmarks.rows_of(seen.ids[3:4])[0])
+    (camera if where == "pose" else marks)[row, row] = entry
+    backend.state = replace(backend.state, covariance=replace(P, camera=camera, marks=marks))
     before = backend.state
     report = backend.update(seen)
     assert report.status is UpdateStatus.FAILED and "ekf" in report.reason

@@ -22,6 +22,7 @@ from tests.backends.scenes import RIG, cloud, observe, path, random_path, run, s
 
 
 def test_the_online_back_ends_are_all_but_the_one_that_solves_at_the_end_and_the_second_filter():
+    """What is shown where nobody chose; `iekf` is `ekf` but for the camera's motion, and is tested beside it."""
     assert set(ONLINE) == set(BUILT_IN["backends"]) - {"batch", "iekf"}
 
 

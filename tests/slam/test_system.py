@@ -15,7 +15,7 @@ from slam.objects.modes import NoDetector
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother", "window")
+BACKENDS = ("ekf", "iekf", "smoother", "window")
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=40, max_depth_error=0.3))
 
 

@@ -18,7 +18,7 @@ from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother", "window")
+BACKENDS = ("ekf", "iekf", "smoother", "window")
 NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
 CONFIG = SystemConfig(
     models=EstimatorModels(pixel_sigma=0.3),
@@ -73,7 +73,8 @@ def test_landmarks_move_as_their_sensitivities_say(backend):
         features, ids = cloud.features(T, k / 30)
         result = system.process_features(with_error(features, delta))
         points.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
-    ids, by_rig = system._session.rig_error.uncertainty.landmarks()
+    marks = system._session.rig_error.uncertainty.landmarks
+    ids, by_rig = marks.ids, marks.by_rig
     estimated = system.backend.positions(ids)
     actual = cloud.points[[points[i] for i in ids.tolist()]] - estimated
     predicted = by_rig[:, :, : len(delta)] @ delta

@@ -1,0 +1,66 @@
+"""Tables: frozen dataclasses of arrays with a row for each of the same things; and landmarks looked up by their ids."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from slam.errors import MeasurementError
+from slam.geometry.arrays import IdArray, IndexArray
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Arrays with as many rows each; those that derive from it name them as their fields."""
+
+    @property
+    def columns(self) -> list[Any]:
+        """All arrays."""
+        return [getattr(self, name) for name in self.__dataclass_fields__]
+
+    def __len__(self) -> int:
+        return len(self.columns[0])
+
+    def select(self, rows: Any) -> Self:
+        """Some of the rows: a mask, indices, or a slice."""
+        return type(self)(*(column[rows] for column in self.columns))
+
+    def joined(self, other: Self) -> Self:
+        """These rows, then others."""
+        return type(self)(*(np.concatenate(pair) for pair in zip(self.columns, other.columns)))
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkTable(Table):
+    """A row for each landmark of a map."""
+
+    ids: IdArray  # (N,), negative for one that is in the map no more
+
+    @cached_property
+    def order(self) -> IndexArray:
+        """Rows of the landmarks in the map, by ascending id."""
+        rows = np.argsort(self.ids, kind="stable")
+        return np.asarray(rows[np.searchsorted(self.ids[rows], 0) :])
+
+    def rows_of(self, ids: IdArray | Sequence[int]) -> IndexArray:
+        """Rows (M,) of landmarks.
+
+        Raises:
+            MeasurementError: one is not in the map.
+        """
+        ids, known = np.asarray(ids, np.int64), self.ids[self.order]
+        at = np.searchsorted(known, ids).clip(0, max(len(known) - 1, 0))
+        bad = known[at] != ids if len(known) else np.ones(len(ids), bool)
+        if bad.any():
+            raise MeasurementError(f"landmark {ids[bad][0]} is not in the map")
+        return self.order[at]
+
+    def require_new(self, ids: IdArray) -> None:
+        """Raise MeasurementError where a landmark is in the map already."""
+        taken = np.isin(ids, self.ids)
+        if taken.any():
+            raise MeasurementError(f"landmark {ids[taken][0]} is in the map already")
