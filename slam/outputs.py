@@ -23,19 +23,14 @@ _RUN, _COMPARISON = ("config.json", "frames.csv"), ("sweep.json",)  # what folde
 
 @dataclass(frozen=True)
 class Output:
-    """A file to be written, or a folder with the files that are written into it.
+    """A file to be written, or a folder with the files that are written into it."""
 
-    Attributes:
-        path: of the file or folder.
-        option: that names it on the command line, for messages.
-        names: of a folder, what is written into it: names or patterns (``*.png``), with a ``/`` at the end those of
-            folders; None for a file.
-        makes_folder: whether the folders above it are made where they are missing; those of a folder always are.
-    """
-
-    path: Path
-    option: str
+    path: Path  # of the file or folder
+    option: str  # that names it on the command line, for messages
+    # of a folder, what is written into it: names or patterns (``*.png``), with a ``/`` at the end those of folders;
+    # None for a file
     names: Sequence[str] | None = None
+    # whether the folders above it are made where they are missing; those of a folder always are
     makes_folder: bool = False
 
     @property

@@ -49,18 +49,13 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """Differences between recordings, each by its own evidence.
+    """Differences between recordings, each by its own evidence."""
 
-    Attributes:
-        names: of the parameters (n,).
-        largest: the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN if fewer
-            than two determine it.
-        pairs: the recordings (n, 2) that differ most; meaningless where `largest` is NaN.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the parameters (n,)
+    # the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN if fewer than two
+    # determine it
     largest: Array
-    pairs: np.ndarray
+    pairs: np.ndarray  # the recordings (n, 2) that differ most; meaningless where `largest` is NaN
 
     @property
     def words(self) -> str:

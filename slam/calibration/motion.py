@@ -21,37 +21,25 @@ from slam.geometry.se3 import Array, so3_exp
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """The same still points in two views.
+    """The same still points in two views."""
 
-    Attributes:
-        first, second: ``(x, y, d)`` (N, 3) [px], d the disparity, as measured.
-        R, t: first guess of the motion (3, 3), (3,) [baselines] that takes the first view's points to the second's.
-    """
-
-    first: Array
+    first: Array  # ``(x, y, d)`` (N, 3) [px], d the disparity, as measured
     second: Array
-    R: Array
+    R: Array  # first guess of the motion (3, 3), (3,) [baselines] that takes the first view's points to the second's
     t: Array
 
 
 class Linear(NamedTuple):
-    """A motion at some points, linearised.
+    """A motion at some points, linearised."""
 
-    Attributes:
-        moved: where the motion takes the points (N, 3) [px].
-        J_point, J_motion: derivatives of `moved` (N, 3, 3), (N, 3, 6) by the points and by ``[rotation (left), t]``.
-        motion: `J_motion`, whitened.
-        white: whitening matrices of the residuals (N, 3, 3), lower triangular; NaN where their covariance is not
-            positive definite.
-        residual: second view less its prediction from the first (N, 3), whitened.
-    """
-
-    moved: Array
-    J_point: Array
+    moved: Array  # where the motion takes the points (N, 3) [px]
+    J_point: Array  # derivatives of `moved` (N, 3, 3), (N, 3, 6) by the points and by ``[rotation (left), t]``
     J_motion: Array
-    motion: Array
+    motion: Array  # `J_motion`, whitened
+    # whitening matrices of the residuals (N, 3, 3), lower triangular; NaN where their covariance is not positive
+    # definite
     white: Array
-    residual: Array
+    residual: Array  # second view less its prediction from the first (N, 3), whitened
 
     @classmethod
     def empty(cls, n: int) -> Linear:
@@ -62,20 +50,13 @@ class Linear(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The motion that takes one view's points to the other's, and the linear problem about it.
+    """The motion that takes one view's points to the other's, and the linear problem about it."""
 
-    Attributes:
-        R, t: the motion.
-        points: the first view's, estimated from both views (N, 3) [px].
-        linear: the problem of the last step.
-        weights: of the points (N,).
-    """
-
-    R: Array
+    R: Array  # the motion
     t: Array
-    points: Array
-    linear: Linear
-    weights: Array
+    points: Array  # the first view's, estimated from both views (N, 3) [px]
+    linear: Linear  # the problem of the last step
+    weights: Array  # of the points (N,)
 
 
 def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Fit | None:

@@ -18,20 +18,14 @@ from slam.geometry.se3 import Array
 class RigPosterior:
     """Gaussian belief about the parameters of `slam.calibration.model`.
 
-    Attributes:
-        names: of the parameters (n,).
-        units: of the parameters (n,).
-        mean: (n,).
-        covariance: (n, n).
-
     Raises:
         CalibrationError: shapes do not fit each other, or a value is not finite.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    mean: Array
-    covariance: Array
+    names: tuple[str, ...]  # of the parameters (n,)
+    units: tuple[str, ...]  # of the parameters (n,)
+    mean: Array  # (n,)
+    covariance: Array  # (n, n)
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -81,19 +75,12 @@ class RigPosterior:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Posterior of the parameters.
+    """Posterior of the parameters."""
 
-    Attributes:
-        mean: (n,).
-        inner: covariance (n, n) without residual fields.
-        covariance: including the effect of unknown residual fields on the mean (n, n).
-        residual: scale of the residual fields, from 0 to 1.
-    """
-
-    mean: Array
-    inner: Array
-    covariance: Array
-    residual: float
+    mean: Array  # (n,)
+    inner: Array  # covariance (n, n) without residual fields
+    covariance: Array  # including the effect of unknown residual fields on the mean (n, n)
+    residual: float  # scale of the residual fields, from 0 to 1
 
 
 def solve(
@@ -147,21 +134,13 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
 
 
 class _ByScale(NamedTuple):
-    """The posterior for each scale of the prior (K).
+    """The posterior for each scale of the prior (K)."""
 
-    Attributes:
-        whole: total evidence.
-        e: its information vector (n,), about the prior's mean.
-        information: of the posterior (K, n, n).
-        covariances: of the posterior (K, n, n).
-        steps: changes of the mean (K, n).
-    """
-
-    whole: Evidence
-    e: Array
-    information: Array
-    covariances: Array
-    steps: Array
+    whole: Evidence  # total evidence
+    e: Array  # its information vector (n,), about the prior's mean
+    information: Array  # of the posterior (K, n, n)
+    covariances: Array  # of the posterior (K, n, n)
+    steps: Array  # changes of the mean (K, n)
 
     def log_likelihoods(self, prior: Prior) -> Array:
         """Logarithms of the marginal likelihoods (K,)."""

@@ -48,15 +48,10 @@ _OFFSETS = (0.03, 0.3, 1.0)  # the same of an offset of the disparity alone
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Prior of the parameters: a mixture of Gaussians with one mean and several covariances.
+    """Prior of the parameters: a mixture of Gaussians with one mean and several covariances."""
 
-    Attributes:
-        mean: (n,).
-        covariances: equally probable ones (K, n, n).
-    """
-
-    mean: Array
-    covariances: Array
+    mean: Array  # (n,)
+    covariances: Array  # equally probable ones (K, n, n)
 
     @cached_property
     def information(self) -> Array:

@@ -158,11 +158,6 @@ def _remounted(errors: Array, J: Array, P: Array) -> Array:
 
     The rig's errors are treated as the residuals are: else a turn of the rig, that a mounting explains, would count in
     the covariance alone.
-
-    Args:
-        errors: of relative poses (M, 6, k), a column for each kind.
-        J: their derivatives (M, 6, m) by what is the same in all poses, of unit variance.
-        P: covariances of the first column (M, 6, 6).
     """
     JW = np.swapaxes(np.linalg.solve(P, J), 1, 2)
     information = np.tensordot(JW, J, axes=((0, 2), (0, 1))) + np.eye(J.shape[2])
@@ -170,12 +165,7 @@ def _remounted(errors: Array, J: Array, P: Array) -> Array:
 
 
 def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array) -> tuple[Array, Array]:
-    """What errors of unit variance that the poses at their ends share make of relative poses (M).
-
-    Returns:
-        the covariances `N` (M, 6, 6), and how the relative poses depend on the shared errors (M, 6, k). Where one end
-        is after a loop nothing is apart: there the difference of both covariances is added to `N`.
-    """
+    """What errors of unit variance that the poses at their ends share make of relative poses (M)."""
     N, G = N.copy(), np.zeros((len(ends), _DOF, max(last.root.shape[1] for _, last in ends)))
     for row, (a, (first, last)) in enumerate(zip(A, ends)):
         if first.jacobian.shape == last.jacobian.shape:

@@ -27,40 +27,24 @@ from slam.tracks.visibility import MapView, expected_landmarks
 
 @dataclass(frozen=True, eq=False)
 class Returned:
-    """Features of an old keyframe that the present frame shows again.
+    """Features of an old keyframe that the present frame shows again."""
 
-    Attributes:
-        rows: of the present features (M,).
-        ids: of the landmarks that the old features belonged to (M,), −1 for none.
-        local: positions in present left-camera coordinates (M, 3) [m].
-        covariances: of the positions (M, 3, 3) [m²].
-    """
-
-    rows: NDArray[np.intp]
-    ids: IdArray
-    local: Array
-    covariances: Array
+    rows: NDArray[np.intp]  # of the present features (M,)
+    ids: IdArray  # of the landmarks that the old features belonged to (M,), −1 for none
+    local: Array  # positions in present left-camera coordinates (M, 3) [m]
+    covariances: Array  # of the positions (M, 3, 3) [m²]
 
 
 @dataclass(frozen=True, eq=False)
 class KnownPlace:
-    """Landmarks of a place whose pose is known.
+    """Landmarks of a place whose pose is known."""
 
-    Attributes:
-        ids: landmark ids that they had (M,), −1 for none.
-        positions: (M, 3) [m] in the back end's world frame.
-        covariances: of the positions (M, 3, 3) [m²].
-        descriptors: (M, D).
-        laplacian: signs of the Laplacian (M,).
-        seen_from: where the camera was when it saw them (3,) [m].
-    """
-
-    ids: IdArray
-    positions: Array
-    covariances: Array
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    seen_from: Array
+    ids: IdArray  # landmark ids that they had (M,), −1 for none
+    positions: Array  # (M, 3) [m] in the back end's world frame
+    covariances: Array  # of the positions (M, 3, 3) [m²]
+    descriptors: NDArray[np.float32]  # (M, D)
+    laplacian: NDArray[np.int8]  # signs of the Laplacian (M,)
+    seen_from: Array  # where the camera was when it saw them (3,) [m]
 
 
 class Mapper:

@@ -40,19 +40,12 @@ _CLAIM = 12.0  # a landmark claims features within this distance of its predicte
 
 @dataclass(frozen=True, eq=False)
 class Depths:
-    """Points triangulated from two views, in the camera's coordinates at the second one (N rows).
+    """Points triangulated from two views, in the camera's coordinates at the second one (N rows)."""
 
-    Attributes:
-        local: positions (N, 3) [m]; NaN where the rays do not meet in front of both cameras.
-        covariances: (N, 3, 3) [m²].
-        misfit: how far the two views are from showing one point (N,), χ² with one degree of freedom.
-        parallax: angle between the rays (N,) [rad].
-    """
-
-    local: Array
-    covariances: Array
-    misfit: Array
-    parallax: Array
+    local: Array  # positions (N, 3) [m]; NaN where the rays do not meet in front of both cameras
+    covariances: Array  # (N, 3, 3) [m²]
+    misfit: Array  # how far the two views are from showing one point (N,), χ² with one degree of freedom
+    parallax: Array  # angle between the rays (N,) [rad]
 
     def good(self, depth_error: float) -> BoolArray:
         """Which are known well enough (N,), `depth_error` being the largest relative standard deviation of depth."""
@@ -190,17 +183,11 @@ class _Views:
 
 @dataclass(frozen=True, eq=False)
 class NewPoints:
-    """Features whose depth has become known.
+    """Features whose depth has become known."""
 
-    Attributes:
-        rows: of the features (N,).
-        local: positions (N, 3) [m] in the camera's coordinates.
-        covariances: (N, 3, 3) [m²].
-    """
-
-    rows: NDArray[np.intp]
-    local: Array
-    covariances: Array
+    rows: NDArray[np.intp]  # of the features (N,)
+    local: Array  # positions (N, 3) [m] in the camera's coordinates
+    covariances: Array  # (N, 3, 3) [m²]
 
 
 class MonocularDepth:

@@ -36,21 +36,14 @@ class MapAnchor:
     """A pose with its uncertainty in the map, from which those of later poses are propagated.
 
     It is the newest keyframe's at the last loop closure, or the first pose of a new back end that has started since.
-
-    Attributes:
-        T_odom_left: the pose (4, 4), as the back end estimated it then.
-        noise: its covariance (6, 6) in the back end, without the common errors.
-        covariance: in the map: joint covariance (6 + n, 6 + n) of the pose, perturbing on the right, and of the common
-            errors.
-        common: estimate of the common errors (n,), in units of their prior standard deviations.
-        rig: what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`.
     """
 
-    T_odom_left: Array
-    noise: Array
+    T_odom_left: Array  # the pose (4, 4), as the back end estimated it then
+    noise: Array  # its covariance (6, 6) in the back end, without the common errors
+    # in the map: joint covariance (6 + n, 6 + n) of the pose, perturbing on the right, and of the common errors
     covariance: Array
-    common: Array
-    rig: CommonError
+    common: Array  # estimate of the common errors (n,), in units of their prior standard deviations
+    rig: CommonError  # what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`
 
     def belief(self, rig: CommonError) -> tuple[Array, Array]:
         """The common errors (n,) and their covariance (n, n); zero and unity if there are others by now."""
@@ -80,60 +73,39 @@ class MapAnchor:
 
 @dataclass(frozen=True, eq=False)
 class TrackingGap:
-    """A time in which the camera moved without being tracked, and after which a new back end took over.
+    """A time in which the camera moved without being tracked, and after which a new back end took over."""
 
-    Attributes:
-        since: time of the last measured pose before it [s].
-        until: time of the first pose after it [s].
-        covariance: of that pose (6, 6), perturbing on the right, see `covariance_after_unseen_motion`; None if the
-            camera was found elsewhere, so that nothing is known of its motion.
-        anchor: the first pose after it, if a new map begins there that no loop has tied to the rest so far.
-    """
-
-    since: float
-    until: float
+    since: float  # time of the last measured pose before it [s]
+    until: float  # time of the first pose after it [s]
+    # of that pose (6, 6), perturbing on the right, see `covariance_after_unseen_motion`; None if the camera was found
+    # elsewhere, so that nothing is known of its motion
     covariance: Array | None = None
+    # the first pose after it, if a new map begins there that no loop has tied to the rest so far
     anchor: MapAnchor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """What a run keeps of the places that it has visited.
+    """What a run keeps of the places that it has visited."""
 
-    Attributes:
-        keyframes: in order of time.
-        index: of their appearance, for place recognition.
-        loops: those in the pose graph.
-        inactive_loops: the latest verified loops outside the pose graph: refused, unconfirmed, or not
-            informative.
-        dropped: number of this run's loops taken out of the pose graph to save time.
-        refused: loops that contradict the path, as pairs of keyframe numbers.
-        corrected: poses T_map_left (C, 4, 4) of the first C keyframes, as of the last loop closure.
-        solved: the anchor at the last of these; None without a loop.
-        anchor: from which the present pose's covariance is propagated: `solved`, or where a new map has started since.
-        T_map_odom: pose (4, 4) of the back end's frame in the map.
-        pending: the last loop that passed the gate, whether in the pose graph or not.
-        confirmed: whether another keyframe shortly before agreed with `pending`.
-        gaps: one before each back end but the first.
-        restarts: number of gaps before the last keyframe.
-        prior_count: number of keyframes of the prior map that this run started in; they come first.
-    """
-
-    keyframes: tuple[Keyframe, ...] = ()
-    index: PlaceIndex = field(default_factory=PlaceIndex)
-    loops: tuple[Loop, ...] = ()
+    keyframes: tuple[Keyframe, ...] = ()  # in order of time
+    index: PlaceIndex = field(default_factory=PlaceIndex)  # of their appearance, for place recognition
+    loops: tuple[Loop, ...] = ()  # those in the pose graph
+    # the latest verified loops outside the pose graph: refused, unconfirmed, or not informative
     inactive_loops: tuple[Loop, ...] = ()
-    dropped: int = 0
-    refused: tuple[tuple[int, int], ...] = ()
+    dropped: int = 0  # number of this run's loops taken out of the pose graph to save time
+    refused: tuple[tuple[int, int], ...] = ()  # loops that contradict the path, as pairs of keyframe numbers
+    # poses T_map_left (C, 4, 4) of the first C keyframes, as of the last loop closure
     corrected: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    solved: MapAnchor | None = None
+    solved: MapAnchor | None = None  # the anchor at the last of these; None without a loop
+    # from which the present pose's covariance is propagated: `solved`, or where a new map has started since
     anchor: MapAnchor | None = None
-    T_map_odom: Array = field(default_factory=lambda: np.eye(4))
-    pending: Loop | None = None
-    confirmed: bool = False
-    gaps: tuple[TrackingGap, ...] = ()
-    restarts: int = 0
-    prior_count: int = 0
+    T_map_odom: Array = field(default_factory=lambda: np.eye(4))  # pose (4, 4) of the back end's frame in the map
+    pending: Loop | None = None  # the last loop that passed the gate, whether in the pose graph or not
+    confirmed: bool = False  # whether another keyframe shortly before agreed with `pending`
+    gaps: tuple[TrackingGap, ...] = ()  # one before each back end but the first
+    restarts: int = 0  # number of gaps before the last keyframe
+    prior_count: int = 0  # number of keyframes of the prior map that this run started in; they come first
 
     def __len__(self) -> int:
         return len(self.keyframes)

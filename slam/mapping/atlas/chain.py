@@ -23,18 +23,13 @@ from slam.geometry.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """The path of the keyframes as the back end estimated it, step by step.
+    """The path of the keyframes as the back end estimated it, step by step."""
 
-    Attributes:
-        poses: T_odom_left (K, 4, 4).
-        steps: covariance (K, 6, 6) by noise of the motion from the keyframe before, perturbing on the right; the first
-            has no meaning.
-        common: derivative (K, 6, m) of the same motion by the common errors, which have unit variance; m is 0 by
-            default.
-    """
-
-    poses: Array
+    poses: Array  # T_odom_left (K, 4, 4)
+    # covariance (K, 6, 6) by noise of the motion from the keyframe before, perturbing on the right; the first has no
+    # meaning
     steps: Array
+    # derivative (K, 6, m) of the same motion by the common errors, which have unit variance; m is 0 by default
     common: Array = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
@@ -74,15 +69,10 @@ class Chain:
 
 
 class Propagated(NamedTuple):
-    """Error accumulated from the begin of its stretch to each keyframe.
+    """Error accumulated from the begin of its stretch to each keyframe."""
 
-    Attributes:
-        noise: covariance (K, 6, 6).
-        common: derivative (K, 6, m) by the common errors.
-    """
-
-    noise: Array
-    common: Array
+    noise: Array  # covariance (K, 6, 6)
+    common: Array  # derivative (K, 6, m) by the common errors
 
 
 def spread(chain: Chain, ends: NDArray[np.intp], propagated: Propagated, moved: Array, common: Array) -> Array:

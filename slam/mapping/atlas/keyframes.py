@@ -18,37 +18,23 @@ _ROUNDING = 1e-14  # numerics: variances below this share of the largest are rou
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A frame that is kept.
+    """A frame that is kept."""
 
-    Attributes:
-        frame: index of the step.
-        stamp: [s].
-        T_odom_left: pose (4, 4) that the back end estimated then.
-        covariance: of that pose (6, 6), without the common errors.
-        step_covariance: covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the
-            right.
-        jacobian: derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`.
-        travelled: length of the path up to here [m].
-        depth: median depth of the features [m].
-        points: features in coordinates of the rectified left camera (F, 3) [m].
-        descriptors: (F, D).
-        laplacian: signs of the Laplacian (F,).
-        landmarks: ids of the landmarks that the features showed (F,), −1 for none.
-        correction: of the rig's error, with which the points were triangulated; None in a map of an earlier run.
-    """
-
-    frame: int
-    stamp: float
-    T_odom_left: Array
-    covariance: Array
+    frame: int  # index of the step
+    stamp: float  # [s]
+    T_odom_left: Array  # pose (4, 4) that the back end estimated then
+    covariance: Array  # of that pose (6, 6), without the common errors
+    # covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the right
     step_covariance: Array
+    # derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`
     jacobian: Array
-    travelled: float
-    depth: float
-    points: NDArray[np.float32]
-    descriptors: NDArray[np.float16]
-    laplacian: NDArray[np.int8]
-    landmarks: IdArray
+    travelled: float  # length of the path up to here [m]
+    depth: float  # median depth of the features [m]
+    points: NDArray[np.float32]  # features in coordinates of the rectified left camera (F, 3) [m]
+    descriptors: NDArray[np.float16]  # (F, D)
+    laplacian: NDArray[np.int8]  # signs of the Laplacian (F,)
+    landmarks: IdArray  # ids of the landmarks that the features showed (F,), −1 for none
+    # of the rig's error, with which the points were triangulated; None in a map of an earlier run
     correction: Correction | None = None
 
     def __len__(self) -> int:
@@ -67,20 +53,13 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Two keyframes that show the same place.
+    """Two keyframes that show the same place."""
 
-    Attributes:
-        first, second: their numbers, the older one first.
-        T_first_second: the second one's pose in the first one's coordinates (4, 4).
-        covariance: its covariance (6, 6), perturbing on the right.
-        inliers: number of features that agree.
-    """
-
-    first: int
+    first: int  # their numbers, the older one first
     second: int
-    T_first_second: Array
-    covariance: Array
-    inliers: int
+    T_first_second: Array  # the second one's pose in the first one's coordinates (4, 4)
+    covariance: Array  # its covariance (6, 6), perturbing on the right
+    inliers: int  # number of features that agree
 
     @property
     def pair(self) -> tuple[int, int]:

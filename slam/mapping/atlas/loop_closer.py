@@ -51,17 +51,11 @@ _HYPOTHESES = 300  # cost: poses tried, so that with a quarter of the matches ri
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Pose and place of a camera found without a prior.
+    """Pose and place of a camera found without a prior."""
 
-    Attributes:
-        T_odom_left: the camera's pose (4, 4) in the back end's frame.
-        place: landmarks of the place.
-        stamp: time of the keyframe that shows the place [s]; −inf for one of an earlier run.
-    """
-
-    T_odom_left: Array
-    place: KnownPlace
-    stamp: float
+    T_odom_left: Array  # the camera's pose (4, 4) in the back end's frame
+    place: KnownPlace  # landmarks of the place
+    stamp: float  # time of the keyframe that shows the place [s]; −inf for one of an earlier run
 
 
 class LoopCloser:
@@ -423,14 +417,7 @@ def _inliers(one: tuple[Loop, Verified]) -> int:
 
 
 def _nearest(poses: Array, here: Array, depth: float, possible: BoolArray) -> NDArray[np.intp]:
-    """Numbers of the possible keyframes nearest by the path, in the camera's position and in what it looks at.
-
-    Args:
-        poses: of the keyframes (K, 4, 4).
-        here: of the camera (4, 4).
-        depth: of what it looks at [m].
-        possible: which of them may be chosen (K,).
-    """
+    """Numbers of the possible keyframes nearest by the path, in the camera's position and in what it looks at."""
     places = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
     views = np.linalg.norm(poses[:, :3, 3] + depth * poses[:, :3, 2] - here[:3, 3] - depth * here[:3, 2], axis=1)
     distance = np.where(possible, places + views, np.inf)

@@ -32,38 +32,24 @@ _HALVINGS = 8  # numerics: most halvings of a step that increases χ²
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The keyframes' poses.
+    """The keyframes' poses."""
 
-    Attributes:
-        poses: T_map_left (K, 4, 4).
-        covariance: joint covariance (6 + m, 6 + m) of the last pose, perturbing on the right, and the common errors.
-        common: the common errors (m,).
-        disagreement: of each loop with the graph (L,), χ² with 6 degrees of freedom.
-    """
-
-    poses: Array
+    poses: Array  # T_map_left (K, 4, 4)
+    # joint covariance (6 + m, 6 + m) of the last pose, perturbing on the right, and the common errors
     covariance: Array
-    common: Array
-    disagreement: Array
+    common: Array  # the common errors (m,)
+    disagreement: Array  # of each loop with the graph (L,), χ² with 6 degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """Path and loops, with the poses and common errors that minimise χ².
+    """Path and loops, with the poses and common errors that minimise χ²."""
 
-    Attributes:
-        chain: the path.
-        problem: the equations.
-        poses: of the keyframes that are variables (M, 4, 4).
-        common: the common errors (m,).
-        normal: the normal equations near the solution.
-    """
-
-    chain: Chain
-    problem: _Problem
-    poses: Array
-    common: Array
-    normal: _Normal
+    chain: Chain  # the path
+    problem: _Problem  # the equations
+    poses: Array  # of the keyframes that are variables (M, 4, 4)
+    common: Array  # the common errors (m,)
+    normal: _Normal  # the normal equations near the solution
 
     @classmethod
     def solved(
@@ -135,24 +121,15 @@ def solve(chain: Chain, loops: Sequence[Loop], start: Array) -> Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Measured motions between keyframes: those of stretches first, then those of loops.
+    """Measured motions between keyframes: those of stretches first, then those of loops."""
 
-    Attributes:
-        ends: keyframes (M,) whose poses are variables; the first one is fixed and defines the map.
-        a, b: rows of `ends` (E,): the motion is the pose of b in the coordinates of a.
-        motions: measured (E, 4, 4).
-        roots: square roots of their information (E, 6, 6): a residual r costs |root r|².
-        common: derivative of the motions by the common errors (E, 6, m).
-        propagated: errors within the stretches, see `slam.mapping.atlas.chain.Chain.propagated`.
-    """
-
-    ends: NDArray[np.intp]
-    a: NDArray[np.intp]
+    ends: NDArray[np.intp]  # keyframes (M,) whose poses are variables; the first one is fixed and defines the map
+    a: NDArray[np.intp]  # rows of `ends` (E,): the motion is the pose of b in the coordinates of a
     b: NDArray[np.intp]
-    motions: Array
-    roots: Array
-    common: Array
-    propagated: Propagated
+    motions: Array  # measured (E, 4, 4)
+    roots: Array  # square roots of their information (E, 6, 6): a residual r costs |root r|²
+    common: Array  # derivative of the motions by the common errors (E, 6, m)
+    propagated: Propagated  # errors within the stretches, see `slam.mapping.atlas.chain.Chain.propagated`
 
     @classmethod
     def of(cls, chain: Chain, loops: Sequence[Loop], also: Sequence[int]) -> _Problem:
@@ -249,19 +226,12 @@ class _Problem:
 
 @dataclass(frozen=True, eq=False)
 class _Normal:
-    """Normal equations of poses, sparse, and of common errors, dense.
+    """Normal equations of poses, sparse, and of common errors, dense."""
 
-    Attributes:
-        solver: of the poses' own part (6 (M − 1), 6 (M − 1)).
-        border: the part between poses and common errors (6 (M − 1), m).
-        through: that part, solved for the poses.
-        inner: covariance of the common errors (m, m).
-    """
-
-    solver: SuperLU
-    border: Array
-    through: Array
-    inner: Array
+    solver: SuperLU  # of the poses' own part (6 (M − 1), 6 (M − 1))
+    border: Array  # the part between poses and common errors (6 (M − 1), m)
+    through: Array  # that part, solved for the poses
+    inner: Array  # covariance of the common errors (m, m)
 
     @classmethod
     def of(

@@ -24,21 +24,13 @@ _ROUNDS = 2  # numerics: of least squares, with the points' noise in the pixels 
 
 @dataclass(frozen=True, eq=False)
 class Verified:
-    """A keyframe's place, seen again.
+    """A keyframe's place, seen again."""
 
-    Attributes:
-        keyframe: that shows it.
-        T_keyframe_left: pose (4, 4) of the present camera in the keyframe's coordinates.
-        covariance: of that pose (6, 6), perturbing on the right.
-        noise: the part of the covariance (6, 6) due to the features' own errors in both frames.
-        matches: inliers, as rows of the keyframe's features and of the present frame's.
-    """
-
-    keyframe: Keyframe
-    T_keyframe_left: Array
-    covariance: Array
-    noise: Array
-    matches: Matches
+    keyframe: Keyframe  # that shows it
+    T_keyframe_left: Array  # pose (4, 4) of the present camera in the keyframe's coordinates
+    covariance: Array  # of that pose (6, 6), perturbing on the right
+    noise: Array  # the part of the covariance (6, 6) due to the features' own errors in both frames
+    matches: Matches  # inliers, as rows of the keyframe's features and of the present frame's
 
 
 def alike(keyframe: Keyframe, features: StereoFeatures, config: AssociationConfig) -> int:
@@ -116,13 +108,7 @@ def refined_pose(
 
 
 def _jackknife(problem: PoseProblem, T: Array, P: Array) -> Array:
-    """Covariance (6, 6) of a least-squares pose (4, 4) by leaving out each match in turn, to first order.
-
-    Args:
-        problem: of which the pose is the solution.
-        T: the pose.
-        P: its covariance (6, 6) by the problem's noise.
-    """
+    """Covariance (6, 6) of a least-squares pose (4, 4) by leaving out each match in turn, to first order."""
     r, G = whitened_residuals(problem, T)
     leverage = G @ P @ np.swapaxes(G, 1, 2)
     moved = P @ (np.swapaxes(G, 1, 2) @ np.linalg.solve(np.eye(3) - leverage, r[:, :, None]))
