@@ -17,7 +17,7 @@ from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
 from slam.mapping.known_landmarks import in_front
-from slam.mapping.monocular import MonocularDepth, unclaimed
+from slam.mapping.monocular import MonocularDepth, frame_covariance, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
 from slam.tracks.localizer import LandmarkMatches, Localizer
@@ -206,19 +206,21 @@ class Mapper:
         features, matches = step.features, step.matches
         if len(matches) < MINIMAL_POINTS:
             return landmarks, added
-        estimate = backend.estimate(landmarks=False)
+        T = step.estimate.T_world_left
         view = self._view(backend, landmarks, step)
         rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
-        covariance = monocular.pose_covariance(estimate, view, landmarks, features, matches)
-        new = monocular.step(features, rows, estimate.T_world_left, covariance, step.index)
+        there = isin(matches.ids, landmarks.ids)
+        local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
+        P = frame_covariance(self.rig, local, stereo, self._localizer.pixel_sigma)
+        rows, local, covariances = monocular.step(features, rows, T, P, step.index)
         wanted = max(self.config.target_in_view - len(matches) - len(added), 0)
-        best = np.sort(np.argsort(-features.response[new.rows], kind="stable")[:wanted])
+        best = np.sort(np.argsort(-features.response[rows], kind="stable")[:wanted])
         if not len(best):
             return landmarks, added
         ids = self._new_ids(len(best))
-        backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
-        landmarks = landmarks.with_new(step.index, ids, features, new.rows[best], step.estimate.T_world_left[:3, 3])
-        return landmarks, added.joined(LandmarkMatches(ids, new.rows[best]))
+        backend.place(ids, local[best], covariances[best])  # type: ignore[attr-defined]
+        landmarks = landmarks.with_new(step.index, ids, features, rows[best], T[:3, 3])
+        return landmarks, added.joined(LandmarkMatches(ids, rows[best]))
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""
