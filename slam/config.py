@@ -139,6 +139,9 @@ _GIVEN = ("self", "rig", "models")
 #: Classes of sections in which settings of earlier versions are constants now.
 _FIXED = {"association": AssociationConfig, "map": MapConfig, "self_calibration": SelfCalibrationConfig}
 
+#: Settings of earlier versions that are gone, and never changed a result.
+_GONE = {"atlas": ("on_disk",)}
+
 
 def _without_fixed(tree: dict[str, Any]) -> dict[str, Any]:
     """The tree without settings of earlier versions that have a fixed value now.
@@ -149,6 +152,9 @@ def _without_fixed(tree: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(tree, dict):  # which is refused as any other value of a wrong type
         return tree
     kept = dict(tree)
+    for section, names in _GONE.items():
+        if isinstance(own := tree.get(section), dict):
+            kept[section] = {key: value for key, value in own.items() if key not in names}
     for section, kind in _FIXED.items():
         if isinstance(own := tree.get(section), dict):
             constants = {name for name, value in vars(kind).items() if isinstance(value, (int, float))}

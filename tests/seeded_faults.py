@@ -184,7 +184,7 @@ FAULTS = (
         "tests/slam/mapping",
     ),
     Fault(
-        "a loop is tested without its own covariance", "slam/mapping/atlas/consensus.py",
+        "a loop is tested without its own covariance", "slam/mapping/atlas/closing.py",
         "return distance(T, loop.T_first_second, P + loop.covariance)", "return distance(T, loop.T_first_second, P)",
         "tests/slam/mapping/atlas/test_disagreement.py tests/slam/mapping",
     ),

@@ -12,6 +12,7 @@ from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import transform
 from slam.interfaces import Backend, MapBackend
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
@@ -26,25 +27,19 @@ from slam.tracks.visibility import MapView, expected_landmarks
 
 
 @dataclass(frozen=True, eq=False)
-class Returned:
-    """Features of an old keyframe that the present frame shows again."""
+class OldPlace:
+    """Features of an old keyframe, as landmarks at positions that are known by now."""
 
-    rows: NDArray[np.intp]  # of the present features (M,)
-    ids: IdArray  # of the landmarks that the old features belonged to (M,), −1 for none
-    local: Array  # positions in present left-camera coordinates (M, 3) [m]
+    landmarks: LandmarkTable  # their bookkeeping (M); ids that they had, −1 for none
+    rows: NDArray[np.intp]  # of the present frame's features that show them, or of the keyframe's (M,)
+    positions: Array  # (M, 3) [m]
     covariances: Array  # of the positions (M, 3, 3) [m²]
 
-
-@dataclass(frozen=True, eq=False)
-class KnownPlace:
-    """Landmarks of a place whose pose is known."""
-
-    ids: IdArray  # landmark ids that they had (M,), −1 for none
-    positions: Array  # (M, 3) [m] in the back end's world frame
-    covariances: Array  # of the positions (M, 3, 3) [m²]
-    descriptors: NDArray[np.float32]  # (M, D)
-    laplacian: NDArray[np.int8]  # signs of the Laplacian (M,)
-    seen_from: Array  # where the camera was when it saw them (3,) [m]
+    @classmethod
+    def at(cls, landmarks: LandmarkTable, rows: NDArray[np.intp], T: Array, points: Array, P: Array) -> OldPlace:
+        """From points (M, 3) [m] with covariances (M, 3, 3) in coordinates that `T` (4, 4) transforms."""
+        P = T[:3, :3] @ P @ T[:3, :3].T
+        return cls(landmarks, rows, transform(T, points), 0.5 * (P + np.swapaxes(P, 1, 2)))
 
 
 class Mapper:
@@ -89,43 +84,37 @@ class Mapper:
             backend.remove(erased)
         return replace(step, landmarks=landmarks, added=added, erased=erased)
 
-    def restore(self, backend: Backend, step: Step, returned: Returned) -> Step:
+    def restore(self, backend: Backend, step: Step, place: OldPlace) -> Step:
         """Let landmarks of a revisited place rejoin the map, if the back end can place them.
 
-        They keep the ids that they had. If the back end still holds such a landmark, at its old, drifted position, that
-        one is erased first. Features that are landmarks of the map already, or that move, are left out.
+        They are in the present camera's coordinates, and keep the ids that they had. If the back end still holds such a
+        landmark, at its old, drifted position, that one is erased first. Features that are landmarks of the map
+        already, or that move, are left out.
         """
         if not isinstance(backend, MapBackend):
             return step
         taken = np.concatenate([step.matches.rows, step.added.rows, step.withheld.rows, step.labels.moving])
-        free = np.flatnonzero(~np.isin(returned.rows, taken) & in_front(returned.local))
+        free = np.flatnonzero(~np.isin(place.rows, taken) & in_front(place.positions))
         if not len(free):
             return step
-        ids = returned.ids[free]
-        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
+        ids, rows = self._named(place.landmarks.ids[free]), place.rows[free]
         stale = np.isin(step.landmarks.ids, ids)
         if stale.any():
             backend.remove(step.landmarks.ids[stale])
         landmarks = step.landmarks.select(~stale)
-        backend.place(ids, returned.local[free], returned.covariances[free])
-        rows = returned.rows[free]
+        backend.place(ids, place.positions[free], place.covariances[free])
         landmarks = landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
         erased = step.erased[~isin(step.erased, ids)]
         return replace(step, landmarks=landmarks, erased=erased, returned=LandmarkMatches(ids, rows))
 
-    def insert(self, backend: Backend, landmarks: LandmarkTable, place: KnownPlace) -> LandmarkTable:
-        """Add landmarks of a known place to the map, as from a saved map; those already in it are left unchanged."""
+    def insert(self, backend: Backend, landmarks: LandmarkTable, place: OldPlace) -> LandmarkTable:
+        """Add landmarks of a place in the world to the map, as from a saved map; those already in it are unchanged."""
         assert isinstance(backend, MapBackend)  # only such back ends start in a map
-        new = np.flatnonzero(~np.isin(place.ids, landmarks.ids) | (place.ids < 0))
-        ids = place.ids[new]
-        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
+        old = place.landmarks.ids
+        new = np.flatnonzero(~np.isin(old, landmarks.ids) | (old < 0))
+        ids = self._named(old[new])
         backend.insert(ids, place.positions[new], place.covariances[new])
-        once = np.ones(len(ids), np.int64)
-        seen_from = np.tile(place.seen_from, (len(ids), 1))
-        rows = LandmarkTable(
-            ids, place.descriptors[new], place.laplacian[new], once, once, 0 * once, 0 * once - 1, seen_from
-        )
-        return landmarks.joined(rows)
+        return landmarks.joined(replace(place.landmarks.select(new), ids=ids))
 
     def reconcile(self, backend: Backend, landmarks: LandmarkTable | None) -> LandmarkTable | None:
         """Make rows and back end agree after an interrupted step: landmarks that only one of them has are erased.
@@ -221,6 +210,12 @@ class Mapper:
         backend.place(ids, local[best], covariances[best])  # type: ignore[attr-defined]
         landmarks = landmarks.with_new(step.index, ids, features, rows[best], T[:3, 3])
         return landmarks, added.joined(LandmarkMatches(ids, rows[best]))
+
+    def _named(self, ids: IdArray) -> IdArray:
+        """The ids (N,) with new ones in place of −1."""
+        ids = ids.copy()
+        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
+        return ids
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

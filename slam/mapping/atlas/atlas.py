@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -21,12 +20,10 @@ from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.chain import Chain, between_keyframes
 from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
-from slam.mapping.atlas.places import PlaceIndex, Vectors
+from slam.mapping.atlas.places import PlaceIndex
+from slam.mapping.atlas.pose_graph import Solution, solve
 from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
-
-if TYPE_CHECKING:
-    from slam.mapping.atlas.pose_graph import Solution
 
 _UNKNOWN_DIRECTION = np.pi / np.sqrt(3)  # derived: standard deviation of an unknown angle [rad]
 
@@ -121,12 +118,13 @@ class Atlas:
         """
         atlas = cls()
         for keyframe in keyframes:
-            atlas = atlas.with_new(replace(keyframe, frame=-1), keyframe.descriptors.astype(np.float32))
+            atlas = atlas.with_new(replace(keyframe, frame=-1))
         return replace(atlas, loops=tuple(loops), corrected=poses, prior_count=len(atlas))
 
-    def with_new(self, keyframe: Keyframe, descriptors: Vectors) -> Atlas:
-        """A copy with one more keyframe, which has descriptors (F, D)."""
-        return replace(self, keyframes=(*self.keyframes, keyframe), index=self.index.with_new(descriptors))
+    def with_new(self, keyframe: Keyframe) -> Atlas:
+        """A copy with one more keyframe."""
+        index = self.index.with_new(keyframe.descriptors.astype(np.float32))
+        return replace(self, keyframes=(*self.keyframes, keyframe), index=index)
 
     @cached_property
     def stamps(self) -> Array:
@@ -150,7 +148,7 @@ class Atlas:
 
     def poses_in_map(self) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes."""
-        return self._in_map(self.poses)
+        return self.in_map(self.poses)
 
     def summary(self) -> dict[str, int]:
         """Numbers of keyframes, of loops closed in this run, and of loops refused because they contradict the path.
@@ -264,12 +262,8 @@ class Atlas:
         common[1:] -= adjoint(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
         return Chain(poses, steps, common)
 
-    def in_map(self, chain: Chain) -> Array:
-        """Poses T_map_left (K, 4, 4) of all keyframes; those since the last loop are computed by `T_map_odom`."""
-        return self._in_map(chain.poses)
-
-    def _in_map(self, poses: Array) -> Array:
-        """All keyframes' poses (K, 4, 4) in odom, transformed to the map."""
+    def in_map(self, poses: Array) -> Array:
+        """All keyframes' poses (K, 4, 4) in the map, given those in odom: of those before the last loop, as it left them."""
         return np.concatenate([self.corrected, self.T_map_odom @ poses[len(self.corrected) :]])
 
     def pose_in_map(self, number: int) -> Array:
@@ -305,10 +299,8 @@ class Atlas:
         """A path in odom, transformed to the map; between keyframes the loops' corrections are interpolated in time."""
         if self.solved is None or not len(path):
             return path
-        from slam.mapping.atlas.pose_graph import solve
-
         chain = self.chain(self.solved.rig, path)
-        moved = self.in_map(chain)
+        moved = self.in_map(chain.poses)
         with suppress(np.linalg.LinAlgError):  # then the keyframes stay as the last loop left them
             moved = solve(chain, self.loops, moved).poses
         stamps = self.stamps[self.prior_count :]

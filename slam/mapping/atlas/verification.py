@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,9 +57,8 @@ def verify(
         seed: of the random choice in the geometric check.
     """
     points = keyframe.points.astype(float)
-    landmarks = _rows(keyframe)
-    prediction = nowhere(features.stamp, np.eye(4))
-    found = localizer.match(prediction, landmarks, points, features, seed)
+    landmarks = replace(keyframe_landmarks(keyframe), ids=np.arange(len(points)))
+    found = localizer.match(nowhere(features.stamp, np.eye(4)), landmarks, points, features, seed)
     if found.T_world_left is None or len(found) < config.inliers:
         return None
     ids, seen = found.ids, found.rows
@@ -115,10 +114,7 @@ def _jackknife(problem: PoseProblem, T: Array, P: Array) -> Array:
     return np.asarray(moved[:, :, 0].T @ moved[:, :, 0])
 
 
-def _rows(keyframe: Keyframe) -> LandmarkTable:
-    """A keyframe's features as landmarks, with their rows as ids."""
-    count = len(keyframe)
-    once = np.ones(count, np.int64)
-    return LandmarkTable(
-        np.arange(count), keyframe.descriptors.astype(np.float32), keyframe.laplacian, once, once, 0 * once, -once
-    )
+def keyframe_landmarks(keyframe: Keyframe) -> LandmarkTable:
+    """A keyframe's features as landmarks of an earlier run; the id is −1 of one that was none."""
+    looks, once = keyframe.descriptors.astype(np.float32), np.ones(len(keyframe), np.int64)
+    return LandmarkTable(keyframe.landmarks, looks, keyframe.laplacian, once, once, 0 * once, -once)

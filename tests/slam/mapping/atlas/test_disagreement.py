@@ -7,7 +7,7 @@ import pytest
 
 from slam.geometry.se3 import exp
 from slam.mapping.atlas.chain import Chain
-from slam.mapping.atlas.consensus import disagreement
+from slam.mapping.atlas.closing import disagreement
 from slam.mapping.atlas.keyframes import Loop
 from slam.mapping.atlas.pose_graph import PoseGraph
 

@@ -11,8 +11,8 @@ import pytest
 
 from slam.geometry.se3 import adjoint, exp, inverse, log
 from slam.mapping.atlas.chain import Chain, spread_over
+from slam.mapping.atlas.closing import is_informative
 from slam.mapping.atlas.keyframes import Loop
-from slam.mapping.atlas.loop_closer import is_informative
 from slam.mapping.atlas.pose_graph import PoseGraph, solve
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
