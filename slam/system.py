@@ -35,7 +35,6 @@ from slam.showing import count
 from slam.third_party import named_failures
 from slam.tracker import Tracker
 from slam.tracks.table import LandmarkTable
-from slam.version import __version__
 
 
 def _require_types(
@@ -348,7 +347,7 @@ class StereoSlam:
             rows = self.landmarks.moved(self.atlas.T_map_odom)
             keyframes = (k.corrected(self.calibration.applied, self.rig.rectified.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
-            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, atlas)
+            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas)
 
     @property
     def warnings(self) -> list[str]:

@@ -15,13 +15,7 @@ _SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from 
 
 
 def require_known(backend: str, ids: IdArray, positions: Array, covariances: Array) -> None:
-    """Check the landmarks handed to `slam.interfaces.MapBackend`.
-
-    Args:
-        backend: its name, for the message.
-        ids: (N,).
-        positions: (N, 3) [m].
-        covariances: (N, 3, 3) [m²].
+    """Check landmarks (N) at positions (N, 3) [m] with covariances (N, 3, 3) [m²], as given to a back end of this name.
 
     Raises:
         MeasurementError: shapes differ, an id occurs twice, a position is not finite or absurdly far, or a covariance
@@ -33,17 +27,14 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
         raise MeasurementError(f"{backend}: {n} landmark ids, but {shapes}")
     if len(np.unique(ids)) != n:
         raise MeasurementError(f"{backend}: a landmark id stands twice")
-    bad = ~np.isfinite(positions).all(axis=1)
-    if bad.any():
-        raise MeasurementError(f"{backend}: the position of landmark {ids[bad][0]} is not finite")
-    bad = (np.abs(positions) > FARTHEST_POSITION).any(axis=1)
-    if bad.any():
-        raise MeasurementError(f"{backend}: landmark {ids[bad][0]} lies more than {FARTHEST_POSITION:g} m off")
-    bad = ~_positive_definite(covariances)
-    if bad.any():
-        raise MeasurementError(
-            f"{backend}: the covariance of landmark {ids[bad][0]} is not symmetric and positive definite"
-        )
+    far = f"landmark {{}} lies more than {FARTHEST_POSITION:g} m off"
+    for bad, what in (
+        (~np.isfinite(positions).all(axis=1), "the position of landmark {} is not finite"),
+        ((np.abs(positions) > FARTHEST_POSITION).any(axis=1), far),
+        (~_positive_definite(covariances), "the covariance of landmark {} is not symmetric and positive definite"),
+    ):
+        if bad.any():
+            raise MeasurementError(f"{backend}: {what.format(ids[bad][0])}")
 
 
 def in_front(local: Array) -> BoolArray:
@@ -52,22 +43,16 @@ def in_front(local: Array) -> BoolArray:
 
 
 def require_in_front(backend: str, ids: IdArray, local: Array) -> None:
-    """Check that landmarks at `local` (N, 3) [m] in the camera's coordinates lie in front of it.
-
-    Raises:
-        MeasurementError: one does not.
-    """
+    """Raise MeasurementError where a landmark at `local` (N, 3) [m] in the camera's coordinates is not before it."""
     bad = ~in_front(local)
     if bad.any():
         raise MeasurementError(f"{backend}: landmark {ids[bad][0]} does not lie in front of the camera")
 
 
-def _positive_definite(covariances: Array) -> np.ndarray:
+def _positive_definite(covariances: Array) -> BoolArray:
     """Which matrices (N,) are finite, symmetric and positive definite."""
     good = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
     C = np.where(good[:, None, None], covariances, np.eye(3))
     scale = np.abs(C).max(axis=(1, 2))
-    good &= np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2)) <= _SYMMETRIC * scale
-    good &= scale < _LARGEST
-    C = np.where(good[:, None, None], C, np.eye(3))
-    return np.asarray(good & (np.linalg.eigvalsh(C)[:, 0] > 0))
+    good &= (np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2)) <= _SYMMETRIC * scale) & (scale < _LARGEST)
+    return np.asarray(good & (np.linalg.eigvalsh(np.where(good[:, None, None], C, np.eye(3)))[:, 0] > 0))

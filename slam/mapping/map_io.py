@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,19 +30,12 @@ from slam.mapping.atlas.keyframes import Keyframe, Loop
 from slam.mapping.known_landmarks import require_known
 from slam.showing import count
 from slam.tracks.table import LandmarkTable
-
-
-class HasMap(Protocol):
-    """Whatever has a map to save, such as a running system."""
-
-    def snapshot(self) -> SavedMap:
-        """The map as it is now; raises SlamError where there is none."""
-        ...
-
+from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
 _VERSION = 4  # fixed: of the file format
 _WITHOUT_PLACES = "2"  # also read; version 3 had keyframes without the common errors of their poses, and is not
+_TEXTS = ("frontend", "world_frame", "written_by")  # of the header
 _DATE = (1980, 1, 1, 0, 0, 0)  # fixed: of all members, so that the same map gives the same bytes
 
 #: World frame of a map that was built from scratch.
@@ -56,20 +49,13 @@ _FAR, _HALF = FARTHEST_POSITION, 65504.0  # guard: [m]; the largest half float
 
 
 class _Kind(NamedTuple):
-    """What an array must be.
+    """What an array must be."""
 
-    Attributes:
-        dtype: of its entries.
-        shape: a letter for each size that other arrays share, a figure for each that is fixed.
-        least, most: bounds of its entries.
-        what: "pose" or "covariance" where each row must be one; "unknown" where entries may be NaN.
-    """
-
-    dtype: type
-    shape: str
-    least: float
+    dtype: type  # of its entries
+    shape: str  # a letter for each size that other arrays share, a figure for each that is fixed
+    least: float  # bounds of its entries
     most: float
-    what: str = ""
+    what: str = ""  # "pose" or "covariance" where each row must be one; "unknown" where entries may be NaN
 
 
 #: Arrays of the landmarks.
@@ -215,20 +201,14 @@ class SavedMap:
 
     @classmethod
     def of(
-        cls,
-        landmarks: LandmarkTable,
-        estimate: Estimate,
-        frontend: str,
-        world_frame: str,
-        version: str,
-        atlas: Atlas,
+        cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, world_frame: str, atlas: Atlas
     ) -> SavedMap:
         """The map of a running system: landmark rows, the back end's estimate, what both belong to, and keyframes."""
         P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
             landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
-            f"surf-stereo-slam {version}", seen_from=landmarks.seen_from,
+            f"surf-stereo-slam {__version__}", seen_from=landmarks.seen_from,
             keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map(), loops=atlas.loops,
         )  # fmt: skip
 
@@ -250,8 +230,8 @@ class SavedMap:
             )
 
 
-def save_map(path: str | Path, what: HasMap | SavedMap) -> None:
-    """Write a map, or a system's map, to a file: completely or not at all.
+def save_map(path: str | Path, what: Any) -> None:
+    """Write a `SavedMap`, or the map of a `StereoSlam`, to a file: completely or not at all.
 
     Raises:
         SlamError: there is no map yet, or the file cannot be written.
@@ -273,8 +253,7 @@ def load_map(path: str | Path) -> SavedMap:
 
 def encode(saved: SavedMap) -> bytes:
     """The bytes of a file; the same for the same map."""
-    texts = {"world_frame": saved.world_frame, "frontend": saved.frontend, "written_by": saved.written_by}
-    header = {**texts, "holds": saved.holds}
+    header = {name: getattr(saved, name) for name in (*_TEXTS, "holds")}
     members = {"header.json": json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False).encode() + b"\n"}
     arrays = {name: getattr(saved, name) for name in _LANDMARKS} | places_to_arrays(saved)
     for name, values in arrays.items():
@@ -301,25 +280,18 @@ def decode(data: bytes, source: str) -> SavedMap:
         raise SlamError(f"{source}: a map of version {version!r}; {known}")
     if hashlib.sha256(body).hexdigest().encode() != digest:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
-    return SavedMap(**_members(body, source, version != _WITHOUT_PLACES), source=source)
-
-
-def _members(body: bytes, source: str, with_places: bool) -> dict[str, Any]:
-    """The attributes of `SavedMap` in an archive."""
     members = unpack(body, source)
-    names = [*_LANDMARKS, *(_PLACES if with_places else ())]
+    names = [*_LANDMARKS, *(_PLACES if version != _WITHOUT_PLACES else ())]
     missing = {"header.json", *(f"{name}.npy" for name in names)} - set(members)
     if missing:
         raise SlamError(f"{source}: the map lacks {min(missing)}")
-    header, texts = (
-        json_text(members["header.json"], f"{source}: header.json"),
-        ("frontend", "world_frame", "written_by"),
-    )
-    if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in texts):
-        raise SlamError(f"{source}: header.json must give {', '.join(texts)}")
+    header = json_text(members["header.json"], f"{source}: header.json")
+    if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in _TEXTS):
+        raise SlamError(f"{source}: header.json must give {', '.join(_TEXTS)}")
     arrays = {name: array(members[f"{name}.npy"], name, source) for name in names}
-    content = {name: header[name] for name in texts} | {name: arrays[name] for name in _LANDMARKS}
-    return content | (places_from_arrays(arrays, source) if with_places else {})
+    places = places_from_arrays(arrays, source) if version != _WITHOUT_PLACES else {}
+    landmarks = {name: arrays[name] for name in _LANDMARKS}
+    return SavedMap(**landmarks, **{name: header[name] for name in _TEXTS}, **places, source=source)
 
 
 def places_to_arrays(saved: SavedMap) -> dict[str, np.ndarray]:

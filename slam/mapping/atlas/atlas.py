@@ -263,7 +263,7 @@ class Atlas:
         return Chain(poses, steps, common)
 
     def in_map(self, poses: Array) -> Array:
-        """All keyframes' poses (K, 4, 4) in the map, given those in odom: of those before the last loop, as it left them."""
+        """Poses (K, 4, 4) of all keyframes in the map, given those in odom; up to the last loop they are as it left them."""
         return np.concatenate([self.corrected, self.T_map_odom @ poses[len(self.corrected) :]])
 
     def pose_in_map(self, number: int) -> Array:
