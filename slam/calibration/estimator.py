@@ -13,13 +13,7 @@ from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
 from slam.calibration.posterior import RigPosterior, Solution, residual_scale, solve
-from slam.calibration.prior import (
-    factory_prior,
-    focal_sigma,
-    prior_information,
-    resumed_prior,
-    systematic_variance,
-)
+from slam.calibration.prior import factory_prior, focal_sigma, prior_information, resumed_prior, systematic_variance
 from slam.calibration.rows import row_evidence
 from slam.calibration.saved import RigNumbers, SavedCalibration
 from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of

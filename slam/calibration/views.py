@@ -100,13 +100,7 @@ def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[N
 
 
 def pair_of(
-    model: RigModel,
-    first: View,
-    second: View,
-    parameters: Array,
-    noise: Array,
-    seed: int,
-    matched: Rows | None = None,
+    model: RigModel, first: View, second: View, parameters: Array, noise: Array, seed: int, matched: Rows | None = None
 ) -> Pair:
     """Matches of two views that agree on one motion, and that motion.
 

@@ -15,13 +15,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import transform
 from slam.interfaces import Backend, MapBackend
 from slam.mapping.config import MapConfig
-from slam.mapping.culling import (
-    bad_landmarks,
-    crowded_landmarks,
-    doubled_landmarks,
-    known_features,
-    surplus_landmarks,
-)
+from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.known_landmarks import in_front
 from slam.mapping.monocular import MonocularDepth, frame_covariance, unclaimed
 from slam.mapping.selection import new_landmarks

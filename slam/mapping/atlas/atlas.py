@@ -21,7 +21,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.chain import Chain, between_keyframes
 from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.mapping.atlas.places import PlaceIndex
-from slam.mapping.atlas.pose_graph import Solution, solve
+from slam.mapping.atlas.pose_graph import PoseGraph
 from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
 
@@ -188,19 +188,14 @@ class Atlas:
             atlas = atlas.with_loop(loop, most)
         return replace(atlas, pending=held[-1], confirmed=True)
 
-    def solved_by(self, solution: Solution, rig: CommonError) -> Atlas:
+    def solved_by(self, graph: PoseGraph, rig: CommonError) -> Atlas:
         """A copy with the keyframes' poses by the pose graph; `rig` says what its common errors stand for."""
-        last = self.keyframes[-1]
+        last, poses = self.keyframes[-1], graph.keyframe_poses()
         shared = replace(rig, jacobian=last.jacobian)
-        anchor = MapAnchor(last.T_odom_left, last.covariance, solution.covariance, solution.common, shared)
-        return replace(
-            self,
-            corrected=solution.poses,
-            solved=anchor,
-            anchor=anchor,
-            gaps=tuple(replace(gap, anchor=None) for gap in self.gaps),
-            T_map_odom=solution.poses[-1] @ inverse(last.T_odom_left),
-        )
+        anchor = MapAnchor(last.T_odom_left, last.covariance, graph.covariance(), graph.common, shared)
+        gaps = tuple(replace(gap, anchor=None) for gap in self.gaps)
+        T_map_odom = poses[-1] @ inverse(last.T_odom_left)
+        return replace(self, corrected=poses, solved=anchor, anchor=anchor, gaps=gaps, T_map_odom=T_map_odom)
 
     def relocalized(self, gap: TrackingGap, place: float | None) -> Atlas:
         """A copy with a gap after which the camera was found in the map.
@@ -263,7 +258,7 @@ class Atlas:
         return Chain(poses, steps, common)
 
     def in_map(self, poses: Array) -> Array:
-        """Poses (K, 4, 4) of all keyframes in the map, given those in odom; up to the last loop they are as it left them."""
+        """Poses (K, 4, 4) of all keyframes in the map, given those in odom; the last loop has set those before it."""
         return np.concatenate([self.corrected, self.T_map_odom @ poses[len(self.corrected) :]])
 
     def pose_in_map(self, number: int) -> Array:
@@ -302,7 +297,7 @@ class Atlas:
         chain = self.chain(self.solved.rig, path)
         moved = self.in_map(chain.poses)
         with suppress(np.linalg.LinAlgError):  # then the keyframes stay as the last loop left them
-            moved = solve(chain, self.loops, moved).poses
+            moved = PoseGraph.solved(chain, self.loops, moved).keyframe_poses()
         stamps = self.stamps[self.prior_count :]
         return Trajectory(path.stamps, between_keyframes(path, stamps, moved[self.prior_count :], self._unseen_time))
 

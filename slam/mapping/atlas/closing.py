@@ -68,7 +68,7 @@ def _judged(
     graph = graph.with_loop(loop)
     if (graph.disagreement() > limit).any():
         return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
-    return atlas.with_loop(loop, config.most_loops).solved_by(graph.solution(), rig), True
+    return atlas.with_loop(loop, config.most_loops).solved_by(graph, rig), True
 
 
 def _left_out(
@@ -96,7 +96,7 @@ def _left_out(
     before = {x.pair for x in atlas.loops}
     held = {x.pair: x for x in (*places(rival), *(x for x in rival if x.pair in before), loop)}
     atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival, config.most_loops)
-    return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start).solution(), rig), True
+    return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig), True
 
 
 def _agree(chain: Chain, before: Loop, loop: Loop, limit: float) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import IdArray, StereoFeatures
+from slam.data import IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
@@ -86,21 +86,6 @@ def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: 
         return True
     uv = rig.left.project(transform(inverse(motion), keyframe.points.astype(float)))
     return bool(rig.left.in_image(uv).mean() < config.keyframe_share)
-
-
-def features_with_depth(rig: StereoRig, features: StereoFeatures, sigma: float, max_error: float) -> NDArray[np.intp]:
-    """Rows of the features whose depth is known well enough.
-
-    Args:
-        rig: the cameras.
-        features: of a frame.
-        sigma: noise of uL, vL, uR [px].
-        max_error: largest relative standard deviation of the depth.
-    """
-    points = rig.triangulate(features.uv_left, features.uv_right)
-    known = np.flatnonzero(np.isfinite(points).all(axis=1))
-    deviation = rig.depth_deviation(points[known], sigma)
-    return known[deviation < max_error * points[known, 2]]
 
 
 def kept_features(

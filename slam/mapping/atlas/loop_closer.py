@@ -16,16 +16,10 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import (
-    Keyframe,
-    Loop,
-    features_with_depth,
-    kept_features,
-    step_covariance,
-    view_has_changed,
-)
+from slam.mapping.atlas.keyframes import Keyframe, Loop, kept_features, step_covariance, view_has_changed
 from slam.mapping.atlas.verification import Verified, alike, keyframe_landmarks, verify
 from slam.mapping.mapper import OldPlace
+from slam.mapping.selection import depth_is_known
 from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.rig_error import Correction
@@ -167,7 +161,8 @@ class LoopCloser:
     def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray) -> Keyframe | None:
         """The frame as a keyframe; None where too few features have a depth."""
         features = step.features
-        known = features_with_depth(self._rig, features, self._sigma, self._max_depth_error)
+        stereo = np.flatnonzero(features.has_stereo)
+        known = stereo[depth_is_known(self._rig, features, stereo, self._sigma, self._max_depth_error)]
         rows = kept_features(known, features.response, landmark_of, step.labels.moving, self._config.features)
         if len(rows) < _MINIMAL:
             return None

@@ -39,12 +39,7 @@ def alike(keyframe: Keyframe, features: StereoFeatures, config: AssociationConfi
 
 
 def verify(
-    keyframe: Keyframe,
-    features: StereoFeatures,
-    rig: StereoRig,
-    localizer: Localizer,
-    config: AtlasConfig,
-    seed: int,
+    keyframe: Keyframe, features: StereoFeatures, rig: StereoRig, localizer: Localizer, config: AtlasConfig, seed: int
 ) -> Verified | None:
     """The present camera's pose relative to a keyframe; None if too few features agree, or all are in one spot.
 

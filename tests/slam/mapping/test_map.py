@@ -6,13 +6,7 @@ import pytest
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.mapping.config import MapConfig
-from slam.mapping.culling import (
-    bad_landmarks,
-    crowded_landmarks,
-    doubled_landmarks,
-    known_features,
-    surplus_landmarks,
-)
+from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.selection import new_landmarks
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView, expected_landmarks, similar_view

@@ -14,15 +14,9 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import (
-    Keyframe,
-    covariance_growth,
-    features_with_depth,
-    kept_features,
-    step_covariance,
-    view_has_changed,
-)
+from slam.mapping.atlas.keyframes import Keyframe, covariance_growth, kept_features, step_covariance, view_has_changed
 from slam.mapping.atlas.verification import refined_pose, verify
+from slam.mapping.selection import depth_is_known
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
 from slam.tracks.localizer import Localizer
@@ -59,7 +53,8 @@ def rows_of(*rows: int) -> np.ndarray:
 def keyframe(features: StereoFeatures) -> Keyframe:
     """The frame as a keyframe."""
     nothing = np.full(len(features), -1)
-    rows = kept_features(features_with_depth(RIG, features, SIGMA, 0.2), features.response, nothing, rows_of(), 400)
+    known = np.flatnonzero(depth_is_known(RIG, features, np.arange(len(features)), SIGMA, 0.2))
+    rows = kept_features(known, features.response, nothing, rows_of(), 400)
     points = RIG.triangulate(features.uv_left[rows], features.uv_right[rows])
     return Keyframe(
         0, 0.0, np.eye(4), np.eye(6), np.zeros((6, 6)), np.zeros((6, 0)), 0.0, float(np.median(points[:, 2])),
