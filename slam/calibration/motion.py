@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.calibration.evidence import Evidence
+from slam.calibration.evidence import Evidence, student_weights
 from slam.calibration.model import RigModel
-from slam.calibration.robust import student_weights
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, so3_exp
@@ -33,19 +32,11 @@ class Linear(NamedTuple):
     """A motion at some points, linearised."""
 
     moved: Array  # where the motion takes the points (N, 3) [px]
-    J_point: Array  # derivatives of `moved` (N, 3, 3), (N, 3, 6) by the points and by ``[rotation (left), t]``
-    J_motion: Array
+    J_point: Array  # derivatives of `moved` by the points (N, 3, 3)
+    J_motion: Array  # and by ``[rotation (left), t]`` (N, 3, 6)
     motion: Array  # `J_motion`, whitened
-    # whitening matrices of the residuals (N, 3, 3), lower triangular; NaN where their covariance is not positive
-    # definite
-    white: Array
+    white: Array  # lower triangular whitening matrices (N, 3, 3) of the residuals; NaN where there is none
     residual: Array  # second view less its prediction from the first (N, 3), whitened
-
-    @classmethod
-    def empty(cls, n: int) -> Linear:
-        """Of n points, to be filled in."""
-        J_motion, motion = np.empty((2, n, 3, 6))
-        return cls(np.empty((n, 3)), np.empty((n, 3, 3)), J_motion, motion, np.empty((n, 3, 3)), np.empty((n, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +66,9 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
     from slam.calibration.motion_kernels import move_points
 
     first, second = (np.ascontiguousarray(a, float) for a in (first, second))
-    points, at = first, Linear.empty(len(first))
+    points, at = first, None
     for _ in range(20):  # 20: of Gauss-Newton at most
-        _linearise(first, second, points, R, t, focal, noise, at)
+        at = linearised(first, second, points, R, t, focal, noise, at)
         distance = np.einsum("ni,ni->n", at.residual, at.residual)
         if not np.isfinite(distance).all():
             return None
@@ -110,12 +101,9 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
         parameters: where to linearise (n,).
         noise: covariance of a point (3, 3) [px²]; only its form matters, the scale is estimated.
     """
-    first = pair.first + model.shift(pair.first, parameters)
-    second = pair.second + model.shift(pair.second, parameters)
+    first, second = (points + model.shift(points, parameters) for points in (pair.first, pair.second))
     fit = fit_motion(first, second, pair.R, pair.t, model.focal, noise)
-    if fit is None:
-        return None
-    return _eliminated(model, fit, parameters)
+    return None if fit is None else _eliminated(model, fit, parameters)
 
 
 def squared_distance(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Array:
@@ -181,21 +169,24 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     return at.moved, at.J_point, at.J_motion
 
 
-def linearised(first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
-    """A motion linearised at estimates of the first view's points, as `fit_motion` needs it.
+def linearised(
+    first: Array,
+    second: Array,
+    points: Array,
+    R: Array,
+    t: Array,
+    focal: float,
+    noise: Array,
+    out: Linear | None = None,
+) -> Linear:
+    """A motion linearised at estimates of the first view's points, as `fit_motion` needs it; into `out` if given.
 
     The residuals carry the points' own corrections to first order.
     """
-    first, second, points = (np.ascontiguousarray(a, float) for a in (first, second, points))
-    out = Linear.empty(len(points))
-    _linearise(first, second, points, R, t, focal, noise, out)
-    return out
-
-
-def _linearise(
-    first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array, out: Linear
-) -> None:
-    """`linearised` into `out`."""
     from slam.calibration.motion_kernels import linearise
 
-    linearise(first, second, points, np.ascontiguousarray(R), np.ascontiguousarray(t), focal, noise, *out)
+    if out is None:
+        n, shapes = len(points), ((3,), (3, 3), (3, 6), (3, 6), (3, 3), (3,))
+        out = Linear(*(np.empty((n, *shape)) for shape in shapes))
+    linearise(*(np.ascontiguousarray(a, float) for a in (first, second, points, R, t)), focal, noise, *out)
+    return out
