@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from slam.errors import ConfigurationError
+from slam.naming import unknown
 
 #: Numbers of settings lie below this, in whatever unit: their squares and products stay far from overflow.
 MOST = 1e9
@@ -25,16 +26,15 @@ _WORD, _TUPLE = 4096, 16  # most characters of a text, most elements of a tuple
 #: Ranges of fields whose cost grows faster than their value, in every class.
 _COSTLY = {"grid": (1, 1000)}
 
+_C = TypeVar("_C")
 Ranges = Mapping[str, tuple[float, float]]
 
 
 def require_positive(config: object, ranges: Ranges | None = None, owner: str = "") -> None:
     """Check the types of a configuration dataclass, and that its numbers are positive and in their ranges.
 
-    Args:
-        config: the dataclass.
-        ranges: least and largest values by field, both allowed; default: `LEAST` to `MOST`, counts to a million.
-        owner: whose settings they are, for the message.
+    `ranges` has least and largest values by field, both allowed; default: `LEAST` to `MOST`, counts to a million.
+    `owner` says whose settings they are.
 
     Raises:
         ConfigurationError: a value is of the wrong type or out of its range.
@@ -118,3 +118,16 @@ def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
         return f"a list of {len(kinds)} values"
     faults = [_type_fault(v, kind) for v, kind in zip(value, kinds)]
     return next((f"a list, each {fault}" for fault in faults if fault), "")
+
+
+def from_options(kind: type[_C], owner: str, options: Mapping[str, Any]) -> _C:
+    """A configuration, of the dataclass `kind`, from keyword options of a front end or back end, its `owner`.
+
+    Raises:
+        ConfigurationError: an option is unknown (the message lists the known ones) or out of its range.
+    """
+    known = [f.name for f in fields(kind)]  # type: ignore[arg-type]
+    for key in options:
+        if key not in known:
+            raise ConfigurationError(f"{owner}: {unknown('option', key, known)}")
+    return kind(**options)

@@ -136,36 +136,29 @@ class SystemConfig:
 #: What the system itself gives to front ends and back ends that it makes.
 _GIVEN = ("self", "rig", "models")
 
-#: Classes of sections in which settings of earlier versions are constants now.
+#: Classes of sections in which settings of earlier versions are constants now, and those that changed no result.
 _FIXED = {"association": AssociationConfig, "map": MapConfig, "self_calibration": SelfCalibrationConfig}
-
-#: Settings of earlier versions that are gone, and never changed a result.
 _GONE = {"atlas": ("on_disk",)}
 
 
 def _without_fixed(tree: dict[str, Any]) -> dict[str, Any]:
-    """The tree without settings of earlier versions that have a fixed value now.
-
-    Raises:
-        ConfigurationError: one had another value.
-    """
+    """The tree without settings of earlier versions; raises ConfigurationError where one had another value than now."""
     if not isinstance(tree, dict):  # which is refused as any other value of a wrong type
         return tree
     kept = dict(tree)
-    for section, names in _GONE.items():
-        if isinstance(own := tree.get(section), dict):
-            kept[section] = {key: value for key, value in own.items() if key not in names}
-    for section, kind in _FIXED.items():
-        if isinstance(own := tree.get(section), dict):
-            constants = {name for name, value in vars(kind).items() if isinstance(value, (int, float))}
-            gone = [key for key in own if key in constants - {f.name for f in fields(kind)}]
-            for key in gone:
-                if not (isinstance(own[key], (int, float)) and own[key] == getattr(kind, key)):
-                    raise ConfigurationError(
-                        f"setting {section}.{key}: no longer a setting; its value is {getattr(kind, key)}, "
-                        f"not {own[key]!r:.80}"
-                    )
-            kept[section] = {key: value for key, value in own.items() if key not in gone}
+    for section, own in tree.items():
+        kind = _FIXED.get(section)
+        if not isinstance(own, dict) or (kind is None and section not in _GONE):
+            continue
+        constants = {name for name, value in vars(kind).items() if isinstance(value, (int, float))} if kind else set()
+        fixed = constants - {f.name for f in fields(kind)} if kind else set()
+        for key in fixed.intersection(own):
+            if not (isinstance(own[key], (int, float)) and own[key] == getattr(kind, key)):
+                raise ConfigurationError(
+                    f"setting {section}.{key}: no longer a setting; its value is {getattr(kind, key)}, "
+                    f"not {own[key]!r:.80}"
+                )
+        kept[section] = {key: value for key, value in own.items() if key not in (*fixed, *_GONE.get(section, ()))}
     return kept
 
 

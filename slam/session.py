@@ -194,11 +194,10 @@ class Session:
         none, rows = np.zeros(0, np.int64), np.zeros(0, np.intp)
         whole = self.map_estimate(state, features.stamp)
         estimate = replace(whole, ids=none, positions=whole.positions[:0], covariances=whole.covariances[:0])
+        report, seen = UpdateReport.nothing(UpdateStatus.EMPTY, NOT_FOUND), replace(features, images=None)
         result = FrameResult(
-            index=state.index + 1, status=FrameStatus.LOST, reason=NOT_FOUND, estimate=estimate,
-            report=UpdateReport.nothing(UpdateStatus.EMPTY, NOT_FOUND), features=replace(features, images=None),
-            predicted=0, matched=none, matched_features=rows, added=none, added_features=rows, erased=none,
-            map_size=len(whole.ids), located=False,
+            state.index + 1, FrameStatus.LOST, NOT_FOUND, estimate, report, seen, predicted=0, matched=none,
+            matched_features=rows, added=none, added_features=rows, erased=none, map_size=len(whole.ids), located=False,
         )  # fmt: skip
         return replace(state, index=state.index + 1, stamp=features.stamp, checksum=None), result
 
@@ -251,12 +250,8 @@ class Session:
     def left_behind(self, before: State, begun: State, step: Step) -> IdArray:
         """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began.
 
-        What the rig's uncertainty does to those is forgotten.
-
-        Args:
-            before: after the last frame.
-            begun: the state in which the step began; without landmarks where a new map did.
-            step: of this frame.
+        `before` is the state after the last frame; `begun` that in which the step began, without landmarks where a new
+        map did. What the rig's uncertainty does to those that left is forgotten.
         """
         if before.landmarks is None or begun.landmarks is not None:
             return step.erased
@@ -265,11 +260,8 @@ class Session:
 
     def _start(self, T_world_left: Array) -> Backend:
         """A back end without landmarks at a pose (4, 4) that is only roughly known."""
-        return self._new(
-            T_world_left=T_world_left.tolist(),
-            initial_position_sigma=POSITION_SIGMA,
-            initial_rotation_sigma=ROTATION_SIGMA,
-        )
+        sigmas = {"initial_position_sigma": POSITION_SIGMA, "initial_rotation_sigma": ROTATION_SIGMA}
+        return self._new(T_world_left=T_world_left.tolist(), **sigmas)
 
     def _new(self, **models: Any) -> Backend:
         """Another back end of the same kind."""

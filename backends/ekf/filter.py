@@ -17,6 +17,7 @@ from backends.ekf.motion import Camera, EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import Problem, UnsolvableError
 from backends.ekf.state import State
+from slam.bounds import from_options
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
@@ -26,7 +27,6 @@ from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import require_in_front, require_known
 from slam.models import EstimatorModels
-from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION, landmarks_pose
 from slam.window.gating import with_noise
