@@ -84,9 +84,9 @@ class StereoSlam:
         rig_prior: SavedCalibration | None = None,
     ) -> None:
         keep_freed_memory()
-        for (name, kind), value in zip(_TYPES.items(), (rig, config, prior_map, rig_prior)):
-            if not isinstance(value, kind) and (value is not None or name == "rig"):
-                raise ConfigurationError(f"{name} must be a {kind.__name__}, got {type(value).__name__}")
+        for (name, wanted), value in zip(_TYPES.items(), (rig, config, prior_map, rig_prior)):
+            if not isinstance(value, wanted) and (value is not None or name == "rig"):
+                raise ConfigurationError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
         c = config or SystemConfig.for_kind(kind, *names)

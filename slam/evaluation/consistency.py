@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
-from slam.evaluation.truth_error import RowArray, doubtful, truth_covariances
+from slam.evaluation.truth_error import RowArray, doubtful, interpolated, truth_covariances
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.se3 import adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -59,8 +59,9 @@ def consistency_figures(
         left out because the truth contradicts itself or an old place was measured again within them, where there are
         any; "scale error [%]" and "scale sigma [%]".
     """
-    first = np.zeros(len(own) - 1, np.intp)
-    from_start = stretch_nees(own, true, covariances, noise, first, np.arange(1, len(own)), common)
+    start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
+    later = np.arange(start + 1, len(own))
+    from_start = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common)
     low, high = chi_square_band(_DOF, max(int(np.isfinite(from_start).sum()), 1))
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
     closed = _closings(covariances)

@@ -5,18 +5,10 @@ import sys
 import pytest
 
 from slam import registry
-from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, UnknownNameError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
-from slam.naming import suggestion
 from slam.sequences import open_sequence
-
-
-def test_only_a_similar_name_is_suggested():
-    assert suggestion("Smother", ["batch", "smoother"]) == " (did you mean 'smoother'?)"
-    assert suggestion("kalman", ["batch", "ekf", "smoother"]) == ""
-    assert suggestion("x", []) == ""
 
 
 @pytest.mark.parametrize(
@@ -110,19 +102,3 @@ def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monke
         registry.create("backends", "foreign_classes:Nothing", "rig", windo=3)
     with pytest.raises(ConfigurationError, match="does not take the argument models"):
         registry.create("backends", "foreign_classes:Nothing", "rig", models=3)
-
-
-@pytest.mark.parametrize(
-    ("setting", "meant"),
-    [
-        ("map.max_landmark=3", "'max_landmarks'"),
-        ("mpa.grid=3", "'map.grid'"),
-        ("mapp.gird=3", "'map'"),
-        ("max_landmarks=3", "'map.max_landmarks'"),
-        ("map.max_speed=3", "'models.objects.max_speed' or 'objects.max_speed'"),
-    ],
-)
-def test_a_setting_is_suggested(setting, meant):
-    with pytest.raises(SlamError) as raised:
-        SystemConfig().with_settings([setting])
-    assert f"did you mean {meant}?" in str(raised.value)

@@ -67,17 +67,6 @@ def test_starts_late_where_the_first_frames_are_empty(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_missing_right_images_do_not_stop_tracking(backend):
-    def no_right(k, features):
-        return replace(features, uv_right=np.full_like(features.uv_right, np.nan)) if k in (10, 11) else features
-
-    system, results, truth = run(backend, change=no_right)
-    assert all(r.status is FrameStatus.TRACKED for r, _ in results[1:])
-    assert not len(results[10][0].added)  # depth comes from the stereo pair
-    assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.01
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_new_map_forgets_what_the_rig_s_error_does_to_the_landmarks_of_the_old_one(backend):
     """By a baseline 33 times too long nothing is tracked, and map follows map, while the calibration goes on."""
     sequence = slam.open_sequence("synthetic:desk?frames=12&baseline=0.075")

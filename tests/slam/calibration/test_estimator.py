@@ -112,11 +112,6 @@ def test_a_good_calibration_is_left_as_it_is(seed):
     assert disparity_error(calibration, 0) < 0.03
 
 
-def test_without_motion_only_rows_are_learnt():
-    calibration = drive(parameters(pitch=1e-3), step=0.0)
-    assert calibration.pairs == 0 and calibration.apply() is None
-
-
 def test_what_motion_has_hardly_shown_is_not_applied():
     """Steps of five centimetres and noisy pixels: most of what is believed of the disparities is the prior's."""
     calibration = drive(TURNED, frames=8, step=0.05, noise=1.0, settings={"minimum_parallax": 0.01})
@@ -151,12 +146,6 @@ def test_unrectified_rig():
     calibration = drive(theta, rig=GENERAL_RIG, scale=GENERAL_RIG.baseline / CAR.baseline, noise=0.1, frames=20)
     assert np.abs(z_scores(calibration, theta)).max() < 3
     assert disparity_error(calibration, theta) < 0.2 * 2e-3 * calibration.model.focal
-
-
-def test_the_poses_of_the_system_are_only_a_start():
-    with_poses, without = (drive(TURNED, seed=3, frames=12, poses=known) for known in (True, False))
-    assert with_poses.pairs == without.pairs
-    assert disparity_error(with_poses, without.posterior.mean) < 0.03
 
 
 def test_a_change_that_does_not_count_is_not_applied():

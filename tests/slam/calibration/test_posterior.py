@@ -17,14 +17,6 @@ def evidence(value, sigma, cross=0.0):
     return Evidence(np.array([[sigma**-2]]), np.array([value / sigma**2]), np.array([[cross]]))
 
 
-def test_a_calibration_that_nothing_speaks_against_is_left_alone():
-    prior = Prior(NONE, np.array([[[0.02]], [[0.1]], [[0.3]], [[1.0]]]) ** 2)
-    near = solve(prior, 0.0, evidence(0.1, 0.1))
-    assert abs(near.mean[0]) < 0.06  # one standard deviation from nothing
-    clear = solve(prior, 0.0, evidence(0.1, 0.01))
-    assert clear.mean[0] == pytest.approx(0.1, abs=0.01)
-
-
 def test_the_posterior_is_that_of_the_whole_mixture():
     """Against the integral: where the data cannot say which scale is true, the means by scale lie apart."""
     sigmas, theta = np.array([0.05, 0.4]), np.linspace(-2, 2, 400_001)

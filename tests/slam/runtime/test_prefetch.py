@@ -65,14 +65,6 @@ def test_an_exception_comes_where_its_item_would():
     assert threads() <= before
 
 
-def test_a_caller_that_stops_early_leaves_no_thread():
-    before = threads()
-    for item in prefetch(range(1000)):
-        if item == 3:
-            break
-    assert threads() <= before
-
-
 @pytest.mark.parametrize("source", ["prefetch(endless())", "LiveFrames(endless(), paced=False)"])
 def test_the_thread_ends_before_the_program_does(source):
     """Where an exception has left the work half done: a thread that runs on while Python is taken down may hang it."""

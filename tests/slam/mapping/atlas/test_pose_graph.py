@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from slam.geometry.se3 import adjoint, exp, inverse, log
-from slam.mapping.atlas.chain import Chain, spread_over
-from slam.mapping.atlas.closing import is_informative
+from slam.geometry.se3 import exp, inverse, log
+from slam.mapping.atlas.chain import Chain
+from slam.mapping.atlas.closing import disagreement, is_informative
 from slam.mapping.atlas.keyframes import Loop
 from slam.mapping.atlas.pose_graph import PoseGraph
 
@@ -96,23 +96,6 @@ def test_a_false_loop_disagrees():
     assert PoseGraph.solved(chain, (*loops, false), chain.poses).disagreement().max() > 100
 
 
-def test_relative_pose_without_loops_is_that_of_the_path():
-    _, chain, _ = problem(1)
-    T, P = PoseGraph.solved(chain, (), chain.poses, (10, 25)).relative_pose(10, 25)
-    direct, expected = chain.motion(10, 25)
-    np.testing.assert_allclose(T, direct, atol=1e-9)
-    np.testing.assert_allclose(P, expected, atol=1e-3 * np.abs(expected).max())
-
-
-def test_motion_back_has_the_carried_covariance():
-    _, chain, _ = problem(2)
-    T, P = chain.motion(3, 8)
-    back, Q = chain.motion(8, 3)
-    np.testing.assert_allclose(back @ T, np.eye(4), atol=1e-12)
-    A = adjoint(T)
-    np.testing.assert_allclose(Q, A @ P @ A.T, rtol=1e-9, atol=1e-15)
-
-
 TURN_AND_SCALE = np.array([[0, 4e-3, 0, 0, 0, 0], [0, 0, 0, 0, 0, 2e-2]]).T  # of a step, for errors of unit variance
 
 
@@ -142,15 +125,6 @@ def test_common_errors_are_found_and_the_covariance_is_right():
     assert 5.5 < np.mean(nees) < 10.5  # 8 is right, with a deviation of 0.9
     assert np.std(found) < 0.3  # of 1: where the lap closes says how far each step turns
     assert np.mean(apart) > 0  # better than with errors that are taken for noise of each step
-
-
-def test_poses_between_the_ends_are_those_of_the_whole_problem_with_common_errors():
-    true, chain, loops, _ = problem_with_common_errors(3)
-    few = PoseGraph.solved(chain, loops, chain.poses).keyframe_poses()
-    none = [Loop(k, k + 1, np.eye(4), 1e12 * np.eye(6), 0) for k in range(len(true) - 1)]  # that say nothing
-    every = PoseGraph.solved(chain, (*loops, *none), chain.poses).keyframe_poses()
-    moved = np.linalg.norm(every[:, :3, 3] - chain.poses[:, :3, 3], axis=1).max()
-    assert np.linalg.norm(few[:, :3, 3] - every[:, :3, 3], axis=1).max() < 0.05 * moved
 
 
 def test_a_motion_has_the_common_errors_in_its_covariance():
@@ -195,16 +169,6 @@ def test_steps_without_noise_leave_a_covariance():
     assert 10 < np.mean(nees) < 22  # 14 is right, with a deviation of 1.2
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_shared_out_keeps_the_ends(share: float):
-    rng = np.random.default_rng(3)
-    begin, motion, rest = (exp(rng.normal(size=(1, 6))) for _ in range(3))
-    change = 0.1 * rng.normal(size=(1, 6))
-    out = spread_over(begin, motion, rest, share * change)
-    end = out @ rest
-    np.testing.assert_allclose(end, begin @ motion @ rest @ exp(share * change), atol=1e-9)
-
-
 def test_one_loop_more_is_the_same_as_all_at_once():
     _, chain, loops, _ = problem_with_common_errors(6)
     last = loops[-1]
@@ -222,3 +186,18 @@ def test_a_loop_says_little_where_earlier_ones_have_told_as_much():
     assert is_informative(untold, loop)
     assert not is_informative(told, loop)
     assert is_informative(told, replace(loop, covariance=0.1 * loop.covariance))
+
+
+@pytest.mark.parametrize("share", [0.1, 1.0, 10.0])  # of the path's covariance, that of the loop
+def test_a_loops_own_covariance_counts_beside_the_paths(share):
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = np.arange(5)
+    steps = np.tile(np.diag([1e-4] * 3 + [1e-2] * 3), (5, 1, 1))
+    graph = PoseGraph.solved(Chain(poses, steps), [], poses, [1, 3])
+    T, P = graph.relative_pose(1, 3)
+    np.testing.assert_allclose(T, poses[2], atol=1e-9)
+    off = 0.05 * rng.standard_normal(6)
+    loop = Loop(1, 3, T @ exp(off), share * P, 30)
+    expected = off @ np.linalg.solve(P, off) / (1 + share)
+    assert disagreement(graph, loop) == pytest.approx(expected, rel=1e-6)

@@ -68,11 +68,6 @@ def test_an_atlas_of_an_earlier_run_is_where_it_was():
     assert atlas.summary() == {"keyframes": 4, "known": 4, "closed": 0, "refused": 0}
 
 
-def test_a_map_says_what_it_holds():
-    assert saved(KEYFRAMES).holds == "1 landmark, 4 keyframes, 2 loops"
-    assert b"1 landmark, 4 keyframes, 2 loops" in encode(saved(KEYFRAMES))
-
-
 @pytest.mark.parametrize(("name", "value"), [
     ("keyframe_stamps", np.zeros(3)),
     ("keyframe_stamps", np.full(4, np.nan)),
