@@ -38,6 +38,11 @@ class Linear(NamedTuple):
     white: Array  # lower triangular whitening matrices (N, 3, 3) of the residuals; NaN where there is none
     residual: Array  # second view less its prediction from the first (N, 3), whitened
 
+    @classmethod
+    def empty(cls, n: int) -> Linear:
+        """Of n points, to be filled in."""
+        return cls(*(np.empty((n, *shape)) for shape in ((3,), (3, 3), (3, 6), (3, 6), (3, 3), (3,))))
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -66,7 +71,7 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
     from slam.calibration.motion_kernels import move_points
 
     first, second = (np.ascontiguousarray(a, float) for a in (first, second))
-    points, at = first, None
+    points, at = first, Linear.empty(len(first))
     for _ in range(20):  # 20: of Gauss-Newton at most
         at = linearised(first, second, points, R, t, focal, noise, at)
         distance = np.einsum("ni,ni->n", at.residual, at.residual)
@@ -170,23 +175,15 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
 
 
 def linearised(
-    first: Array,
-    second: Array,
-    points: Array,
-    R: Array,
-    t: Array,
-    focal: float,
-    noise: Array,
+    first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array,
     out: Linear | None = None,
-) -> Linear:
+) -> Linear:  # fmt: skip
     """A motion linearised at estimates of the first view's points, as `fit_motion` needs it; into `out` if given.
 
     The residuals carry the points' own corrections to first order.
     """
     from slam.calibration.motion_kernels import linearise
 
-    if out is None:
-        n, shapes = len(points), ((3,), (3, 3), (3, 6), (3, 6), (3, 3), (3,))
-        out = Linear(*(np.empty((n, *shape)) for shape in shapes))
+    out = Linear.empty(len(points)) if out is None else out
     linearise(*(np.ascontiguousarray(a, float) for a in (first, second, points, R, t)), focal, noise, *out)
     return out

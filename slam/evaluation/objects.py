@@ -212,7 +212,7 @@ class ObjectScore:
         true = self._world @ self.bodies[body - 1][frames]
         both = rows[1:][(np.diff(rows) == 1) & (np.diff(frames[rows]) == 1)]
         me = [motion_errors(own[[k - 1, k]], true[[k - 1, k]]) for k in both]
-        errors = PathErrors(*(np.array([getattr(e, part)[0] for e in me]) for part in ("translation", "rotation")))
+        errors = PathErrors(np.array([e.translation[0] for e in me]), np.array([e.rotation[0] for e in me]))
         values = self._nees(body, life)
         figures["ME"] = _summed(errors)
         figures["relative, 10 frames"] = _summed(motion_errors(own, true, 10)) if len(own) > 10 else {}

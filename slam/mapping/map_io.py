@@ -289,8 +289,8 @@ def decode(data: bytes, source: str) -> SavedMap:
     if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in _TEXTS):
         raise SlamError(f"{source}: header.json must give {', '.join(_TEXTS)}")
     arrays = {name: array(members[f"{name}.npy"], name, source) for name in names}
-    places = places_from_arrays(arrays, source) if version != _WITHOUT_PLACES else {}
-    landmarks = {name: arrays[name] for name in _LANDMARKS}
+    places: dict[str, Any] = places_from_arrays(arrays, source) if version != _WITHOUT_PLACES else {}
+    landmarks: dict[str, Any] = {name: arrays[name] for name in _LANDMARKS}
     return SavedMap(**landmarks, **{name: header[name] for name in _TEXTS}, **places, source=source)
 
 

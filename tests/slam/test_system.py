@@ -122,21 +122,6 @@ def frames_without_images(count: int = 12) -> list[StereoFrame]:
     return [StereoFrame(k, k / 30, none, none) for k in range(count)]
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_run_with_overlap_gives_the_same_bytes_as_one_step_after_the_other(backend):
-    frames = frames_without_images()
-    poses = []
-    for overlap in (True, False):
-        system = StereoSlam(RIG, CloudFrontend(), backend, config=CONFIG)
-        results = list(system.run(frames, overlap))
-        assert [frame.index for frame, _ in results] == list(range(12))
-        assert "extract" in results[-1][1].milliseconds
-        poses.append(np.array([r.estimate.T_world_left for _, r in results]).tobytes())
-    system = StereoSlam(RIG, CloudFrontend(), backend, config=CONFIG)
-    poses.append(np.array([system.process(f).estimate.T_world_left for f in frames]).tobytes())
-    assert poses[0] == poses[1] == poses[2]
-
-
 def test_a_frame_that_cannot_be_extracted_ends_a_run_after_the_frames_before_it():
     system = StereoSlam(RIG, CloudFrontend(broken=5), "ekf", config=CONFIG)
     done = []

@@ -16,7 +16,6 @@ from slam.evaluation.metrics import (
     Statistics,
     absolute_errors,
     associate,
-    chi_square_band,
     relative_errors,
     segment_errors,
 )
@@ -216,12 +215,6 @@ def test_segments_follow_kitti_s_definition() -> None:
 
 
 # ------------------------------------------------------------------------------------------- consistency
-
-
-def test_chi_square_band_of_a_table() -> None:
-    assert chi_square_band(6, 1, 0.95) == pytest.approx((1.237, 14.449), abs=1e-3)
-    low, high = chi_square_band(6, 50)
-    assert 5 < low < 6 < high < 7.1
 
 
 # ------------------------------------------------------------------------------------------- real data

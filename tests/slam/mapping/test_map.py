@@ -72,12 +72,6 @@ def test_erase_what_is_missed_or_seldom_seen():
     assert bad_landmarks(rows, config).tolist() == [False, True, True, False, False]
 
 
-def test_what_was_hardly_ever_seen_does_not_stay():
-    unseen = [7, 7, *range(6, -1, -1)]
-    rows = rows_with(seen=[5, 6, *[5] * 7], in_view=[6] * 9, missed=[0] * 9, unseen=unseen)
-    assert bad_landmarks(rows, MapConfig(confirmed=6)).tolist() == [True, False, True, *[False] * 6]
-
-
 def test_frames_unseen_are_counted_though_the_others_are_seen_in_every_one():
     """Landmark 0 is out of view while 80 others are tracked; frames in which nothing is measured do not count."""
     none, others = np.zeros(0, np.int64), np.arange(1, 81)
@@ -144,12 +138,6 @@ def test_out_of_view_the_map_is_thinned_to_the_best_seen():
     assert not crowded_landmarks(rows, apart, config).any()
     unknown = rows_with(seen=rows.seen, unseen=rows.unseen)
     assert not crowded_landmarks(unknown, positions, config).any()
-
-
-def test_of_equally_well_seen_ones_the_older_stays():
-    rows = rows_with(seen=[5, 5, 5, 5], unseen=[2, 2, 1, 0], seen_from=np.zeros((4, 3)))
-    positions = np.array([[0, 0, 2], [0.05, 0, 2], [1, 0, 2], [2, 0, 2.0]])
-    assert crowded_landmarks(rows, positions, MapConfig(erase_missed=1)).tolist() == [False, True, False, False]
 
 
 def test_what_looks_as_it_did():

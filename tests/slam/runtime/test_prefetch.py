@@ -15,13 +15,6 @@ def threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "prefetch"}
 
 
-def test_the_same_items_in_the_same_order():
-    before = threads()
-    assert list(prefetch(range(100))) == list(range(100))
-    assert list(prefetch([])) == []
-    assert threads() <= before
-
-
 def test_an_item_is_made_while_the_one_before_is_used():
     made = threading.Event()
 
