@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Any, get_args
 
+from slam.bounds import field_types, type_fault
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.config import MapConfig
-from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for, require_not_negative
+from slam.models import EstimatorModels, models_for, require_not_negative
 from slam.objects.config import ObjectsConfig
 from slam.settings import apply_settings
 from slam.tracks.config import AssociationConfig
@@ -75,8 +75,6 @@ class SystemConfig:
     frontend: dict[str, Any] = field(default_factory=dict)
     backend: dict[str, Any] = field(default_factory=dict)
 
-    __pydantic_config__ = FORBID_UNKNOWN
-
     def __post_init__(self) -> None:
         require_not_negative(self)
         for section in ("frontend", "backend"):
@@ -113,12 +111,7 @@ class SystemConfig:
             ConfigurationError: a key is unknown, or no longer a setting and of another value than now, or a value is of
                 the wrong type or out of range.
         """
-        from pydantic import TypeAdapter, ValidationError
-
-        try:
-            return TypeAdapter(cls).validate_python(_without_fixed(tree))
-        except ValidationError as error:
-            raise ConfigurationError(_refused(error.errors()[0])) from None
+        return _built(cls, _without_fixed(tree), "")
 
     def with_settings(self, settings: list[str]) -> SystemConfig:
         """A copy with ``section.key=value`` settings applied, for instance ``map.max_landmarks=300``.
@@ -162,19 +155,27 @@ def _without_fixed(tree: dict[str, Any]) -> dict[str, Any]:
     return kept
 
 
-#: What is required of a setting, by pydantic's name of the fault.
-_WANTED = {
-    "int": "a whole number", "float": "a number", "finite": "a finite number", "bool": "true or false",
-    "string": "a text", "list": "a list", "tuple": "a list", "is": "a list", "dict": "an object", "none": "null",
-}  # fmt: skip
+def _built(kind: type, tree: Any, where: str) -> Any:
+    """A configuration class's instance from a tree of plain types; `where` is the section, for messages."""
+    if not isinstance(tree, dict):
+        raise ConfigurationError(f"setting {where}: must be an object, got {tree!r:.80}")
+    hints, values = field_types(kind), {}
+    for key, value in tree.items():
+        name, hint = f"{where}.{key}".lstrip("."), hints.get(key)
+        if hint is None:
+            raise ConfigurationError(f"setting {name}: there is no such setting in this version")
+        if is_dataclass(hint):
+            values[key] = _built(hint, value, name)
+            continue
+        if fault := type_fault(value, hint):
+            raise ConfigurationError(f"setting {name}: must be {fault}, got {value!r:.80}")
+        values[key] = _plain(value, hint)
+    return kind(**values)
 
 
-def _refused(fault: Mapping[str, Any]) -> str:
-    """The line for a value that pydantic refuses: the setting, what it must be, and what it is."""
-    where = ".".join(str(part) for part in fault["loc"])
-    if fault["type"] == "unexpected_keyword_argument":
-        return f"setting {where}: there is no such setting in this version"
-    wanted = _WANTED.get(fault["type"].partition("_")[0])
-    if wanted is None:
-        return f"setting {where}: {fault['msg']}"
-    return f"setting {where}: must be {wanted}, got {fault['input']!r:.80}"
+def _plain(value: Any, hint: Any) -> Any:
+    """A value with whole numbers and lists of JSON turned into what a field of this type holds."""
+    if isinstance(value, list):
+        inner = float if float in get_args(hint) else None
+        return tuple(_plain(each, inner) for each in value)
+    return float(value) if hint is float and not isinstance(value, bool) else value
