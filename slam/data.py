@@ -294,8 +294,7 @@ class Estimate:
         T_world_left: pose (4, 4).
         covariance: its covariance (6, 6): rotation [rad], then translation [m], in the left camera's axes.
         ids: landmark ids (N,), ascending.
-        positions: landmark positions in world coordinates (N, 3) [m].
-        covariances: their marginal covariances (N, 3, 3) [m²].
+        positions, covariances: of the landmarks in the world (N, 3) [m], and their marginal ones (N, 3, 3) [m²].
     """
 
     stamp: float

@@ -11,7 +11,7 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,6 +56,7 @@ class _Kind(NamedTuple):
     least: float  # bounds of its entries
     most: float
     what: str = ""  # "pose" or "covariance" where each row must be one; "unknown" where entries may be NaN
+    field: str = ""  # attribute of a keyframe or loop that it holds
 
 
 #: Arrays of the landmarks.
@@ -67,23 +68,26 @@ _LANDMARKS = {
     "seen_from": _Kind(np.float64, "n3", -_FAR, _FAR, "unknown"),
 }  # fmt: skip
 
-#: Scalars, poses and covariances by keyframe, features of all keyframes in succession, and loops.
+#: Keyframes by their attributes, the features of all of them in succession, and loops.
 _PLACES = {
-    "keyframe_stamps": _Kind(np.float64, "k", -_GREATEST, _GREATEST),
+    "keyframe_stamps": _Kind(np.float64, "k", -_GREATEST, _GREATEST, field="stamp"),
     "keyframe_poses": _Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
-    "keyframe_odometry": _Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
-    "keyframe_covariances": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance"),
-    "keyframe_steps": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance"),
-    "keyframe_shares": _Kind(np.float64, "k6m", -_GREATEST, _GREATEST),
-    "keyframe_travelled": _Kind(np.float64, "k", -_FAR, _FAR),
-    "keyframe_depths": _Kind(np.float64, "k", np.nextafter(0, 1), _FAR),
+    "keyframe_odometry": _Kind(np.float64, "k44", -_FAR, _FAR, "pose", "T_odom_left"),
+    "keyframe_covariances": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance", "covariance"),
+    "keyframe_steps": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance", "step_covariance"),
+    "keyframe_shares": _Kind(np.float64, "k6m", -_GREATEST, _GREATEST, field="jacobian"),
+    "keyframe_travelled": _Kind(np.float64, "k", -_FAR, _FAR, field="travelled"),
+    "keyframe_depths": _Kind(np.float64, "k", np.nextafter(0, 1), _FAR, field="depth"),
     "keyframe_features": _Kind(np.int64, "k", 0, MOST_ID),
-    "place_points": _Kind(np.float32, "f3", -_FAR, _FAR), "place_descriptors": _Kind(np.float16, "fd", -_HALF, _HALF),
-    "place_laplacian": _Kind(np.int8, "f", -128, 127), "place_landmarks": _Kind(np.int64, "f", -1, MOST_ID),
-    "loop_pairs": _Kind(np.int64, "l2", 0, MOST_ID), "loop_motions": _Kind(np.float64, "l44", -_FAR, _FAR, "pose"),
-    "loop_covariances": _Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance"),
-    "loop_inliers": _Kind(np.int64, "l", 0, MOST_ID),
-}  # fmt: skip
+    "place_points": _Kind(np.float32, "f3", -_FAR, _FAR, field="points"),
+    "place_descriptors": _Kind(np.float16, "fd", -_HALF, _HALF, field="descriptors"),
+    "place_laplacian": _Kind(np.int8, "f", -128, 127, field="laplacian"),
+    "place_landmarks": _Kind(np.int64, "f", -1, MOST_ID, field="landmarks"),
+    "loop_pairs": _Kind(np.int64, "l2", 0, MOST_ID, field="pair"),
+    "loop_motions": _Kind(np.float64, "l44", -_FAR, _FAR, "pose", "T_first_second"),
+    "loop_covariances": _Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance", "covariance"),
+    "loop_inliers": _Kind(np.int64, "l", 0, MOST_ID, field="inliers"),
+}
 
 
 def _require(arrays: Mapping[str, Any], kinds: Mapping[str, _Kind], source: str) -> None:
@@ -298,20 +302,18 @@ def places_to_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
     """Keyframes, their poses in the map, and loops of a map as arrays by the names of `_PLACES`."""
     k, loops = saved.keyframes, saved.loops
     m = max((f.jacobian.shape[1] for f in k), default=0)
-    shares = [f.jacobian if f.jacobian.shape[1] == m else np.zeros((6, m)) for f in k]
+    k = tuple(f if f.jacobian.shape[1] == m else replace(f, jacobian=np.zeros((6, m))) for f in k)
     sizes = {"k": len(k), "m": m, "l": len(loops), "d": saved.dimensions, "f": sum(map(len, k))}
-    names = ("points", "descriptors", "laplacian", "landmarks")
-    columns: list[Any] = [
-        [f.stamp for f in k], saved.keyframe_poses, [f.T_odom_left for f in k], [f.covariance for f in k],
-        [f.step_covariance for f in k], shares, [f.travelled for f in k], [f.depth for f in k], [len(f) for f in k],
-        *(np.concatenate([getattr(f, name) for f in k]) if k else () for name in names),
-        [x.pair for x in loops], [x.T_first_second for x in loops], [x.covariance for x in loops],
-        [x.inliers for x in loops],
-    ]  # fmt: skip
-    return {
-        name: np.array(column, kind.dtype).reshape([sizes[c] if c.isalpha() else int(c) for c in kind.shape])
-        for (name, kind), column in zip(_PLACES.items(), columns)
-    }
+    whole = {"keyframe_poses": saved.keyframe_poses, "keyframe_features": [len(f) for f in k]}
+    arrays = {}
+    for name, kind in _PLACES.items():
+        values: Any = whole.get(name)
+        if values is None:
+            values = [getattr(x, kind.field) for x in (loops if kind.shape[0] == "l" else k)]
+            values = np.concatenate(values) if kind.shape[0] == "f" and values else values
+        shape = [sizes[c] if c.isalpha() else int(c) for c in kind.shape]
+        arrays[name] = np.array(values, kind.dtype).reshape(shape)
+    return arrays
 
 
 def places_from_arrays(arrays: Mapping[str, np.ndarray], source: str) -> dict[str, Any]:
@@ -320,22 +322,24 @@ def places_from_arrays(arrays: Mapping[str, np.ndarray], source: str) -> dict[st
     Raises:
         SlamError: the arrays do not fit together, or a value is impossible; `source` names them in the message.
     """
-    a = arrays
-    _require(a, {"descriptors": _LANDMARKS["descriptors"]} | _PLACES, source)
-    begin, pairs = np.concatenate([[0], np.cumsum(a["keyframe_features"])]).astype(int), a["loop_pairs"]
-    if begin[-1] != len(a["place_points"]):
+    _require(arrays, {"descriptors": _LANDMARKS["descriptors"]} | _PLACES, source)
+    begin = np.concatenate([[0], np.cumsum(arrays["keyframe_features"])]).astype(int).tolist()
+    pairs = arrays["loop_pairs"]
+    if begin[-1] != len(arrays["place_points"]):
         raise SlamError(f"{source}: the keyframes have other features than there are")
     if (pairs >= len(begin) - 1).any() or (pairs[:, :1] >= pairs[:, 1:]).any():
         raise SlamError(f"{source}: a loop is between keyframes that there are not")
-    keyframes = tuple(
-        Keyframe(
-            -1, float(a["keyframe_stamps"][i]), a["keyframe_odometry"][i], a["keyframe_covariances"][i],
-            a["keyframe_steps"][i], a["keyframe_shares"][i], float(a["keyframe_travelled"][i]),
-            float(a["keyframe_depths"][i]), a["place_points"][s], a["place_descriptors"][s], a["place_laplacian"][s],
-            a["place_landmarks"][s],
-        )
-        for i, s in enumerate(slice(x, y) for x, y in pairwise(begin))
-    )  # fmt: skip
-    columns = pairs.tolist(), a["loop_motions"], a["loop_covariances"], a["loop_inliers"].tolist()
-    loops = tuple(Loop(first, second, *rest) for (first, second), *rest in zip(*columns))
-    return {"keyframes": keyframes, "keyframe_poses": a["keyframe_poses"], "loops": loops}
+
+    def fields_of(sizes: dict[str, Any]) -> dict[str, Any]:
+        """Fields of a keyframe or loop, given its row, or the slice of its rows, in arrays of each size."""
+        found = {k.field: arrays[name][sizes[k.shape[0]]] for name, k in _PLACES.items() if k.shape[0] in sizes}
+        return {name: x.item() if x.ndim == 0 else x for name, x in found.items() if name}
+
+    spans = [slice(*span) for span in pairwise(begin)]
+    keyframes = tuple(Keyframe(-1, **fields_of({"k": i, "f": span})) for i, span in enumerate(spans))
+    loops = []
+    for i, (first, second) in enumerate(pairs.tolist()):
+        fields = fields_of({"l": i})
+        del fields["pair"]
+        loops.append(Loop(first, second, **fields))
+    return {"keyframes": keyframes, "keyframe_poses": arrays["keyframe_poses"], "loops": tuple(loops)}
