@@ -17,7 +17,7 @@ from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, Loop, kept_features, step_covariance, view_has_changed
-from slam.mapping.atlas.verification import Verified, alike, keyframe_landmarks, verify
+from slam.mapping.atlas.verification import Verified, keyframe_landmarks, verify
 from slam.mapping.mapper import OldPlace
 from slam.mapping.selection import depth_is_known
 from slam.mapping.step import Step
@@ -25,6 +25,7 @@ from slam.models import EstimatorModels
 from slam.rig_error import Correction
 from slam.runtime.blas import one_blas_thread
 from slam.tracks.config import AssociationConfig
+from slam.tracks.follow import match_everywhere
 from slam.tracks.localizer import Localizer
 
 _NEARBY = 4  # cost: keyframes compared because they are near the path, besides those that look alike
@@ -229,7 +230,9 @@ class LoopCloser:
 
     def _ranked(self, atlas: Atlas, likely: NDArray[np.intp], features: StereoFeatures) -> NDArray[np.intp]:
         """The keyframes with most matches by descriptor, if there are enough of them, best first."""
-        number = np.array([alike(atlas.keyframes[k], features, self._localizer.config) for k in likely], int)
+        seen, config = [atlas.keyframes[k] for k in likely.tolist()], self._localizer.config
+        found = [match_everywhere(k.descriptors.astype(np.float32), k.laplacian, features, config) for k in seen]
+        number = np.array([len(matches) for matches in found], int)
         order = np.argsort(-number, kind="stable")[:_VERIFIED]
         return likely[order[number[order] >= self._config.inliers]]
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, hat, inverse, log
-from slam.mapping.atlas.chain import Chain, Propagated, spread
+from slam.mapping.atlas.chain import Chain, spread
 from slam.mapping.atlas.keyframes import Loop
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class PoseGraph:
     chain: Chain  # the path
     loops: tuple[Loop, ...]  # in the graph
     ends: NDArray[np.intp]  # keyframes (M,) whose poses are variables; the first one is fixed and defines the map
-    propagated: Propagated  # errors within the stretches between them
+    propagated: tuple[Array, Array]  # errors within the stretches between them
     motions: _Motions  # the equations
     poses: Array  # T_map_left of the keyframes that are variables (M, 4, 4)
     common: Array  # the common errors (m,)
@@ -124,10 +124,10 @@ class _Motions:
     common: Array  # derivative of the motions by the common errors (E, 6, m)
 
     @classmethod
-    def of(cls, chain: Chain, loops: Sequence[Loop], ends: NDArray[np.intp], propagated: Propagated) -> _Motions:
+    def of(cls, chain: Chain, loops: Sequence[Loop], ends: NDArray[np.intp], errors: tuple[Array, Array]) -> _Motions:
         begin, end = ends[:-1], ends[1:]
-        common = propagated.common[end]
-        covariances = np.concatenate([propagated.noise[end], np.array([x.covariance for x in loops]).reshape(-1, 6, 6)])
+        noise, common = (part[end] for part in errors)
+        covariances = np.concatenate([noise, np.array([x.covariance for x in loops]).reshape(-1, 6, 6)])
         motions = inverse(chain.poses[begin]) @ chain.poses[end]
         return cls(
             np.searchsorted(ends, [*begin, *(x.first for x in loops)]),

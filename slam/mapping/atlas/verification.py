@@ -12,8 +12,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, covariance_growth
-from slam.tracks.config import AssociationConfig
-from slam.tracks.follow import Matches, match_everywhere
+from slam.tracks.follow import Matches
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
 from slam.window.pose_only import PoseProblem, least_squares, whitened_residuals
@@ -31,11 +30,6 @@ class Verified:
     covariance: Array  # of that pose (6, 6), perturbing on the right
     noise: Array  # the part of the covariance (6, 6) due to the features' own errors in both frames
     matches: Matches  # inliers, as rows of the keyframe's features and of the present frame's
-
-
-def alike(keyframe: Keyframe, features: StereoFeatures, config: AssociationConfig) -> int:
-    """Number of matches by descriptor alone between a keyframe and the present frame."""
-    return len(match_everywhere(keyframe.descriptors.astype(np.float32), keyframe.laplacian, features, config))
 
 
 def verify(

@@ -102,9 +102,6 @@ def test_ate_of_a_nearly_straight_path_equals_evo_s() -> None:
     assert_equal_to_evo(ours.translation_statistics, ape.get_all_statistics())
 
 
-# ------------------------------------------------------------------------------------------- alignment
-
-
 def assert_proper(R: np.ndarray) -> None:
     assert np.allclose(R @ R.T, np.eye(len(R)), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1, abs=1e-12)
@@ -147,9 +144,6 @@ def test_a_straight_path_is_turned_as_its_orientations_say(count: int, seed: int
     assert errors.rotation.max() < 1e-5  # [deg]
 
 
-# ------------------------------------------------------------------------------------------- common stamps
-
-
 def test_association_by_nearest_stamp() -> None:
     truth = straight(10)
     stamps = np.array([-0.5, 0.995, 2.004, 2.02, 3.5, 8.0, 9.3])
@@ -171,9 +165,6 @@ def test_association_with_interpolated_truth() -> None:
     assert true.positions[:, 2] == pytest.approx([0.25, 2.004, 3.5, 9.0])
     ours, _ = associate(estimate, truth, tolerance=0.3, interpolated=True)
     assert ours.stamps.tolist() == [0.25, 2.004, 9.0]
-
-
-# ------------------------------------------------------------------------------------------- RPE and segments
 
 
 def kitti_development_kit(
@@ -209,15 +200,6 @@ def test_segments_follow_kitti_s_definition() -> None:
         assert np.allclose(ours.translation[own], rows[:, 1], atol=1e-9)
         assert np.allclose(ours.rotation[own], rows[:, 2], atol=1e-7)  # arccos loses half the digits near 0
     assert ours.mean_translation == pytest.approx(theirs[:, 1].mean(), abs=1e-9)
-
-
-# ------------------------------------------------------------------------------------------- GPS
-
-
-# ------------------------------------------------------------------------------------------- consistency
-
-
-# ------------------------------------------------------------------------------------------- real data
 
 
 def test_the_ends_of_a_path_that_was_written_and_read_again_keep_their_truth() -> None:
