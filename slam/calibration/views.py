@@ -48,38 +48,26 @@ class View:
     @classmethod
     def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array, most: int) -> View:
         """Of the strongest features as measured, `most` at the most, at a pose (4, 4) of the left camera."""
-        rectified_rig = model.rig.rectified
-        rows = np.flatnonzero(features.has_stereo)
+        rectified, rows = model.rig.rectified, np.flatnonzero(features.has_stereo)
         if len(rows) > most:
             rows = np.sort(rows[np.argsort(-features.response[rows], kind="stable")[:most]])
-        left, right = (
-            rectified_rig.rectify_left(features.uv_left[rows]),
-            rectified_rig.rectify_right(features.uv_right[rows]),
-        )
-        points = model.points(np.column_stack([left, right[:, 0]]))
-        vertical = right[:, 1] - left[:, 1]
+        left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
+        points, vertical = model.points(np.column_stack([left, right[:, 0]])), right[:, 1] - left[:, 1]
         good = np.isfinite(points).all(axis=1) & np.isfinite(vertical)
-        rows = rows[good]
-        return cls(
-            points[good],
-            vertical[good],
-            features.descriptors[rows],
-            features.laplacian[rows],
-            T_world_left @ rectified_rig.T_left_rectified,
-        )
+        rows, T = rows[good], T_world_left @ rectified.T_left_rectified
+        return cls(points[good], vertical[good], features.descriptors[rows], features.laplacian[rows], T)
 
 
 def match(first: View, second: View) -> Rows:
     """Rows of features matched in two views: mutual nearest neighbours that pass the ratio test."""
     if min(len(first), len(second)) < 2 or not first.descriptors.shape[1]:
         return NO_MATCHES
-    found = [
-        (rows[i], others[j])
-        for sign, (rows, descriptors) in first.by_sign.items()
-        if sign in second.by_sign
-        for others, other_descriptors in (second.by_sign[sign],)
-        for i, j in (_nearest(descriptors, other_descriptors),)
-    ]
+    found = []
+    for sign, (rows, looks) in first.by_sign.items():
+        if sign in second.by_sign:
+            others, other_looks = second.by_sign[sign]
+            i, j = _nearest(looks, other_looks)
+            found.append((rows[i], others[j]))
     a, b = (np.concatenate([pair[k] for pair in found] or [np.zeros(0, np.intp)]) for k in (0, 1))
     order = np.argsort(a)
     return a[order], b[order]

@@ -143,7 +143,10 @@ def interpolated(true: Trajectory, noise: TruthNoise) -> BoolArray:
     motion = inverse(true.poses[:-1]) @ true.poses[1:]
     change = np.linalg.norm(np.diff(so3_log(motion[:, :3, :3]), axis=0), axis=1)
     moves = np.linalg.norm(motion[:, :3, 3], axis=1) > noise.translation
-    ratio = np.where(moves[:-1] & moves[1:], change / max(float(np.quantile(change, _LARGE)), _LEAST), np.inf)
+    large = float(np.quantile(change, _LARGE))
+    if large < _LEAST:
+        return made_up
+    ratio = np.where(moves[:-1] & moves[1:], change / large, np.inf)
     run = np.cumsum(ratio >= _NEARLY)  # the number of each run of nearly even changes
     made_up[1:-1] = (ratio < _NEARLY) & np.isin(run, run[ratio < _EVEN])
     made_up[0], made_up[-1] = made_up[1], made_up[-2]
