@@ -155,7 +155,7 @@ def _without_fixed(tree: dict[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def _built(kind: type, tree: Any, where: str) -> Any:
+def _built(kind: Any, tree: Any, where: str) -> Any:
     """A configuration class's instance from a tree of plain types; `where` is the section, for messages."""
     if not isinstance(tree, dict):
         raise ConfigurationError(f"setting {where}: must be an object, got {tree!r:.80}")

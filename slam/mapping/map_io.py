@@ -305,7 +305,7 @@ def places_to_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
     k = tuple(f if f.jacobian.shape[1] == m else replace(f, jacobian=np.zeros((6, m))) for f in k)
     sizes = {"k": len(k), "m": m, "l": len(loops), "d": saved.dimensions, "f": sum(map(len, k))}
     whole = {"keyframe_poses": saved.keyframe_poses, "keyframe_features": [len(f) for f in k]}
-    arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     for name, kind in _PLACES.items():
         values: Any = whole.get(name)
         if values is None:
