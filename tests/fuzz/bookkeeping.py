@@ -45,7 +45,7 @@ class Books:
             atlas=AtlasConfig(enabled=bool(rng.random() < 0.3)),
         )  # fmt: skip
         self.loops = config.atlas.enabled
-        self.system = StereoSlam(rig, None, choose(rng, ("ekf", "smoother", "window")), config=config)
+        self.system = StereoSlam(rig, None, choose(rng, ("ekf", "ekf", "smoother")), config=config)
         self.stamps: list[float] = []
         self.map: set[int] = set()
         self.ever: set[int] = set()
