@@ -194,12 +194,9 @@ def frame_result(
 ) -> FrameResult:  # fmt: skip
     """The result of a step.
 
-    Args:
-        step: the frame, after all stages.
-        mapped_before: whether there ever was a landmark before this frame.
-        revision: change of the correction of earlier frames' pixels before the step; None without one.
-        milliseconds: wall time per stage.
-        common: the part of the pose's error that it shares with the poses reported in other frames.
+    `mapped_before` says whether there ever was a landmark before; `revision` is the change of earlier pixels'
+    correction before the step, `common` the part of the pose's error that it shares with the poses reported in other
+    frames.
     """
     atlas, objects = step.atlas, step.objects
     if atlas.loops:

@@ -139,11 +139,9 @@ class SelfCalibration:
         return replace(now, uv_left=uv_left, uv_right=uv_right)
 
     def observe(self, features: StereoFeatures, T_world_left: Array) -> None:
-        """Learn from one frame.
+        """Learn from one frame's features as measured, not corrected.
 
-        Args:
-            features: of the frame as measured, not corrected.
-            T_world_left: the left camera's pose (4, 4) by the system, an initial guess.
+        `T_world_left` (4, 4) is the left camera's pose by the system, a first guess.
         """
         if not self.config.enabled:
             return

@@ -105,9 +105,7 @@ class Accumulator:
 
         About a solution that the prior holds elsewhere all gradients point the same way, which is no scatter.
 
-        Args:
-            mean: of the parameters (n,), near that solution or not.
-            covariance: of the parameters, residual fields left out (n, n).
+        `mean` (n,) is near that solution or not; `covariance` (n, n) is without residual fields.
         """
         count = len(self._blocks)
         if count < 2:
@@ -144,11 +142,8 @@ def student_weights(squared: Array, dof: int, least: float) -> Array:
 def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> tuple[Evidence, Evidence]:
     """Likelihood of the parameters by one frame's vertical disparities, which an ideal rectified pair does not have.
 
-    Args:
-        model: the parameters' meaning.
-        points: ``(x, y, d)`` (N, 3) [px] of the matches, as measured.
-        vertical: right row less left row (N,) [px], as measured.
-        parameters: the values (n,) at which outliers are identified.
+    `points` ``(x, y, d)`` (N, 3) [px] of the matches and `vertical`, right row less left row (N,) [px], are as
+    measured; outliers are identified at `parameters` (n,).
 
     Returns:
         The evidence of the parameters (n), and of them followed by the right camera's residual fields of y (n + k). The

@@ -60,13 +60,9 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
 
     Points are weighted by Student's t distribution, whose scale is estimated.
 
-    Args:
-        first: points ``(x, y, d)`` (N, 3) [px] of an ideal rig.
-        second: the same points in the second view.
-        R: first guess of the rotation (3, 3).
-        t: of the translation (3,) [baselines].
-        focal: focal length [px].
-        noise: covariance of a point (3, 3) [px²]; only its form matters.
+    `first` and `second` are the same points ``(x, y, d)`` (N, 3) [px] of an ideal rig with a focal length `focal` [px],
+    `R` (3, 3) and `t` (3,) [baselines] a first guess. Of the `noise`, a point's covariance (3, 3) [px²], only the form
+    matters.
     """
     from slam.calibration.motion_kernels import move_points
 
@@ -100,11 +96,7 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
     estimated points, not at the measured ones: else the noise would be correlated with the Jacobian, and the result
     biased.
 
-    Args:
-        model: the parameters' meaning.
-        pair: the views.
-        parameters: where to linearise (n,).
-        noise: covariance of a point (3, 3) [px²]; only its form matters, the scale is estimated.
+    It is linearised at `parameters` (n,). Of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
     """
     first, second = (points + model.shift(points, parameters) for points in (pair.first, pair.second))
     fit = fit_motion(first, second, pair.R, pair.t, model.focal, noise)

@@ -92,9 +92,7 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
     which cannot be observed as directly, are taken to be as large as those across. Errors of neighbouring frames are
     taken to be independent; where they are not, the fields and so the uncertainty are overestimated.
 
-    Args:
-        prior: of the parameters.
-        rows: evidence of the parameters and of the fields across the rows (n + k).
+    `rows` is the evidence of the parameters and of the fields across the rows (n + k).
     """
     n = len(prior.mean)
     known, shared = prior.information[-1] + rows.S[:n, :n], rows.S[:n, n:]

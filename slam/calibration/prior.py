@@ -79,10 +79,7 @@ def factory_prior(model: RigModel) -> Prior:
 def resumed_prior(model: RigModel, mean: Array, covariance: Array) -> Prior:
     """Prior of a rig calibrated by earlier recordings; its cameras may have rotated since.
 
-    Args:
-        model: the parameters' meaning.
-        mean: of the parameters, by the recordings (n,).
-        covariance: of the mean (n, n).
+    `mean` (n,) of the parameters and its `covariance` (n, n) are by those recordings.
     """
     sigma = offset_sigma(model)
     turned = np.array(_OFFSETS)

@@ -94,14 +94,9 @@ def pair_of(
 
     The motion of the system's poses is tried first; others are tried only if most matches disagree with it.
 
-    Args:
-        model: the parameters' meaning.
-        first: the earlier view.
-        second: the later view.
-        parameters: of the rig (n,), as known so far.
-        noise: covariance (3, 3) of a point [px²]; only its form matters.
-        seed: of the random choice in the geometric check.
-        matched: features that look alike, where that is known already.
+    The rig is corrected by `parameters` (n,). Of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
+    `seed` is of the random choice in the geometric check; `matched` are features that look alike, where that is known
+    already.
     """
     a, b = match(first, second) if matched is None else matched
     one, two = first.points[a], second.points[b]

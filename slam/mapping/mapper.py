@@ -118,12 +118,7 @@ class Mapper:
     def reconcile(self, backend: Backend, landmarks: LandmarkTable | None) -> LandmarkTable | None:
         """Make rows and back end agree after an interrupted step: landmarks that only one of them has are erased.
 
-        Args:
-            backend: as the interrupted step left it, after its prediction.
-            landmarks: the rows before the step.
-
-        Returns:
-            the rows that stay.
+        The back end is as that step left it, the rows are those before it; those that stay are returned.
         """
         if self._monocular is not None:
             self._monocular = self._new_monocular()

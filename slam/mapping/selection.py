@@ -17,13 +17,8 @@ def new_landmarks(
 ) -> NDArray[np.intp]:
     """Rows of the features that become landmarks.
 
-    Args:
-        features: of the frame.
-        free: which features belong to no landmark (N,).
-        occupied: pixels of the landmarks in view (M, 2), the measured ones first.
-        rig: the cameras, for the depth's uncertainty.
-        pixel_sigma: noise of uL, vL, uR [px].
-        config: settings.
+    `free` (N,) says which features belong to no landmark; `occupied` (M, 2) are pixels of the landmarks in view, the
+    measured ones first.
     """
     wanted = config.target_in_view - len(occupied)
     if wanted <= 0 or not len(features):

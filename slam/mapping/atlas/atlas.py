@@ -59,9 +59,8 @@ class MapAnchor:
 
         The path since the anchor is not corrected by the common errors, so their estimate counts as an error too.
 
-        Args:
-            back: adjoint (6, 6) of the anchor's pose in the later one's coordinates.
-            shares: derivative (6, m) of the motion since by the rig's errors.
+        `back` (6, 6) is the adjoint of the anchor's pose in the later one's coordinates, `shares` (6, m) the derivative
+        of the motion since by the rig's errors.
         """
         J = np.concatenate([back, shares @ self.rig.root], axis=1)
         found = shares @ self.rig.root @ self.common
@@ -111,10 +110,8 @@ class Atlas:
     def of_earlier_run(cls, keyframes: Sequence[Keyframe], poses: Array, loops: Sequence[Loop] = ()) -> Atlas:
         """The places of a saved map.
 
-        Args:
-            keyframes: with poses in the frame of the back end that estimated them.
-            poses: of the keyframes in the map (K, 4, 4).
-            loops: that gave these poses.
+        Its keyframes have poses in the frame of the back end that estimated them; `poses` (K, 4, 4) are those in the
+        map, which `loops` gave.
         """
         atlas = cls()
         for keyframe in keyframes:
@@ -200,9 +197,7 @@ class Atlas:
     def relocalized(self, gap: TrackingGap, place: float | None) -> Atlas:
         """A copy with a gap after which the camera was found in the map.
 
-        Args:
-            gap: which has just ended.
-            place: time of the keyframe by which it was found [s]; None if it was found by the back end's landmarks.
+        `place` [s] is the time of the keyframe by which it was found; None if it was found by the back end's landmarks.
         """
         anchor = self.anchor
         if place is not None:
@@ -215,12 +210,9 @@ class Atlas:
     ) -> Atlas:
         """A copy with a new back end from here on, which takes its first pose for exact; in the map it is uncertain.
 
-        Args:
-            since: time of the last measured pose [s].
-            before: the earlier back end's last estimate, with the rig's uncertainty.
-            after: the new back end's first estimate, at the same pose.
-            common: the part of the pose's error that other frames share.
-            models: motion model, with the speeds of a camera of this kind.
+        `since` [s] is the time of the last measured pose; `before` the earlier back end's last estimate, with the rig's
+        uncertainty, `after` the new one's first, at the same pose; `common` the part of the pose's error that other
+        frames share.
         """
         n = common.root.shape[1]
         error, known = (np.zeros(n), np.eye(n)) if self.anchor is None else self.anchor.belief(common)
@@ -243,9 +235,8 @@ class Atlas:
     def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as estimated at the time, or as revised in `path`.
 
-        Args:
-            rig: what the common errors stand for now.
-            path: the present estimate of the whole path; None for the poses as they were estimated at the time.
+        `rig` says what the common errors stand for now. Without a path the poses are as they were estimated at the
+        time.
         """
         poses, count, m = self.poses.copy(), len(self), len(rig.root)
         if path is not None:
@@ -270,10 +261,8 @@ class Atlas:
     def estimate(self, estimate: Estimate, common: CommonError, gaps: bool = True) -> Estimate:
         """An estimate in odom, transformed to the map; its covariance is propagated from the anchor, if there is one.
 
-        Args:
-            estimate: with covariances by noise and by the common errors.
-            common: the part of the pose's error that other frames share.
-            gaps: whether landmarks also get the uncertainty of the pose at which their map begins, which all share.
+        Its covariances are by noise and by the `common` errors. With `gaps`, landmarks also get the uncertainty of the
+        pose at which their map begins, which all share.
         """
         if self.anchor is None:
             return estimate
@@ -315,10 +304,7 @@ def covariance_after_unseen_motion(covariance: Array, duration: float, models: E
     motion model's initial velocity uncertainty acts throughout the gap as well, up to a wholly unknown direction and
     position.
 
-    Args:
-        covariance: by the motion model (6, 6).
-        duration: of the gap [s].
-        models: motion model, with the speeds of a camera of this kind.
+    `covariance` (6, 6) is by the motion model, `duration` [s] that of the gap.
     """
     speeds = np.array([models.initial_angular_velocity_sigma, models.initial_velocity_sigma])
     most = np.array([_UNKNOWN_DIRECTION, ANYWHERE])

@@ -72,12 +72,8 @@ def spread(chain: Chain, ends: NDArray[np.intp], propagated: tuple[Array, Array]
 
     Each motion gets its part by the common errors; the rest is distributed in proportion to the noise.
 
-    Args:
-        chain: the path.
-        ends: the keyframes (M,) that bound stretches.
-        propagated: see `Chain.propagated`.
-        moved: their new poses (M, 4, 4).
-        common: the common errors (m,).
+    `ends` (M,) are the keyframes that bound stretches, `moved` (M, 4, 4) their new poses, `common` (m,) the common
+    errors; for `propagated` see `Chain.propagated`.
     """
     number = np.arange(len(chain.poses))
     at = np.maximum(np.searchsorted(ends, number), 1) - 1  # row of each keyframe's stretch

@@ -132,12 +132,8 @@ def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array, limi
     Loops that join shrink the path's covariance, against which the next ones are tested. It is empty if the seed
     contradicts the path.
 
-    Args:
-        chain: the path.
-        loops: to choose from.
-        seed: the loop that must be in the set.
-        start: poses (K, 4, 4) of all keyframes, at which the graph is first linearised.
-        limit: largest squared Mahalanobis distance of a loop from the pose graph.
+    `start` (K, 4, 4) are poses of all keyframes, at which the graph is first linearised; `limit` is the largest squared
+    Mahalanobis distance of a loop from the pose graph.
     """
     others = sorted((x for x in loops if x is not seed), key=lambda x: (abs(x.second - seed.second), x.first))
     also = [k for x in others for k in x.pair]
@@ -164,10 +160,8 @@ def spaced(loops: Sequence[Loop], travelled: Array, apart: Array) -> list[Loop]:
 
     Loops at one place are not independent evidence: they see the same things, or the same lookalikes.
 
-    Args:
-        loops: all of them.
-        travelled: length of the path up to each keyframe (K,) [m].
-        apart: distance from each keyframe (K,) [m], along the path, beyond which its place is left.
+    `travelled` (K,) [m] is the length of the path up to each keyframe, `apart` (K,) [m] the distance along it beyond
+    which the keyframe's place is left.
     """
     chosen: list[Loop] = []
     for loop in sorted(loops, key=lambda x: x.second):

@@ -76,11 +76,7 @@ def distance(expected: Array, found: Array, covariance: Array) -> float:
 def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: AtlasConfig) -> bool:
     """Whether a camera's view differs enough from a keyframe's for a new one: other features, or another viewpoint.
 
-    Args:
-        keyframe: the earlier one.
-        motion: pose (4, 4) of the camera in the keyframe's coordinates.
-        rig: the rectified cameras.
-        config: settings.
+    `motion` is the camera's pose (4, 4) in the keyframe's coordinates.
     """
     if np.linalg.norm(motion[:3, 3]) > config.keyframe_distance * keyframe.depth:
         return True
@@ -93,12 +89,8 @@ def kept_features(
 ) -> NDArray[np.intp]:
     """Rows of the features that a keyframe keeps: landmarks first, then the strongest; none that move.
 
-    Args:
-        rows: of features with a depth.
-        response: of all features (N,).
-        landmark_of: id of the landmark that each feature shows (N,), −1 for none.
-        moving: rows of features that move.
-        most: largest number of rows.
+    They are at most `most` of `rows`, which have a depth. `landmark_of` (N,) is the id of the landmark that each
+    feature shows, −1 for none.
     """
     rows = rows[~np.isin(rows, moving)]
     order = np.lexsort((-response[rows], landmark_of[rows] < 0))[:most]
@@ -114,11 +106,6 @@ def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> 
 
     A pose's error has two parts: the path's drift, and an error of its own frame, which the next frame forgets. Q
     holds the drift alone, so that Q of successive steps can be added; loops carry the error of the frames they end at.
-
-    Args:
-        before: the earlier keyframe.
-        T_odom_left: the later pose (4, 4).
-        covariance: of the later pose (6, 6), by noise.
     """
     back = adjoint(inverse(T_odom_left) @ before.T_odom_left)
     return covariance_growth(covariance, back @ before.covariance @ back.T)

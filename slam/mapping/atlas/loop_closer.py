@@ -73,10 +73,7 @@ class LoopCloser:
     def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> tuple[Atlas, OldPlace | None]:
         """The atlas after a frame, and the old features that the frame shows again if it closed a loop.
 
-        Args:
-            atlas: before the frame.
-            step: the frame's result.
-            path: returns the path in odom so far.
+        `path` returns the path in odom so far.
         """
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
         wanted = begins or (not step.tracking.unmatched and self._is_keyframe(atlas, step))
@@ -106,11 +103,7 @@ class LoopCloser:
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
         """Find a camera that may be anywhere by the keyframes; None if no place fits or several do.
 
-        Args:
-            atlas: the places.
-            features: of the frame.
-            correction: with which the features were corrected.
-            seed: of the random choice in the geometric check.
+        `correction` is that of the features; `seed` of the random choice in the geometric check.
         """
         if not self._config.enabled or len(features) < self._config.inliers:
             return None

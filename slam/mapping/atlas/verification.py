@@ -37,13 +37,7 @@ def verify(
 ) -> Verified | None:
     """The present camera's pose relative to a keyframe; None if too few features agree, or all are in one spot.
 
-    Args:
-        keyframe: the older one.
-        features: of the present frame.
-        rig: the cameras.
-        localizer: matches features without a prediction, and finds the inliers.
-        config: settings.
-        seed: of the random choice in the geometric check.
+    `seed` is of the random choice in the geometric check.
     """
     points = keyframe.points.astype(float)
     landmarks = replace(keyframe_landmarks(keyframe), ids=np.arange(len(points)))
