@@ -44,7 +44,7 @@ def consistency_figures(
     """The figures of a run's summary; those that the path is too short for are left out.
 
     One run's errors are correlated over time: its mean may leave the band, which holds for independent ones, without
-    a fault. The first pose defines the world and is left out.
+    a fault. The first pose defines the world and is left out; the start is the first pose whose truth was measured.
 
     Args:
         own: the online path (N poses).
@@ -109,11 +109,10 @@ def stretch_nees(
     estimated = inverse(own.poses[first]) @ own.poses[last]
     residuals = pose_residuals(estimated, inverse(true.poses[first]) @ true.poses[last])
     A = adjoint(inverse(estimated))
-    noises = covariances if common is None else covariances - np.array([one.covariance for one in common])
+    common = common or [CommonError()] * len(own)
+    noises = covariances - np.array([one.covariance for one in common])
     N = noises[last] - A @ noises[first] @ np.swapaxes(A, 1, 2) + truth_covariances(true, noise, first, last, A)
-    G: Array = np.zeros((len(first), _DOF, 0))
-    if common is not None and len(first):
-        N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
+    N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
     N = 0.5 * (N + np.swapaxes(N, 1, 2))
     usable = np.isfinite(residuals).all(axis=1) & ~doubtful(true, noise, first, last)
     usable[usable] = _are_covariances(N[usable]) & _are_covariances(_with(N[usable], G[usable]))
@@ -167,7 +166,7 @@ def _remounted(errors: Array, J: Array, P: Array) -> Array:
 
 def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array) -> tuple[Array, Array]:
     """What errors of unit variance that the poses at their ends share make of relative poses (M)."""
-    N, G = N.copy(), np.zeros((len(ends), _DOF, max(last.root.shape[1] for _, last in ends)))
+    N, G = N.copy(), np.zeros((len(ends), _DOF, max((last.root.shape[1] for _, last in ends), default=0)))
     for row, (a, (first, last)) in enumerate(zip(A, ends)):
         if first.jacobian.shape == last.jacobian.shape:
             G[row, :, : last.root.shape[1]] = (last.jacobian - a @ first.jacobian) @ last.root
