@@ -28,11 +28,12 @@ from slam.data import (
 )
 from slam.errors import ConfigurationError, SlamError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import LEAST_VARIANCE, Array
+from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, MapBackend
 from slam.mapping.atlas.atlas import Atlas, TrackingGap
 from slam.mapping.atlas.loop_closer import Found, LoopCloser
+from slam.mapping.known_landmarks import definite
 from slam.mapping.map_io import SavedMap
 from slam.mapping.mapper import Mapper
 from slam.mapping.step import Step
@@ -275,9 +276,7 @@ def _give_landmarks(old: Backend, new: Backend) -> None:
     """Give all landmarks of a back end to another one."""
     assert isinstance(new, MapBackend)
     whole = old.estimate()
-    covariances = 0.5 * (whole.covariances + np.swapaxes(whole.covariances, 1, 2))
-    short = np.maximum(LEAST_VARIANCE - np.linalg.eigvalsh(covariances)[:, 0], 0)
-    new.insert(whole.ids, whole.positions, covariances + short[:, None, None] * np.eye(3))
+    new.insert(whole.ids, whole.positions, definite(whole.covariances))
 
 
 def _fill(backend: Backend, known: SavedMap) -> None:

@@ -7,10 +7,11 @@ import numpy as np
 from slam.checks import FARTHEST_POSITION
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import LEAST_VARIANCE, Array
 
 _NEAREST = 1e-3  # guard: least depth [m] of a landmark that a camera sees
 _LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having
+_ROUNDING = 1e-14  # numerics: share of a covariance's largest eigenvalue below which the smallest is rounding
 _SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from its transpose
 
 
@@ -35,6 +36,17 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
     ):
         if bad.any():
             raise MeasurementError(f"{backend}: {what.format(ids[bad][0])}")
+
+
+def definite(covariances: Array) -> Array:
+    """Covariances (N, 3, 3) [m²] symmetric and positive definite: what rounding took from the least variance is added.
+
+    A landmark that is hardly known in one direction may have lost its variance in another one.
+    """
+    P = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
+    values = np.linalg.eigvalsh(P)
+    short = np.maximum(np.maximum(LEAST_VARIANCE, _ROUNDING * values[:, 2]) - values[:, 0], 0)
+    return np.asarray(P + short[:, None, None] * np.eye(3))
 
 
 def in_front(local: Array) -> BoolArray:

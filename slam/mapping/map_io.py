@@ -27,7 +27,7 @@ from slam.files import read_bytes, whole_file
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.known_landmarks import require_known
+from slam.mapping.known_landmarks import definite, require_known
 from slam.showing import count
 from slam.tracks.table import LandmarkTable
 from slam.version import __version__
@@ -208,7 +208,7 @@ class SavedMap:
         cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, world_frame: str, atlas: Atlas
     ) -> SavedMap:
         """The map of a running system: landmark rows, the back end's estimate, what both belong to, and keyframes."""
-        P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
+        P = definite(estimate.covariances)
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
             landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,

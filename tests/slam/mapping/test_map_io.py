@@ -17,6 +17,7 @@ from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry import se3
+from slam.mapping.known_landmarks import definite, require_known
 from slam.mapping.map_io import SavedMap, decode, encode, load_map, save_map
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
@@ -129,6 +130,16 @@ def test_a_map_that_is_none_is_refused_though_its_checksum_is_right(name, conten
     with pytest.raises(SlamError, match=r"a\.map") as error:
         decode(with_member(name, content), "a.map")
     assert "\n" not in str(error.value)
+
+
+def test_a_landmark_that_is_hardly_known_can_be_kept():
+    """Of a point that is nearly at infinity rounding leaves no variance across, as of one in a recording."""
+    R = se3.so3_exp(np.array([0.3, -0.5, 0.2]))
+    P = np.stack([R @ np.diag([-48.6, 1.6e5, 5.9e17]) @ R.T, 1e-4 * np.eye(3)])
+    with pytest.raises(MeasurementError, match="not symmetric and positive definite"):
+        require_known("a map", np.arange(2), np.ones((2, 3)), P)
+    require_known("a map", np.arange(2), np.ones((2, 3)), definite(P))
+    np.testing.assert_array_equal(definite(P)[1], P[1])
 
 
 def test_other_files_and_versions_are_refused(tmp_path):
