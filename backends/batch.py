@@ -18,13 +18,12 @@ from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key, to_pose3, velocity_change
 from backends.smoother.graph import FAILURES, GraphProblem, Tracks, minimised
 from backends.smoother.state import SmootherState
-from slam.bounds import require_not_negative
+from slam.bounds import from_options, require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.window.motion import LONGEST, is_first, velocity_sigmas
 from slam.window.stereo import RectifiedStereo

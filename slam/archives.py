@@ -32,12 +32,7 @@ _DAMAGED = (
 
 
 def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict[str, bytes]:
-    """The members of a zip archive by name.
-
-    Args:
-        data: the archive.
-        source: its name, for messages.
-        error: what is raised.
+    """The members of a zip archive by name; `source` is its name, for messages.
 
     Raises:
         SlamError: of type `error`, if it is damaged, encrypted, compressed in an unusual way, or would unpack to far
@@ -54,8 +49,7 @@ def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict
 
 def _require_plain(members: list[zipfile.ZipInfo], size: int) -> None:
     """Raise ValueError for an archive that should not be unpacked."""
-    names = [m.filename for m in members]
-    if len(members) > _MEMBERS or len(set(names)) < len(names):
+    if len(members) > _MEMBERS or len({m.filename for m in members}) < len(members):
         raise ValueError(f"an archive of {len(members)} members")
     total = sum(m.file_size for m in members)
     if total > max(_AT_LEAST, _TIMES * size):
@@ -68,11 +62,7 @@ def _require_plain(members: list[zipfile.ZipInfo], size: int) -> None:
 
 
 def array(data: bytes, name: str, source: str, error: type[SlamError] = SlamError) -> np.ndarray:
-    """The array of an ``.npy`` member, whose header must agree with the data after it.
-
-    Raises:
-        SlamError: of type `error`, if it is no array, or one of objects.
-    """
+    """The array of an ``.npy`` member, whose header must agree with the data; raises `error` where it is none."""
     try:
         return _array(data)
     except _DAMAGED as fault:
@@ -96,11 +86,7 @@ def _array(data: bytes) -> np.ndarray:
 
 
 def json_text(text: str | bytes, source: str, error: type[SlamError] = SlamError) -> Any:
-    """Parse a JSON text.
-
-    Raises:
-        SlamError: of type `error`, if it is no JSON, or too long.
-    """
+    """Parse a JSON text; raises `error` where it is no JSON, or too long."""
     if len(text) > _TEXT:
         raise error(f"{source}: {len(text)} characters of JSON")
     try:

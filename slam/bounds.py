@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from slam.errors import ConfigurationError
+from slam.naming import unknown
 
 #: Numbers of settings lie below this, in whatever unit: their squares and products stay far from overflow.
 MOST = 1e9
@@ -25,16 +26,15 @@ _WORD, _TUPLE = 4096, 16  # most characters of a text, most elements of a tuple
 #: Ranges of fields whose cost grows faster than their value, in every class.
 _COSTLY = {"grid": (1, 1000)}
 
+_C = TypeVar("_C")
 Ranges = Mapping[str, tuple[float, float]]
 
 
 def require_positive(config: object, ranges: Ranges | None = None, owner: str = "") -> None:
     """Check the types of a configuration dataclass, and that its numbers are positive and in their ranges.
 
-    Args:
-        config: the dataclass.
-        ranges: least and largest values by field, both allowed; default: `LEAST` to `MOST`, counts to a million.
-        owner: whose settings they are, for the message.
+    `ranges` has least and largest values by field, both allowed; default: `LEAST` to `MOST`, counts to a million.
+    `owner` says whose settings they are.
 
     Raises:
         ConfigurationError: a value is of the wrong type or out of its range.
@@ -49,10 +49,10 @@ def require_not_negative(config: object, ranges: Ranges | None = None, owner: st
 
 def _require(config: object, ranges: Ranges, owner: str, positive: bool) -> None:
     mark = f"{owner}: " if owner else ""
-    hints = _hints(type(config))  # type: ignore[arg-type]
+    hints = field_types(type(config))  # type: ignore[arg-type]
     for f in fields(config):  # type: ignore[arg-type]
         value = getattr(config, f.name)
-        fault = _type_fault(value, hints[f.name])
+        fault = type_fault(value, hints[f.name])
         if fault:
             raise ConfigurationError(f"{mark}{f.name} must be {fault}, got {value!r}")
         for number in value if isinstance(value, (tuple, list)) else (value,):
@@ -76,15 +76,15 @@ def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool
 
 
 @lru_cache(maxsize=64)
-def _hints(kind: type) -> dict[str, Any]:
-    """Types of a dataclass's fields."""
+def field_types(kind: type) -> dict[str, Any]:
+    """Types of a dataclass's fields, by name."""
     return get_type_hints(kind)
 
 
-def _type_fault(value: Any, hint: Any) -> str:
+def type_fault(value: Any, hint: Any) -> str:
     """What is required of a value of the wrong type; empty if the type is right."""
     if get_origin(hint) in (Union, UnionType):
-        faults = [_type_fault(value, kind) for kind in get_args(hint)]
+        faults = [type_fault(value, kind) for kind in get_args(hint)]
         return "" if "" in faults else " or ".join(filter(None, faults))
     if hint is NoneType:
         return "" if value is None else "none"
@@ -107,7 +107,7 @@ def _type_fault(value: Any, hint: Any) -> str:
 
 
 def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
-    """As `_type_fault`, for a tuple, or a list in its place."""
+    """As `type_fault`, for a tuple, or a list in its place."""
     if not isinstance(value, (tuple, list)):
         return "a list"
     if len(kinds) == 2 and kinds[1] is Ellipsis:
@@ -116,5 +116,18 @@ def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
         kinds = (kinds[0],) * len(value)
     if len(value) != len(kinds):
         return f"a list of {len(kinds)} values"
-    faults = [_type_fault(v, kind) for v, kind in zip(value, kinds)]
+    faults = [type_fault(v, kind) for v, kind in zip(value, kinds)]
     return next((f"a list, each {fault}" for fault in faults if fault), "")
+
+
+def from_options(kind: type[_C], owner: str, options: Mapping[str, Any]) -> _C:
+    """A configuration, of the dataclass `kind`, from keyword options of a front end or back end, its `owner`.
+
+    Raises:
+        ConfigurationError: an option is unknown (the message lists the known ones) or out of its range.
+    """
+    known = [f.name for f in fields(kind)]  # type: ignore[arg-type]
+    for key in options:
+        if key not in known:
+            raise ConfigurationError(f"{owner}: {unknown('option', key, known)}")
+    return kind(**options)

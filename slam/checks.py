@@ -20,10 +20,7 @@ MOST_ID = 2**53
 def require_stamp(owner: str, stamp: float, last: float | None) -> None:
     """Check the time to which a back end is to be advanced.
 
-    Args:
-        owner: the back end's name, for the message.
-        stamp: the new time [s].
-        last: the time before it [s]; None for the first.
+    `stamp` [s] is the new time, `last` [s] the one before it, None for the first; `owner` is the back end's name.
 
     Raises:
         MeasurementError: it is not finite, not later than the last one, or beyond `LATEST_STAMP`.
@@ -38,9 +35,8 @@ def require_stamp(owner: str, stamp: float, last: float | None) -> None:
 def require_not_measured(owner: str, measured: bool) -> None:
     """Check that an update comes in its turn.
 
-    Args:
-        owner: the back end's name, for the message.
-        measured: whether the present stamp has had its update, or something was added at its pose.
+    `measured` says whether the present stamp has had its update, or something was added at its pose; `owner` is the
+    back end's name.
 
     Raises:
         MeasurementError: it has.

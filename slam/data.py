@@ -1,15 +1,14 @@
 """The data that flows through the system: frozen dataclasses of arrays, one row per feature or landmark.
 
 Frames are in the names: ``T_world_left`` takes left-camera coordinates to world coordinates. Pixels are (x right,
-y down), the centre of the first pixel is (0, 0), in the rig's own images. Lengths are metres, angles radians,
-times seconds. Pose covariances are (6, 6), order [rotation, translation], of a perturbation on the right,
-``T exp(ξ)``, that is in left-camera axes.
+y down), the centre of the first pixel is (0, 0), in the rig's own images. Lengths are metres, angles radians, times
+seconds. Pose covariances are (6, 6), order [rotation, translation], of a perturbation ``T exp(ξ)``: in camera axes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 
 import numpy as np
@@ -34,8 +33,7 @@ class StereoFrame:
         index: number of the frame in its sequence.
         stamp: time [s].
         left, right: images (H, W) or (H, W, 3|4), uint8 or uint16; `right` is None where it is missing.
-        left_mask, right_mask: (H, W) bool, False where a camera sees its own car or lens: features there are not used.
-            None for the whole image.
+        left_mask, right_mask: (H, W) bool, False where features are not used; None for the whole image.
     """
 
     index: int
@@ -53,11 +51,7 @@ class StereoFrame:
 
 @dataclass(frozen=True, eq=False)
 class ImagePair:
-    """Rectified grey images of one stereo frame.
-
-    Attributes:
-        left, right: (H, W) float32; `right` is None where it is missing.
-    """
+    """Rectified grey images (H, W) of one stereo frame; `right` is None where it is missing."""
 
     left: NDArray[np.float32]
     right: NDArray[np.float32] | None
@@ -93,20 +87,9 @@ class Patches:
 
     def joined(self, other: Patches) -> Patches:
         """These and others."""
-        if not len(self):
-            return other
-        if not len(other):
-            return self
+        if not len(self) or not len(other):
+            return self if len(self) else other
         return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Patches)))
-
-
-def _at(mask: BoolArray, uv: Array) -> BoolArray:
-    """The mask (H, W) at pixels (N, 2); True beyond its border and where a pixel is NaN."""
-    there = np.isfinite(uv).all(axis=1)
-    out = np.ones(len(uv), bool)
-    column, row = np.rint(uv[there]).astype(int).T.clip(0, np.array([mask.shape[1] - 1, mask.shape[0] - 1])[:, None])
-    out[there] = mask[row, column]
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +98,7 @@ class StereoFeatures:
 
     Attributes:
         stamp: time [s].
-        uv_left: left pixels (N, 2).
-        uv_right: right pixels (N, 2), NaN where there is no stereo match.
+        uv_left, uv_right: pixels (N, 2); the right ones NaN where there is no stereo match.
         scale: size of the feature (N,) [px].
         angle: orientation (N,) [rad], 0 where upright.
         response: strength (N,).
@@ -143,10 +125,8 @@ class StereoFeatures:
             if not isinstance(value, (np.ndarray, list, tuple)) or (isinstance(value, np.ndarray) and not value.ndim):
                 kind = type(value).__name__
                 raise MeasurementError(f"features: {name} must be an array with a row for each feature, got {kind}")
-        n = len(self.uv_left)
-        for name in ("uv_right", "scale", "angle", "response", "laplacian", "descriptors"):
-            if len(getattr(self, name)) != n:
-                raise MeasurementError(f"features: {name} has {len(getattr(self, name))} rows, uv_left has {n}")
+            if len(value) != len(self.uv_left):
+                raise MeasurementError(f"features: {name} has {len(value)} rows, uv_left has {len(self.uv_left)}")
 
     def __len__(self) -> int:
         return len(self.uv_left)
@@ -160,24 +140,11 @@ class StereoFeatures:
         """Which features have a right pixel (N,)."""
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
 
-    def outside(self, left_mask: BoolArray | None, right_mask: BoolArray | None) -> StereoFeatures:
-        """Those where the masks (H, W) of a frame are True; under the right camera's only the right pixel goes."""
-        if left_mask is not None:
-            rows = np.flatnonzero(_at(left_mask, self.uv_left))
-            names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
-            return replace(self, **{name: getattr(self, name)[rows] for name in names}).outside(None, right_mask)
-        if right_mask is None:
-            return self
-        return replace(self, uv_right=np.where(_at(right_mask, self.uv_right)[:, None], self.uv_right, np.nan))
-
     @classmethod
     def empty(cls, stamp: float, dimensions: int = 64, threshold: float = float("nan")) -> StereoFeatures:
         """No features."""
-        z = np.zeros(0)
-        return cls(
-            stamp, np.zeros((0, 2)), np.zeros((0, 2)), z, z, z, np.zeros(0, np.int8),
-            np.zeros((0, dimensions), np.float32), threshold,
-        )  # fmt: skip
+        uv, z = np.zeros((0, 2)), np.zeros(0)
+        return cls(stamp, uv, uv, z, z, z, z.astype(np.int8), np.zeros((0, dimensions), np.float32), threshold)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,12 +153,10 @@ class Observations:
 
     Attributes:
         ids: landmark ids (M,), unique.
-        uv_left: left pixels (M, 2), finite.
-        uv_right: right pixels (M, 2), NaN where there is no stereo match.
+        uv_left, uv_right: pixels (M, 2); the right ones NaN where there is no stereo match.
 
     Raises:
-        MeasurementError: shapes differ, an id occurs twice, a left pixel is not finite, a right one is infinite, or one
-            is too far off to be in any image.
+        MeasurementError: shapes differ, an id occurs twice, or a pixel is not finite or too far off to be in any image.
     """
 
     ids: IdArray
@@ -201,11 +166,9 @@ class Observations:
     def __post_init__(self) -> None:
         if not all(isinstance(a, np.ndarray) and a.ndim for a in (self.ids, self.uv_left, self.uv_right)):
             raise MeasurementError("observations: ids and pixels must be arrays with a row for each landmark")
-        n = len(self.ids)
-        if self.uv_left.shape != (n, 2) or self.uv_right.shape != (n, 2):
-            raise MeasurementError(
-                f"observations: {n} ids, but uv_left is {self.uv_left.shape} and uv_right {self.uv_right.shape}"
-            )
+        n, shapes = len(self.ids), (self.uv_left.shape, self.uv_right.shape)
+        if shapes != ((n, 2), (n, 2)):
+            raise MeasurementError(f"observations: {n} ids, but uv_left is {shapes[0]} and uv_right {shapes[1]}")
         if len(np.unique(self.ids)) != n:
             raise MeasurementError("observations: a landmark id stands twice")
         if not np.isfinite(self.uv_left).all():
@@ -242,11 +205,9 @@ class Prediction:
 
     Attributes:
         stamp: time [s].
-        T_world_left: predicted pose (4, 4).
-        covariance: its covariance (6, 6).
+        T_world_left, covariance: predicted pose (4, 4), and its covariance (6, 6).
         ids: landmarks in the angle of view (M,) (paper A, IV and Fig. 3).
-        uv_left: their predicted left pixels (M, 2).
-        uv_right: their predicted right pixels (M, 2); may lie outside the image.
+        uv_left, uv_right: their predicted pixels (M, 2); the right ones may lie outside the image.
         innovation: covariances of the left pixels' innovations (M, 2, 2) [px²], measurement noise included.
     """
 
@@ -262,12 +223,10 @@ class Prediction:
 
 
 class UpdateStatus(StrEnum):
-    """How an update ended.
+    """How an update ended: OK where measurements were used.
 
-    Attributes:
-        OK: measurements were used.
-        EMPTY: nothing was measured, or nothing passed the gate: the estimate is the prediction.
-        FAILED: the estimator could not solve; the estimate is the prediction, and the report gives the reason.
+    EMPTY: nothing was measured, or nothing passed the gate. FAILED: the estimator could not solve, and the report gives
+    the reason. After both the estimate is the prediction.
     """
 
     OK = "ok"
@@ -282,10 +241,9 @@ class UpdateReport:
     Attributes:
         status: how it ended.
         reason: one line where the status is not OK, or where a solver that failed was built anew; else empty.
-        used: ids of the landmarks whose observations were used (K,).
-        rejected: ids of those that failed the back end's gate (R,).
-        nis: normalised innovation squared νᵀ S⁻¹ ν of all used observations together (NaN if none).
-        dof: its degrees of freedom.
+        used, rejected: ids of the landmarks whose observations were used (K,), and that failed the gate (R,).
+        nis, dof: normalised innovation squared νᵀ S⁻¹ ν of all used observations together (NaN if none), and its
+            degrees of freedom.
     """
 
     status: UpdateStatus
@@ -312,7 +270,7 @@ class RecentPoses:
     """The camera's last poses together, the newest last.
 
     Attributes:
-        stamps: their times (K,) [s], ascending.
+        stamps: their times (K,) [s].
         poses: T_world_left (K, 4, 4).
         covariance: joint (6 K, 6 K), of perturbations on the right, each in the order of a pose's covariance.
     """
@@ -336,8 +294,7 @@ class Estimate:
         T_world_left: pose (4, 4).
         covariance: its covariance (6, 6): rotation [rad], then translation [m], in the left camera's axes.
         ids: landmark ids (N,), ascending.
-        positions: landmark positions in world coordinates (N, 3) [m].
-        covariances: their marginal covariances (N, 3, 3) [m²].
+        positions, covariances: of the landmarks in the world (N, 3) [m], and their marginal ones (N, 3, 3) [m²].
     """
 
     stamp: float
@@ -348,16 +305,14 @@ class Estimate:
     covariances: Array
 
     def __repr__(self) -> str:
-        R = self.T_world_left[:3, :3]
-        sigma = np.sqrt(np.diag(R @ self.covariance[3:, 3:] @ R.T).clip(min=0))
-        where = f"camera at {point(self.T_world_left[:3, 3])} ± {point(sigma)} m"
+        R, t = self.T_world_left[:3, :3], self.T_world_left[:3, 3]
+        where = f"camera at {point(t)} ± {point(np.sqrt(np.diag(R @ self.covariance[3:, 3:] @ R.T).clip(min=0)))} m"
         return f"Estimate({self.stamp:.3f} s, {where}, {count(len(self.ids), 'landmark')})"
 
     def to_table(self) -> dict[str, NDArray]:
-        """The landmarks as columns (N,) with the names and units of ``landmarks.csv``, for instance for a data frame.
+        """The landmarks as columns (N,) like those of ``landmarks.csv``, for instance for a data frame.
 
-        Returns:
-            ``id``, ``x``, ``y``, ``z`` [m] in world coordinates, and the covariance terms ``cxx`` to ``czz`` [m²].
+        ``id``, ``x``, ``y``, ``z`` [m] in world coordinates, and the covariance terms ``cxx`` to ``czz`` [m²].
         """
         terms = {f"c{'xyz'[i]}{'xyz'[j]}": self.covariances[:, i, j] for i in range(3) for j in range(i, 3)}
         return {"id": self.ids, **{"xyz"[i]: self.positions[:, i] for i in range(3)}, **terms}
@@ -366,12 +321,9 @@ class Estimate:
 class FrameStatus(StrEnum):
     """How a frame ended.
 
-    Attributes:
-        STARTED: first frame, or the first one with anything to see: the map begins.
-        TRACKED: the pose was measured against the map.
-        LOST: no match for several frames: the pose is only predicted, and may be far off.
-        PREDICTED: no or too few matches: the pose is the motion model's.
-        FAILED: the back end could not solve; the pose is the motion model's.
+    STARTED: the map begins, with the first frame that shows anything. TRACKED: the pose was measured against the map.
+    PREDICTED: no or too few matches: the pose is the motion model's. LOST: no match for several frames: that pose may
+    be far off. FAILED: the back end could not solve; the pose is the motion model's.
     """
 
     STARTED = "started"
@@ -392,30 +344,24 @@ class FrameResult:
 
     Attributes:
         index: number of the step.
-        status: how it ended.
-        reason: one line that says why, if the status is not tracked; else empty.
+        status, reason: how it ended, and one line that says why, if it was not tracked; else empty.
         estimate: pose after the step, without landmarks; `StereoSlam.estimate` includes them.
         report: the back end's report.
         features: of the frame.
         predicted: number of landmarks in the angle of view.
-        matched: ids of landmarks associated with a feature (after the geometric check) (K,).
-        matched_features: rows of those features (K,).
-        added: ids of landmarks that joined the map (A,).
-        added_features: rows of their features (A,).
+        matched, matched_features: ids of landmarks associated with a feature (after the geometric check), and rows of
+            those features (K,).
+        added, added_features: ids of landmarks that joined the map, and rows of their features (A,).
         erased: ids of landmarks that left the map.
         map_size: number of landmarks in the map.
         milliseconds: wall time per stage.
         moving_features: rows of features classified as moving (V,); they never become landmarks.
         objects: the moving bodies, by ascending id.
-        located: False as long as the camera has not been found in the prior map that the system was started with; the
-            pose is meaningless then.
-        revision: the change of the correction of all earlier pixels, if there was one before this step
-            (`RevisingBackend`); else None.
-        T_map_odom: pose (4, 4) in the map of the back end's own world frame, in which poses never jump; the identity
-            before the first loop.
-        loop: if the frame closed a loop, index of the earlier frame of the same place, or −1 if that is in the prior
-            map; else None.
-        refused_loop: the same for a loop that was refused because it contradicts the path.
+        located: False as long as the camera has not been found in the prior map; the pose is meaningless then.
+        revision: change of the correction of all earlier pixels before this step (`RevisingBackend`); None without one.
+        T_map_odom: pose (4, 4) in the map of the back end's own world, in which poses never jump; unity before a loop.
+        loop, refused_loop: if the frame closed a loop, or one that contradicts the path, index of the earlier frame of
+            the same place, or −1 if that is in the prior map; else None.
         keyframe: whether the frame has become a keyframe.
         returned: ids of the revisited place's landmarks that have rejoined the map.
         common: the part of the pose's error that all frames share; empty after a loop, which mixes it with noise.

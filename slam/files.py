@@ -52,23 +52,18 @@ def note_input(path: str | Path) -> None:
 
 
 def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError) -> bytes:
-    """The content of a regular file.
-
-    Args:
-        path: the file.
-        limit: most bytes that are read.
-        error: what is raised.
+    """The content of a regular file of at most `limit` bytes.
 
     Raises:
         SlamError: of type `error`, where the file is missing, not a regular file, unreadable or too large.
     """
     try:
-        descriptor = os.open(path, os.O_RDONLY | _not_blocking())
-        note_input(path)
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except OSError as fault:
         raise error(f"{path}: {reason(fault)}") from fault
     except (ValueError, TypeError) as fault:  # a NUL or a lone surrogate in the name; no name at all
         raise error(f"{path}: no possible file name") from fault
+    note_input(path)
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
@@ -90,14 +85,9 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] 
 
 
 def read_object(path: str | Path) -> dict[str, Any]:
-    """The object in a JSON file.
-
-    Raises:
-        SlamError: the file cannot be read, or holds something else.
-    """
-    text = read_text(path, _JSON_LIMIT, SlamError)
+    """The object in a JSON file; raises SlamError where it cannot be read, or holds something else."""
     try:
-        tree = json.loads(text)
+        tree = json.loads(read_text(path, _JSON_LIMIT, SlamError))
     except (ValueError, RecursionError) as fault:
         raise SlamError(f"{path}: no valid JSON: {fault}") from fault
     if not isinstance(tree, dict):
@@ -123,11 +113,7 @@ def read_numbers(path: str | Path, columns: int) -> Array:
 
 
 def require_content(path: Path) -> None:
-    """Raise where a path, for a library that opens it by itself, is no regular file with something in it.
-
-    Raises:
-        SequenceError: there is none.
-    """
+    """Raise SequenceError where a path, for a library that opens it by itself, is no regular file with content."""
     try:
         status = path.stat()
     except OSError as fault:
@@ -143,11 +129,7 @@ def require_content(path: Path) -> None:
 
 
 def require_utf8(path: Path, error: type[SlamError] = SlamError) -> None:
-    """Raise where the name of a file is no UTF-8: OpenCV and other libraries crash on such a name.
-
-    Raises:
-        SlamError: of type `error`.
-    """
+    """Raise `error` where the name of a file is no UTF-8: OpenCV and other libraries crash on such a name."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -174,11 +156,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 
 def expanded(text: str | Path, error: type[SlamError] = SequenceError) -> Path:
-    """A path as the user gave it, with ``~`` expanded.
-
-    Raises:
-        SlamError: of type `error`, where there is no such home, or the text can be no path.
-    """
+    """A path as the user gave it, with ``~`` expanded; raises `error` where there is no such home, or it is no path."""
     if "\0" in str(text) or not isinstance(text, (str, os.PathLike)):
         raise error(f"{text}: no possible file name")
     try:
@@ -198,23 +176,15 @@ def remove_file(path: Path) -> None:
         path.unlink()
 
 
-def require_target(path: Path, error: type[SlamError] = SlamError) -> None:
-    """Raise where a file could not be written for certain.
-
-    Raises:
-        SlamError: of type `error`, where there is no folder for it, or something at its place that is not a regular
-            file: a device or a pipe is never replaced.
-    """
+def _require_target(path: Path, error: type[SlamError]) -> None:
+    """Raise `error` where there is no folder for a file, or something else at its place: a device, a pipe."""
     if "\0" in str(path):
         raise error(f"{path}: no possible file name")
-    try:
-        if not path.parent.is_dir():
-            raise error(f"{path}: cannot be written: there is no folder {path.parent}")
-        with suppress(FileNotFoundError):
-            if not stat.S_ISREG(path.stat().st_mode):  # raises for links in a circle
-                raise error(f"{path}: cannot be written: there is something that is not a regular file")
-    except OSError as fault:
-        raise error(f"{path}: cannot be written: {reason(fault)}") from fault
+    if not path.parent.is_dir():
+        raise error(f"{path}: cannot be written: there is no folder {path.parent}")
+    with suppress(FileNotFoundError):
+        if not stat.S_ISREG(path.stat().st_mode):  # raises for links in a circle
+            raise error(f"{path}: cannot be written: there is something that is not a regular file")
 
 
 @contextmanager
@@ -224,10 +194,9 @@ def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator
     Raises:
         SlamError: of type `error`, if it cannot be written; nothing is left of it then.
     """
-    place = Path(path)
-    require_target(place, error)
-    temporary = None
+    place, temporary = Path(path), None
     try:
+        _require_target(place, error)
         place = place.resolve()  # a link stays a link
         beside = place.with_name(f".{secrets.token_hex(8)}.part")
         with beside.open("xb") as file:
@@ -248,11 +217,7 @@ def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text in UTF-8, completely or not at all.
-
-    Raises:
-        SlamError: it cannot be written.
-    """
+    """Write a text in UTF-8, completely or not at all; raises SlamError where it cannot be written."""
     with whole_file(path) as file:
         file.write(text.encode("utf-8", "backslashreplace"))
 
@@ -279,11 +244,7 @@ class RowFile:
         self._length = 0
 
     def write(self, text: str) -> None:
-        """Append rows.
-
-        Raises:
-            OSError: they cannot be written; earlier rows are kept.
-        """
+        """Append rows; raises OSError where they cannot be written, and keeps the earlier ones."""
         rest = memoryview(text.encode("utf-8", "backslashreplace"))
         length = self._length + len(rest)
         try:
@@ -323,8 +284,3 @@ def lock_folder(folder: Path) -> int | None:
         os.close(descriptor)
         return None
     return descriptor
-
-
-def _not_blocking() -> int:
-    """Flags with which opening a pipe does not wait for its writer."""
-    return getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)

@@ -13,7 +13,6 @@ from slam.checks import FARTHEST_POSITION
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
 from slam.naming import unknown
-from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
 ANYWHERE = 1e3  # numerics: standard deviation of an unknown position [m]
@@ -30,17 +29,12 @@ _RANGES = {
 }
 
 
-def _numbers(value: object) -> Array:
-    """An array of numbers; an empty one where there are none."""
-    try:
-        return np.array(value, float)
-    except (TypeError, ValueError, OverflowError):
-        return np.zeros(0)
-
-
-def _is_rotation(R: Array) -> bool:
-    """Whether a matrix (3, 3) is a rotation, to within the rounding of six digits."""
-    return bool(np.abs(R).max() < 1.1 and np.abs(R @ R.T - np.eye(3)).max() <= 1e-6 and np.linalg.det(R) > 0)
+def _is_pose(T: Array) -> bool:
+    """Whether an array is a rigid motion (4, 4), its rotation to within the rounding of six digits."""
+    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_POSITION).all() or np.abs(T[:3, :3]).max() >= 1.1:
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-6 and np.linalg.det(R) > 0)
 
 
 @dataclass(frozen=True)
@@ -59,8 +53,6 @@ class MotionModel:
     acceleration: float = 1.0
     angular_acceleration: float = 1.0
     wheels: bool = False
-
-    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_positive(self, {"acceleration": _DENSITIES, "angular_acceleration": _DENSITIES})
@@ -96,13 +88,14 @@ class EstimatorModels:
     T_world_left: Sequence[Sequence[float]] | None = None
     objects: ObjectModels = field(default_factory=ObjectModels)
 
-    __pydantic_config__ = FORBID_UNKNOWN
-
     def __post_init__(self) -> None:
         require_positive(self, _RANGES)
         if self.T_world_left is not None:
-            T = _numbers(self.T_world_left)
-            if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_POSITION).all() or not _is_rotation(T[:3, :3]):
+            try:
+                T = np.array(self.T_world_left, float)
+            except (TypeError, ValueError, OverflowError):
+                T = np.zeros(0)
+            if not _is_pose(T):
                 raise ConfigurationError("T_world_left must be a (4, 4) pose: a rotation and a translation")
             object.__setattr__(self, "T_world_left", tuple(map(tuple, T.tolist())))
         if self.gate_probability >= 1:

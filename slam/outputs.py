@@ -19,24 +19,24 @@ from slam.errors import SlamError
 from slam.files import reason
 
 _RUN, _COMPARISON = ("config.json", "frames.csv"), ("sweep.json",)  # what folders of our own hold
+_OTHER = "cannot be written: there is something that is not a"
 
 
 @dataclass(frozen=True)
 class Output:
-    """A file to be written, or a folder with the files that are written into it.
+    """A file to be written, or a folder with the files that are written into it."""
 
-    Attributes:
-        path: of the file or folder.
-        option: that names it on the command line, for messages.
-        names: of a folder, what is written into it: names or patterns (``*.png``), with a ``/`` at the end those of
-            folders; None for a file.
-        makes_folder: whether the folders above it are made where they are missing; those of a folder always are.
-    """
-
-    path: Path
-    option: str
+    path: Path  # of the file or folder
+    option: str  # that names it on the command line, for messages
+    # of a folder, what is written into it: names or patterns (``*.png``), with a ``/`` at the end those of folders;
+    # None for a file
     names: Sequence[str] | None = None
-    makes_folder: bool = False
+    makes_folder: bool = False  # the folders above a file are made where they are missing; those of a folder always are
+
+    @property
+    def is_folder(self) -> bool:
+        """Whether it is a folder."""
+        return self.names is not None
 
     @property
     def real(self) -> Path:
@@ -46,6 +46,13 @@ class Output:
     def writes(self, name: str) -> bool:
         """Whether something of this name is written into the folder."""
         return any(fnmatchcase(name, pattern.rstrip("/")) for pattern in self.names or ())
+
+    @property
+    def found(self) -> list[Path]:
+        """What of it is there already."""
+        if not self.is_folder:
+            return [self.path] if self.path.exists() else []
+        return sorted(path for path in self.path.iterdir() if self.writes(path.name)) if self.path.is_dir() else []
 
 
 def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), overwrite: bool | None = False) -> None:
@@ -64,7 +71,7 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
         if "\0" in str(output.path):
             raise SlamError(f"{output.path}: no possible file name")
     read = [Path(os.path.realpath(path)) for path in inputs]
-    made = {output.real for output in outputs if output.names is not None}
+    made = {output.real for output in outputs if output.is_folder}
     for output in outputs:
         try:
             _require_possible(output, made)
@@ -73,44 +80,39 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
         except OSError as fault:
             raise SlamError(f"{output.path}: cannot be written: {reason(fault)}") from fault
     for one, other in permutations(outputs, 2):
-        _require_apart(one, other)
+        if _clash(one, other):
+            raise SlamError(f"{one.path}: {one.option} and {other.option} cannot write to the same place")
 
 
 def _require_possible(output: Output, made: set[Path]) -> None:
     """Raise where there is something else, or no folder to write to; `made` are folders that other outputs make."""
-    path, is_folder = output.path, output.names is not None
-    there = _status(path)
-    if there is not None and not (stat.S_ISDIR if is_folder else stat.S_ISREG)(there.st_mode):
-        wanted = "folder" if is_folder else "regular file"
-        raise SlamError(f"{path}: cannot be written: there is something that is not a {wanted}")
-    if there is not None and not os.access(path, os.W_OK):
+    path = output.path
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        mode = None
+    if mode is not None and not (stat.S_ISDIR if output.is_folder else stat.S_ISREG)(mode):
+        raise SlamError(f"{path}: {_OTHER} {'folder' if output.is_folder else 'regular file'}")
+    if mode is not None and not os.access(path, os.W_OK):
         raise SlamError(f"{path}: cannot be written: Permission denied")
-    if is_folder and there is None and path.is_symlink():
+    if output.is_folder and mode is None and path.is_symlink():
         raise SlamError(f"{path}: cannot be written: a link to a folder that is not there")
-    place = path if is_folder and there is not None else output.real.parent
+    place = path if output.is_folder and mode is not None else output.real.parent
     near = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
     above = next(folder for folder in (place, *place.absolute().parents) if os.path.lexists(folder))
     for folder in (near, above):
         if not folder.is_dir():  # such as a link to nothing
             raise SlamError(f"{path}: cannot be written: {folder} is not a folder")
-    if above != place and not is_folder and not output.makes_folder and place not in made:
+    if above != place and not output.is_folder and not output.makes_folder and place not in made:
         raise SlamError(f"{path}: cannot be written: there is no folder {path.parent}")
     with tempfile.TemporaryFile(dir=above):  # permissions alone do not say it
         pass
 
 
-def _status(path: Path) -> os.stat_result | None:
-    """What is there, links followed; None where nothing is."""
-    try:
-        return path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-
-
 def _require_no_input(output: Output, inputs: Sequence[Path]) -> None:
     """Raise where an input would be replaced, or files would be added to a folder of inputs."""
-    found = _found(output)
-    if output.names is not None and output.path.is_dir() and next(output.path.iterdir(), None) is not None:
+    found = output.found
+    if output.is_folder and output.path.is_dir() and next(output.path.iterdir(), None) is not None:
         found.append(output.path)
     for path in found:
         if any(_is_input(path, known) for known in inputs):
@@ -125,43 +127,27 @@ def _is_input(path: Path, known: Path) -> bool:
     if not (known.is_dir() and real.is_relative_to(known)):
         return False
     between = [folder for folder in (real, *real.parents) if folder != known and folder.is_relative_to(known)]
-    return not any(_is_own(folder) for folder in between)
-
-
-def _is_own(folder: Path) -> bool:
-    """Whether a run or a comparison has left its files in a folder."""
-    return any(all((folder / name).is_file() for name in names) for names in (_RUN, _COMPARISON))
+    return not any(all((f / name).is_file() for name in names) for f in between for names in (_RUN, _COMPARISON))
 
 
 def _require_free(output: Output, overwrite: bool | None) -> None:
     """Raise where something is there that may not be replaced."""
-    for path in _found(output):
+    for path in output.found:
         if not overwrite:
             allow = "" if overwrite is None else ", or --overwrite to replace it"
             raise SlamError(f"{path}: is there already; give another {output.option}{allow}")
-        if output.names is not None:
+        if output.names is not None and path.exists():
             folder = path.name not in output.names and f"{path.name}/" in output.names
-            if path.exists() and not (path.is_dir() if folder else path.is_file()):
-                wanted = "folder" if folder else "regular file"
-                raise SlamError(f"{path}: cannot be written: there is something that is not a {wanted}")
+            if not (path.is_dir() if folder else path.is_file()):
+                raise SlamError(f"{path}: {_OTHER} {'folder' if folder else 'regular file'}")
 
 
-def _found(output: Output) -> list[Path]:
-    """What of an output is there already."""
-    if output.names is None:
-        return [output.path] if output.path.exists() else []
-    return sorted(path for path in output.path.iterdir() if output.writes(path.name)) if output.path.is_dir() else []
-
-
-def _require_apart(one: Output, other: Output) -> None:
-    """Raise where the first output would be one of the other's files, or lie in a file or folder of the other's."""
+def _clash(one: Output, other: Output) -> bool:
+    """Whether the first output would be one of the other's files, or lie in a file or folder of the other's."""
     inner, outer = one.real, other.real
     same = inner == outer or (one.path.exists() and other.path.exists() and one.path.samefile(other.path))
-    if same and one.names is not None and other.names is not None:
-        clash = any(other.writes(name.rstrip("/")) for name in one.names)
-    elif same or other.names is None:
-        clash = same or inner.is_relative_to(outer)
-    else:
-        clash = inner.is_relative_to(outer) and other.writes(inner.relative_to(outer).parts[0])
-    if clash:
-        raise SlamError(f"{one.path}: {one.option} and {other.option} cannot write to the same place")
+    if same and one.names is not None and other.is_folder:
+        return any(other.writes(name.rstrip("/")) for name in one.names)
+    if same or not other.is_folder:
+        return same or inner.is_relative_to(outer)
+    return inner.is_relative_to(outer) and other.writes(inner.relative_to(outer).parts[0])

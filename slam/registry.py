@@ -63,13 +63,14 @@ def resolve(role: str, name: str) -> Any:
     Raises:
         UnknownNameError: the name is not known (the message lists the known ones), or its module cannot be imported.
     """
-    what = role[:-1].replace("end", " end")
-    target = name if ":" in name else _table(role).get(name)
+    what, own = _spoken(role), ":" in name
+    target = name if own else _table(role).get(name)
     if target is None:
         raise UnknownNameError(f"{unknown(what, name, names(role))}; or one of your own: module:Class")
-    if target is not name and name in BUILT_IN[role] and (hidden := _hidden(role)):
-        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {hidden}")
-    if target is name and str(Path.cwd()) not in sys.path:
+    failed = f"{what} {name!r} cannot be loaded:"
+    if not own and name in BUILT_IN[role] and (hidden := _hidden(role)):
+        raise UnknownNameError(f"{failed} {hidden}")
+    if own and str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))  # last: nothing that is installed is replaced
     module, _, attribute = target.partition(":")
     try:
@@ -78,16 +79,18 @@ def resolve(role: str, name: str) -> Any:
         where, package = "", (error.name or "").partition(".")[0]
         if package in BUILT_IN:
             where = f": {_hidden(package) or f'`{package}` is the package of slam, so call yours by another name'}"
-        elif target is name and package == module.partition(".")[0]:
-            where = (
-                f"; looked for in {Path.cwd()}, where `slam` runs, among the installed packages, and in PYTHONPATH, "
-                "to which you can add another folder"
-            )
-        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {text_of(error)}{where}") from error
+        elif own and package == module.partition(".")[0]:
+            where = f"; looked for in {Path.cwd()}, where `slam` runs, among the installed packages, and in PYTHONPATH"
+        raise UnknownNameError(f"{failed} {text_of(error)}{where}") from error
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
-        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {text_of(error)}") from error
+        raise UnknownNameError(f"{failed} {text_of(error)}") from error
     except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
-        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {cause(error)}") from error
+        raise UnknownNameError(f"{failed} {cause(error)}") from error
+
+
+def _spoken(role: str) -> str:
+    """A role in words: "back end" or "front end"."""
+    return role[:-1].replace("end", " end")
 
 
 def _hidden(package: str) -> str:
@@ -109,22 +112,16 @@ def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:
         ConfigurationError: an option is unknown or out of its range; or the class cannot be created like that, or lacks
             methods of its protocol (they are named).
     """
-    what = role[:-1].replace("end", " end")
-    made = resolve(role, name)
-
-    def failed(error: BaseException) -> str:
-        return f"{what} {name!r} cannot be created: {cause(error)}"
-
+    what, made = f"{_spoken(role)} {name!r}", resolve(role, name)
     if options.get("models", options) is None:  # as where a class hands on its own default
         del options["models"]
     try:
         created = made(rig, **options)
     except SlamError:
         raise
-    except TypeError as error:
-        raise ConfigurationError(_unknown_option(f"{what} {name!r}", made, options) or failed(error)) from error
     except (Exception, SystemExit) as error:  # whatever a foreign class does
-        raise ConfigurationError(failed(error)) from error
+        wrong = _unknown_option(what, made, options) if isinstance(error, TypeError) else ""
+        raise ConfigurationError(wrong or f"{what} cannot be created: {cause(error)}") from error
     return require_methods(role, created, repr(name))
 
 
@@ -146,13 +143,9 @@ def _unknown_option(what: str, made: Any, options: Mapping[str, Any]) -> str:
 
 
 def require_methods(role: str, part: Any, name: str = "") -> Any:
-    """An object that is given as a back end or front end; None, for no front end, goes through.
-
-    Raises:
-        ConfigurationError: it lacks methods of its protocol (they are named).
-    """
+    """A back end or front end, or None for no front end; raises ConfigurationError where it lacks a method."""
     missing = [method for method in _METHODS[role] if not callable(getattr(part, method, None))]
     if missing and (part is not None or role == "backends"):
-        what = role[:-1].replace("end", " end")
-        raise ConfigurationError(f"{what} {name or type(part).__name__} is none: it lacks {', '.join(missing)}")
+        what = f"{_spoken(role)} {name or type(part).__name__}"
+        raise ConfigurationError(f"{what} is none: it lacks {', '.join(missing)}")
     return part

@@ -28,11 +28,12 @@ from slam.data import (
 )
 from slam.errors import ConfigurationError, SlamError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import LEAST_VARIANCE, Array
+from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, MapBackend
 from slam.mapping.atlas.atlas import Atlas, TrackingGap
 from slam.mapping.atlas.loop_closer import Found, LoopCloser
+from slam.mapping.known_landmarks import definite
 from slam.mapping.map_io import SavedMap
 from slam.mapping.mapper import Mapper
 from slam.mapping.step import Step
@@ -51,39 +52,23 @@ NEW_MAP = "the place is not in the map: a new map begins"
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end.
+    """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end."""
 
-    Attributes:
-        backend: holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`.
-        landmarks: the map's bookkeeping; None before the first frame.
-        atlas: keyframes and loops.
-        index: of the last frame.
-        stamp: its time [s].
-        tracking: how localization has gone.
-        standing: whether the camera stands.
-        dimensions: length of the descriptors; None before the first feature.
-        mapped: whether there ever was a landmark.
-        measured_at: time of the last frame whose pose was measured, or in which a new map began [s].
-        checksum: of the images; None without images, or of images that show nothing.
-        prior_map: in which the camera has not been found yet; None without one, or once it is found.
-        past: the paths of all back ends before the present one.
-        restarted: indices of the frames in which another back end took over.
-    """
-
-    backend: Backend
-    landmarks: LandmarkTable | None = None
-    atlas: Atlas = field(default_factory=Atlas)
-    index: int = -1
-    stamp: float = -np.inf
-    tracking: TrackingState = field(default_factory=TrackingState)
-    standing: Standing = field(default_factory=Standing)
-    dimensions: int | None = None
-    mapped: bool = False
-    measured_at: float = -np.inf
-    checksum: tuple[int, int] | None = None
+    backend: Backend  # holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`.
+    landmarks: LandmarkTable | None = None  # the map's bookkeeping; None before the first frame
+    atlas: Atlas = field(default_factory=Atlas)  # keyframes and loops
+    index: int = -1  # of the last frame
+    stamp: float = -np.inf  # its time [s]
+    tracking: TrackingState = field(default_factory=TrackingState)  # how localization has gone
+    standing: Standing = field(default_factory=Standing)  # whether the camera stands
+    dimensions: int | None = None  # length of the descriptors; None before the first feature
+    mapped: bool = False  # whether there ever was a landmark
+    measured_at: float = -np.inf  # time of the last frame whose pose was measured, or in which a new map began [s]
+    checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
+    # in which the camera has not been found yet; None without one, or once it is found
     prior_map: SavedMap | None = None
-    past: tuple[Trajectory, ...] = ()
-    restarted: tuple[int, ...] = ()
+    past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
+    restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
 
     @classmethod
     def in_map(cls, backend: Backend, known: SavedMap) -> State:
@@ -114,14 +99,11 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Elsewhere:
-    """Why a step ended early: the camera is not where the back end has it, so that another one must take over.
+    """Why a step ended early: the camera is not where the back end has it, so that another one must take over."""
 
-    Attributes:
-        T_world_left: the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins.
-        found: the place of the atlas by which it was found; None if it was found by the map's landmarks.
-    """
-
+    # the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins
     T_world_left: Array | None
+    # the place of the atlas by which it was found; None if it was found by the map's landmarks
     found: Found | None = None
 
 
@@ -213,11 +195,10 @@ class Session:
         none, rows = np.zeros(0, np.int64), np.zeros(0, np.intp)
         whole = self.map_estimate(state, features.stamp)
         estimate = replace(whole, ids=none, positions=whole.positions[:0], covariances=whole.covariances[:0])
+        report, seen = UpdateReport.nothing(UpdateStatus.EMPTY, NOT_FOUND), replace(features, images=None)
         result = FrameResult(
-            index=state.index + 1, status=FrameStatus.LOST, reason=NOT_FOUND, estimate=estimate,
-            report=UpdateReport.nothing(UpdateStatus.EMPTY, NOT_FOUND), features=replace(features, images=None),
-            predicted=0, matched=none, matched_features=rows, added=none, added_features=rows, erased=none,
-            map_size=len(whole.ids), located=False,
+            state.index + 1, FrameStatus.LOST, NOT_FOUND, estimate, report, seen, predicted=0, matched=none,
+            matched_features=rows, added=none, added_features=rows, erased=none, map_size=len(whole.ids), located=False,
         )  # fmt: skip
         return replace(state, index=state.index + 1, stamp=features.stamp, checksum=None), result
 
@@ -270,12 +251,8 @@ class Session:
     def left_behind(self, before: State, begun: State, step: Step) -> IdArray:
         """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began.
 
-        What the rig's uncertainty does to those is forgotten.
-
-        Args:
-            before: after the last frame.
-            begun: the state in which the step began; without landmarks where a new map did.
-            step: of this frame.
+        `before` is the state after the last frame; `begun` that in which the step began, without landmarks where a new
+        map did. What the rig's uncertainty does to those that left is forgotten.
         """
         if before.landmarks is None or begun.landmarks is not None:
             return step.erased
@@ -284,11 +261,8 @@ class Session:
 
     def _start(self, T_world_left: Array) -> Backend:
         """A back end without landmarks at a pose (4, 4) that is only roughly known."""
-        return self._new(
-            T_world_left=T_world_left.tolist(),
-            initial_position_sigma=POSITION_SIGMA,
-            initial_rotation_sigma=ROTATION_SIGMA,
-        )
+        sigmas = {"initial_position_sigma": POSITION_SIGMA, "initial_rotation_sigma": ROTATION_SIGMA}
+        return self._new(T_world_left=T_world_left.tolist(), **sigmas)
 
     def _new(self, **models: Any) -> Backend:
         """Another back end of the same kind."""
@@ -302,18 +276,11 @@ def _give_landmarks(old: Backend, new: Backend) -> None:
     """Give all landmarks of a back end to another one."""
     assert isinstance(new, MapBackend)
     whole = old.estimate()
-    covariances = 0.5 * (whole.covariances + np.swapaxes(whole.covariances, 1, 2))
-    short = np.maximum(LEAST_VARIANCE - np.linalg.eigvalsh(covariances)[:, 0], 0)
-    new.insert(whole.ids, whole.positions, covariances + short[:, None, None] * np.eye(3))
+    new.insert(whole.ids, whole.positions, definite(whole.covariances))
 
 
 def _fill(backend: Backend, known: SavedMap) -> None:
-    """Give a back end a saved map.
-
-    Raises:
-        ConfigurationError: it cannot start in a prior map.
-        SlamError: it cannot hold a map of this size.
-    """
+    """Give a back end a saved map."""
     name = type(backend).__name__
     if not isinstance(backend, MapBackend):
         raise ConfigurationError(f"{name} cannot start in a prior map: it has no insert")

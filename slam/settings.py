@@ -18,7 +18,7 @@ SETTABLE: dict[str, tuple[str, ...]] = {
     "models": ("motion.acceleration", "motion.angular_acceleration", "pixel_sigma"),
     "association": ("align",),
     "map": ("target_in_view", "max_landmarks", "max_depth_error", "monocular", "restart_after"),
-    "atlas": ("enabled", "give_back", "on_disk"),
+    "atlas": ("enabled", "give_back"),
     "self_calibration": ("enabled", "systematic"),
     "objects": ("mode", "max_speed", "min_speed", "database"),
     "surf": ("features", "descriptor", "upright", "min_depth", "max_depth", "threads"),
@@ -38,7 +38,7 @@ def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
     Raises:
         ConfigurationError: a text is not of that form, or its section or key is unknown.
     """
-    if isinstance(settings, str) or not all(isinstance(setting, str) for setting in _listed(settings)):
+    if not isinstance(settings, (list, tuple)) or not all(isinstance(setting, str) for setting in settings):
         raise ConfigurationError("settings must be a list of texts section.key=value")
     for setting in settings:
         if len(setting) > _LONGEST:
@@ -57,12 +57,9 @@ def can_be_set(key: str, owner: str = "") -> bool:
 
 
 def require_settable(settings: Iterable[str], tree: Mapping[str, Any], frontend: str) -> None:
-    """Refuse texts ``section.key=value`` of settings that are the program's own.
+    """Refuse texts ``section.key=value`` of settings that are the program's own; other faults `apply_settings` finds.
 
-    Args:
-        settings: as `apply_settings` takes them; faults that it finds are left to it.
-        tree: the configuration that they are for.
-        frontend: name of the front end.
+    `tree` is the configuration that they are for, `frontend` the name of the front end.
 
     Raises:
         ConfigurationError: one is no setting for users.
@@ -73,11 +70,6 @@ def require_settable(settings: Iterable[str], tree: Mapping[str, Any], frontend:
         if (key in known or own) and not can_be_set(key, frontend if own else ""):
             near = suggestion(key.rpartition(".")[2], SETTABLE[frontend]) if own else ""
             raise ConfigurationError(f"setting {key}: cannot be set{near}; `slam settings` lists those that can")
-
-
-def _listed(settings: Any) -> list[Any]:
-    """An iterable as a list; for anything else, a list with an element that is no text."""
-    return list(settings) if isinstance(settings, Iterable) else [None]
 
 
 def _value(text: str) -> Any:

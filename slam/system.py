@@ -24,7 +24,6 @@ from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.step import Step
 from slam.objects.modes import ObjectDetector, detector_for
-from slam.results import frame_result
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.one_thread import OneThread
@@ -33,22 +32,11 @@ from slam.runtime.stages import Stages
 from slam.session import Elsewhere, Session, State
 from slam.showing import count
 from slam.third_party import named_failures
-from slam.tracker import Tracker
+from slam.tracker import Tracker, frame_result
 from slam.tracks.table import LandmarkTable
-from slam.version import __version__
 
-
-def _require_types(
-    rig: StereoRig, config: SystemConfig | None, prior_map: SavedMap | None, rig_prior: SavedCalibration | None
-) -> None:
-    """Raise ConfigurationError if an argument of a system has another type than documented."""
-    kinds: dict[str, tuple[object, type]] = {
-        "rig": (rig, StereoRig), "config": (config, SystemConfig),
-        "prior_map": (prior_map, SavedMap), "rig_prior": (rig_prior, SavedCalibration),
-    }  # fmt: skip
-    for name, (value, kind) in kinds.items():
-        if not isinstance(value, kind) and (value is not None or name == "rig"):
-            raise ConfigurationError(f"{name} must be a {kind.__name__}, got {type(value).__name__}")
+#: Types of a system's arguments.
+_TYPES = {"rig": StereoRig, "config": SystemConfig, "prior_map": SavedMap, "rig_prior": SavedCalibration}
 
 
 class StereoSlam:
@@ -96,25 +84,23 @@ class StereoSlam:
         rig_prior: SavedCalibration | None = None,
     ) -> None:
         keep_freed_memory()
-        _require_types(rig, config, prior_map, rig_prior)
+        for (name, wanted), value in zip(_TYPES.items(), (rig, config, prior_map, rig_prior)):
+            if not isinstance(value, wanted) and (value is not None or name == "rig"):
+                raise ConfigurationError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
         c = config or SystemConfig.for_kind(kind, *names)
         if prior_map is not None and len(prior_map) > c.map.max_landmarks:  # all of it is kept
             c = replace(c, map=replace(c.map, max_landmarks=len(prior_map)))
         self.config = c
-        self.frontend: Frontend | None = (
-            registry.create("frontends", frontend, rig, **c.frontend)
-            if isinstance(frontend, str)
-            else registry.require_methods("frontends", frontend)
-        )
+        if isinstance(frontend, str):
+            frontend = registry.create("frontends", frontend, rig, **c.frontend)
+        if isinstance(backend, str):
+            backend = registry.create("backends", backend, rig, models=c.models, **c.backend)
+        self.frontend: Frontend | None = registry.require_methods("frontends", frontend)
+        first: Backend = registry.require_methods("backends", backend)
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
-        first: Backend = (
-            registry.create("backends", backend, rig, models=c.models, **c.backend)
-            if isinstance(backend, str)
-            else registry.require_methods("backends", backend)
-        )
         self._session = Session(rig, c, names[1], first, rig_prior)
         self._tracker = Tracker(self._session, detector_for(rig, c.objects, c.models))
         self._stages = Stages()
@@ -214,8 +200,9 @@ class StereoSlam:
         """One step from features: predict, associate, update, and manage the map (paper A, III and IV; paper B, 2).
 
         A frame without features is no error: the pose is predicted and the status says so. A step ended by an
-        exception, such as an interrupt, leaves the map unchanged (see `roll_back`), but the back end is already at the
-        stamp of that frame, so continue with a later one. Self-calibration keeps what it has learnt from the frame.
+        exception, such as an interrupt, leaves the map unchanged, but for landmarks that it had removed already, and
+        forgets moving bodies. The back end is already at the stamp of that frame, so continue with a later one.
+        Self-calibration keeps what it has learnt from the frame.
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
@@ -238,12 +225,9 @@ class StereoSlam:
         return named_failures(place, self.backend, self.frontend)
 
     def _step(self, state: State, features: StereoFeatures, begun: Prediction | None = None) -> Step | Elsewhere:
-        """The way of a frame from its features to the map, beside the present state.
+        """The way of a frame from its features, as measured, to the map, beside the state before the frame.
 
-        Args:
-            state: before the frame.
-            features: as measured.
-            begun: the prediction of a back end that takes over in this frame, at a pose that is believed.
+        `begun` is the prediction of a back end that takes over in this frame, at a pose that is believed.
         """
         stage, t = self._stages.stage, self._tracker
         with stage("predict"):  # the motion model advances the camera's pose (paper A, Eq. 11), unless it stands
@@ -296,21 +280,10 @@ class StereoSlam:
         self._state, self._stages = state.after(step, checksum), Stages()
         return result
 
-    @one_blas_thread
-    def roll_back(self) -> None:
-        """After a step that an exception ended: undo its changes of the map, in the back end as well.
-
-        Landmarks that it added are removed; those that it had removed from the back end leave the map. The camera's
-        estimate stays as the step left it. Bodies are forgotten if their detector was interrupted. The next step,
-        `estimate` and `snapshot` do this by themselves; without such an exception there is nothing to do.
-        """
-        with self._stepping, self._named("taking a step back"):
-            self._roll_back()
-
     def _roll_back(self) -> None:
-        """`roll_back`, in the only thread."""
-        self._state = self._tracker.roll_back(self._state, self._stages.current)
-        self._stages = Stages()
+        """After a step that an exception ended: what it did to the back end's map is undone."""
+        if self._stages.begun:
+            self._state, self._stages = self._tracker.roll_back(self._state), Stages()
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
@@ -348,7 +321,7 @@ class StereoSlam:
             rows = self.landmarks.moved(self.atlas.T_map_odom)
             keyframes = (k.corrected(self.calibration.applied, self.rig.rectified.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
-            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, atlas)
+            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas)
 
     @property
     def warnings(self) -> list[str]:

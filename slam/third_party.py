@@ -14,7 +14,7 @@ from slam.checks import LATEST_STAMP
 from slam.data import Estimate, Patches, Prediction, UpdateReport, UpdateStatus
 from slam.errors import PartError, SlamError, cause, text_of
 
-_OURS = ("slam", "backends", "frontends")
+_OURS = ("slam", "backends", "frontends", "builtins")
 
 #: What each method answers: a type, and the types or shapes of its attributes. Equal letters stand for equal numbers.
 _POSE = {"stamp": Real, "T_world_left": (4, 4), "covariance": (6, 6), "ids": ("n",)}
@@ -34,11 +34,7 @@ _FINITE = {"T_world_left", "covariance", "positions", "covariances", "real"}
 def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     """What a method of a back end or front end answered, checked; a step does that with every answer, so it is cheap.
 
-    Args:
-        owner: the back end or front end.
-        method: its name.
-        answer: what it returned.
-        sizes: of the arrays, by the letters of `_ANSWERS`, where they are known.
+    `sizes` of the arrays, by the letters of `_ANSWERS`, are those that are known.
 
     Raises:
         SlamError: it is of another type than documented, an array of another shape, or a pose or position not finite.
@@ -78,11 +74,7 @@ def _require_array(value: Any, wanted: tuple[Any, ...], sizes: dict[str, int], w
 def named_failures(place: str, *parts: object) -> Iterator[None]:
     """Turn exceptions that a third-party part raised, or that its return values may have caused, into `PartError`.
 
-    If all parts are our own, exceptions pass unchanged.
-
-    Args:
-        place: the present operation, for the message.
-        parts: the back end, the front end.
+    If all parts are our own, exceptions pass unchanged. `place` is the present operation, for the message.
 
     Raises:
         PartError: chained from the exception.
@@ -92,18 +84,14 @@ def named_failures(place: str, *parts: object) -> Iterator[None]:
     except SlamError:
         raise
     except (Exception, SystemExit) as error:  # whatever a third-party class does
-        foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in (*_OURS, "builtins")]
-        if not foreign or (isinstance(error, SystemExit) and not any(_raised_by(part, error) for part in foreign)):
+        foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in _OURS]
+        *_, (last, _) = walk_tb(error.__traceback__)
+        by_part = last.f_globals.get("__name__") in [type(part).__module__ for part in foreign]
+        if not foreign or (isinstance(error, SystemExit) and not by_part):  # as of a signal handler elsewhere
             raise
         part, call = next(((part, f".{call}") for part in foreign if (call := _call(error, part))), (foreign[0], ""))
         failed = "failed" if call else "may have failed"  # what it answered may have broken something of ours
         raise PartError(f"{place}: {type(part).__name__}{call} {failed}: {cause(error)}") from error
-
-
-def _raised_by(part: object, error: BaseException) -> bool:
-    """Whether an exception was raised in the module of `part`, not by a signal handler elsewhere."""
-    *_, (frame, _) = walk_tb(error.__traceback__)
-    return frame.f_globals.get("__name__") == type(part).__module__
 
 
 def _call(error: BaseException, part: object) -> str:

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
+from slam.data import (
+    Estimate,
+    FrameResult,
+    FrameStatus,
+    IdArray,
+    Prediction,
+    StereoFeatures,
+    UpdateReport,
+    UpdateStatus,
+)
 from slam.geometry.arrays import Array, isin
+from slam.geometry.se3 import inverse
+from slam.input.warnings import REPEATED
 from slam.interfaces import Frontend, RestingBackend
 from slam.mapping.step import Step
+from slam.object_data import MovingObject
 from slam.objects.modes import ObjectDetector
-from slam.rig_error import Revision
+from slam.rig_error import CommonError, Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
 from slam.third_party import checked
 from slam.tracks.alignment import Aligner
 from slam.tracks.localizer import LandmarkMatches
 from slam.tracks.standing import Standing
+from slam.tracks.state import HIDDEN
 from slam.tracks.table import LandmarkTable
 
 
@@ -156,11 +170,10 @@ class Tracker:
             rig_error.uncertainty.change(back, _positions(state, back), back[:0], again=True)
         return replace(step, atlas=atlas)
 
-    def roll_back(self, state: State, stage: str | None) -> State:
-        """The state after a step that was interrupted in a stage: what it did to the back end's map is undone."""
-        if stage in ("predict", "associate", "objects"):  # those change its tracks
-            self.objects.restart()
-        if stage in (None, "predict") or state.prior_map is not None:  # that back end has not begun
+    def roll_back(self, state: State) -> State:
+        """The state after an interrupted step: what that did to the back end's map is undone, bodies are forgotten."""
+        self.objects.restart()
+        if state.prior_map is not None or not np.isfinite(self.advanced):  # that back end has not begun
             return state
         landmarks = self._session.mapper.reconcile(state.backend, state.landmarks)
         self._session.rig_error.uncertainty.keep(np.zeros(0, np.int64) if landmarks is None else landmarks.ids)
@@ -174,3 +187,51 @@ class Tracker:
 def _positions(state: State, ids: IdArray) -> Array:
     """Landmarks' positions (N, 3) [m] in the world."""
     return np.asarray(checked(state.backend, "positions", state.backend.positions(ids), n=len(ids)))
+
+
+def frame_result(
+    step: Step, mapped_before: bool, revision: Revision | None, milliseconds: Mapping[str, float], common: CommonError
+) -> FrameResult:  # fmt: skip
+    """The result of a step.
+
+    `mapped_before` says whether there ever was a landmark before; `revision` is the change of earlier pixels'
+    correction before the step, `common` the part of the pose's error that it shares with the poses reported in other
+    frames.
+    """
+    atlas, objects = step.atlas, step.objects
+    if atlas.loops:
+        objects = tuple(_in_map(thing, atlas.T_map_odom) for thing in objects)
+    status, reason = _status(step, mapped_before)
+    return FrameResult(
+        step.index, status, reason, atlas.estimate(step.estimate, step.common), step.report, step.features,
+        len(step.prediction.ids), step.matches.ids, step.matches.rows, step.added.ids, step.added.rows, step.erased,
+        len(step.landmarks), dict(milliseconds), step.labels.moving, objects, revision=revision,
+        T_map_odom=atlas.T_map_odom, loop=atlas.closed_in(step.index), refused_loop=atlas.refused_in(step.index),
+        keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index, returned=step.returned.ids,
+        common=common if atlas.anchor is None else CommonError(),
+    )  # fmt: skip
+
+
+def _in_map(thing: MovingObject, T_map_odom: Array) -> MovingObject:
+    """A body in the map's coordinates; of its covariances only the velocity's changes, the pose's is in body axes."""
+    e, R = thing.estimate, np.kron(np.eye(2), T_map_odom[:3, :3])
+    motion, since = (T_map_odom @ T @ inverse(T_map_odom) for T in (thing.motion, thing.motion_since_found))
+    pose, P = T_map_odom @ e.T_world_object, R @ e.velocity_covariance @ R.T
+    estimate = replace(e, T_world_object=pose, velocity=R @ e.velocity, velocity_covariance=P)
+    return replace(thing, estimate=estimate, motion=motion, motion_since_found=since)
+
+
+def _status(step: Step, mapped_before: bool) -> tuple[FrameStatus, str]:
+    """How a frame ended, and why where it was not tracked."""
+    if step.report.status is UpdateStatus.FAILED:
+        return FrameStatus.FAILED, step.report.reason
+    if not step.tracking.unmatched:
+        return FrameStatus.TRACKED, ""
+    if not mapped_before:
+        return (FrameStatus.STARTED, "") if len(step.added) else (FrameStatus.PREDICTED, "nothing to see yet")
+    reason = REPEATED if step.repeated else step.report.reason
+    if step.matches.doubted:
+        reason = f"{step.matches.doubted} landmarks agree on a pose too far from the prediction to be believed at once"
+        reason = reason if step.tracking.hidden_at is None else HIDDEN
+    reason = reason or f"only {len(step.report.used)} of {len(step.matches)} matched landmarks were used"
+    return (FrameStatus.LOST if step.tracking.lost else FrameStatus.PREDICTED), reason

@@ -15,6 +15,7 @@ from backends.ekf.motion import Camera, EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import Jacobian, UnsolvableError, Update
 from backends.ekf.state import FilterState
+from slam.bounds import from_options
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
@@ -24,7 +25,6 @@ from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
-from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION
 from slam.window.stereo import RectifiedMeasurement

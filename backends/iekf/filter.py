@@ -8,10 +8,9 @@ from typing import Any
 from backends.ekf.filter import EkfBackend, Form
 from backends.ekf.landmarks import InverseDepth
 from backends.iekf.camera import InvariantCamera
-from slam.bounds import require_positive
+from slam.bounds import from_options, require_positive
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
-from slam.options import from_options
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from backends.smoother.mending import corrected, path_solved, rebuilt
 from backends.smoother.path import Path
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
+from slam.bounds import from_options
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import CopyError, MeasurementError
@@ -23,7 +24,6 @@ from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
-from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 
 

@@ -12,6 +12,7 @@ from backends.window.config import WindowConfig
 from backends.window.history import Call, History, state_corrected
 from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
+from slam.bounds import from_options
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import MeasurementError
@@ -20,7 +21,6 @@ from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
-from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 
 

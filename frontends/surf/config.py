@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from slam.bounds import require_not_negative
+from slam.bounds import from_options, require_not_negative
 from slam.errors import ConfigurationError
-from slam.options import from_options
 
 _RANGES = {  # least and largest values
     "features": (1, 100_000),

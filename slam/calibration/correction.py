@@ -13,15 +13,10 @@ from slam.geometry.se3 import Array
 
 @dataclass(frozen=True, eq=False)
 class RigCorrection:
-    """Maps measured pixels to those of an ideal rig.
+    """Maps measured pixels to those of an ideal rig."""
 
-    Attributes:
-        model: the parameters' meaning.
-        parameters: their values (n,).
-    """
-
-    model: RigModel
-    parameters: Array
+    model: RigModel  # the parameters' meaning
+    parameters: Array  # their values (n,)
 
     def rows(self, z: Array) -> Array:
         """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]; uR NaN stays NaN."""
@@ -53,13 +48,9 @@ class RigCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Revision:
-    """A change of the correction during a run, for measurements that have the earlier correction.
+    """A change of the correction during a run, for measurements that have the earlier correction."""
 
-    Attributes:
-        before, after: the corrections.
-    """
-
-    before: RigCorrection
+    before: RigCorrection  # the corrections
     after: RigCorrection
 
     def rows(self, z: Array) -> Array:

@@ -9,19 +9,12 @@ import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.correction import Revision, RigCorrection
-from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence
+from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence, row_evidence
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
 from slam.calibration.posterior import RigPosterior, Solution, residual_scale, solve
-from slam.calibration.prior import (
-    factory_prior,
-    focal_sigma,
-    prior_information,
-    resumed_prior,
-    systematic_variance,
-)
-from slam.calibration.rows import row_evidence
-from slam.calibration.saved import RigNumbers, SavedCalibration
+from slam.calibration.prior import factory_prior, focal_sigma, prior_information, resumed_prior, systematic_variance
+from slam.calibration.saved import SavedCalibration, rig_numbers
 from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
@@ -124,9 +117,9 @@ class SelfCalibration:
 
     def _motion_agrees(self) -> bool:
         """Whether the evidence of motion is likelier with the posterior mean than with the calibration as delivered."""
-        if not self.pairs and self._open is None:
-            return False
         motion, mean = self._moved(), self._solution.mean
+        if motion is None:
+            return False
         return bool(motion.e @ mean - 0.5 * mean @ motion.S @ mean > 1)  # a fitted parameter's gain (Akaike)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
@@ -146,11 +139,9 @@ class SelfCalibration:
         return replace(now, uv_left=uv_left, uv_right=uv_right)
 
     def observe(self, features: StereoFeatures, T_world_left: Array) -> None:
-        """Learn from one frame.
+        """Learn from one frame's features as measured, not corrected.
 
-        Args:
-            features: of the frame as measured, not corrected.
-            T_world_left: the left camera's pose (4, 4) by the system, an initial guess.
+        `T_world_left` (4, 4) is the left camera's pose by the system, a first guess.
         """
         if not self.config.enabled:
             return
@@ -176,8 +167,7 @@ class SelfCalibration:
         if self._looked is None:
             return True
         cosine = 0.5 * (np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) - 1)
-        # 0.05: but at least one per rotation by this angle [rad]: turns are rare, and they alone show the focal
-        # length
+        # 0.05: one frame at least per rotation by this angle [rad]: turns are rare, and alone show the focal length
         return bool(cosine < np.cos(0.05))
 
     def _compare(self, view: View) -> None:
@@ -209,22 +199,22 @@ class SelfCalibration:
 
     def evidence(self) -> RecordingEvidence | None:
         """The evidence of this recording alone, without any prior; None if no motion was seen."""
-        if not self.pairs and self._open is None:
+        moved, rows = self._moved(), self._rows.total()
+        if moved is None or rows is None or self._fields is None:
             return None
-        (rows,), moved = self._rows.total(), self._moved()
-        assert self._fields is not None  # as there are rows
         return RecordingEvidence(rows + moved, moved, residual_scale(self._prior, self._fields))
 
-    def _moved(self) -> Evidence:
+    def _moved(self) -> Evidence | None:
         """The evidence of motion: of the pairs, and of the incomplete one."""
-        parts = self._motion.total()
-        if self._open is not None:
-            parts.append(self._open.scaled(1 / self._motion.inflation))
-        return sum(parts[1:], parts[0])
+        complete = self._motion.total()
+        if self._open is None:
+            return complete
+        part = self._open.scaled(1 / self._motion.inflation)
+        return part if complete is None else complete + part
 
     def kept(self) -> SavedCalibration:
         """The present posterior, as a prior for further recordings of the rig."""
-        return SavedCalibration(self.posterior, RigNumbers.of(self.rig), self._solution.residual)
+        return SavedCalibration(self.posterior, rig_numbers(self.rig), self._solution.residual)
 
     def summary(self) -> dict[str, Any]:
         """The result as plain types."""
@@ -236,24 +226,20 @@ class SelfCalibration:
         pixel, disparity = np.exp(self._variances)
         return np.diag([pixel, pixel, disparity])
 
-    def _ideal(self, pair: Pair) -> Pair:
-        """A pair of views with its points corrected by the present posterior."""
-        first, second = (p + self.model.shift(p, self._solution.mean) for p in (pair.first, pair.second))
-        return replace(pair, first=first, second=second)
-
     def _evidence(self, first: View, second: View, matched: Rows) -> Evidence | None:
         """The evidence of a pair of views with matched features; None without a solution."""
-        c = self.config
-        pair = pair_of(self.model, first, second, self._solution.mean, self._noise, self._seen, matched)
-        if len(pair.first) < c.minimum_common:
+        mean = self._solution.mean
+        pair = pair_of(self.model, first, second, mean, self._noise, self._seen, matched)
+        if len(pair.first) < self.config.minimum_common:
             self.unsolved += 1
             return None
-        if parallax(self.model, pair) < c.minimum_parallax:
+        if parallax(self.model, pair) < self.config.minimum_parallax:
             return None
+        one, two = (points + self.model.shift(points, mean) for points in (pair.first, pair.second))
         self._scattered += 1
-        scatter = np.log(noise_variances(self._ideal(pair), self.model.focal, self._noise))
+        scatter = np.log(noise_variances(Pair(one, two, pair.R, pair.t), self.model.focal, self._noise))
         self._variances = self._variances + (scatter - self._variances) / self._scattered
-        evidence = pair_evidence(self.model, pair, self._solution.mean, self._noise)
+        evidence = pair_evidence(self.model, pair, mean, self._noise)
         self.unsolved += evidence is None
         return evidence
 
@@ -264,9 +250,9 @@ class SelfCalibration:
         found = self.evidence()
         assert found is not None  # because there are pairs
         if self._kept:
-            self._solution = solve(self._prior, found.residual, [found.whole.with_error(self._systematic)])
+            self._solution = solve(self._prior, found.residual, found.whole.with_error(self._systematic))
         else:
-            self._solution = solve(self._prior, found.residual, [found.motion], [found.whole])
+            self._solution = solve(self._prior, found.residual, found.motion, found.whole)
 
 
 def _mean_variance(changes: Array, covariance: Array) -> float:

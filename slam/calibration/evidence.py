@@ -1,4 +1,4 @@
-"""The likelihood of the parameters, summed in blocks so that errors shared by neighbouring frames count once."""
+"""The likelihood of the parameters, by rows and summed in blocks so that errors shared by neighbours count once."""
 
 from __future__ import annotations
 
@@ -6,23 +6,20 @@ from typing import NamedTuple
 
 import numpy as np
 
+from slam.calibration.model import RESIDUAL, RigModel
+from slam.chi_square import chi_square_limit
+from slam.geometry.arrays import median
 from slam.geometry.se3 import Array
 
 _PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts for
 
 
 class Evidence(NamedTuple):
-    """A Gaussian likelihood in information form: ``log p = eᵀ θ - θᵀ S θ / 2``.
+    """A Gaussian likelihood in information form: ``log p = eᵀ θ - θᵀ S θ / 2``."""
 
-    Attributes:
-        S: information (n, n).
-        e: information times mean (n,).
-        cross: information that the parameters share with the residual fields (n, m).
-    """
-
-    S: Array
-    e: Array
-    cross: Array
+    S: Array  # information (n, n)
+    e: Array  # information times mean (n,)
+    cross: Array  # information that the parameters share with the residual fields (n, m)
 
     def scaled(self, factor: float) -> Evidence:
         """The same with `factor` times the information."""
@@ -43,18 +40,12 @@ class Evidence(NamedTuple):
 
 
 class RecordingEvidence(NamedTuple):
-    """The evidence of one recording, without any prior.
+    """The evidence of one recording, without any prior."""
 
-    Attributes:
-        whole: of its rows and its motion.
-        motion: of its motion alone, from which the scale of the calibration's errors follows: rows have errors of their
-            own.
-        residual: scale of the residual fields by its rows, from 0 to 1.
-    """
-
-    whole: Evidence
+    whole: Evidence  # of its rows and its motion
+    # of its motion alone, from which the scale of the calibration's errors follows: rows have errors of their own
     motion: Evidence
-    residual: float = 1.0
+    residual: float = 1.0  # scale of the residual fields by its rows, from 0 to 1
 
     def scaled(self, factor: float) -> RecordingEvidence:
         """The same with `factor` times the information."""
@@ -77,7 +68,7 @@ class Accumulator:
     def __init__(self, inflation: float, length: int) -> None:
         self._prior = inflation
         self._blocks: list[Evidence] = []
-        self._before: Evidence | None = None  # the sum of all blocks but the last, None where it is out of date
+        self._before: Evidence | None = None  # cost: the sum of all blocks but the last, None where it is out of date
         self._length = length
         self._in_last = 0
         self.count = 0
@@ -93,35 +84,28 @@ class Accumulator:
         self._in_last += 1
         self.count += 1
         if len(self._blocks) > 32:  # 32: blocks of evidence kept separately, for their scatter
-            self._join()
+            even, odd = self._blocks[::2], self._blocks[1::2]
+            if len(even) == len(odd):
+                self._in_last += self._length
+            self._blocks = [a + b for a, b in zip(even, odd)] + even[len(odd) :]
+            self._length, self._before = 2 * self._length, None
 
-    def _join(self) -> None:
-        """Merge neighbours into blocks of twice the length."""
-        even, odd = self._blocks[::2], self._blocks[1::2]
-        if len(even) == len(odd):
-            self._in_last += self._length
-        self._blocks = [a + b for a, b in zip(even, odd)] + even[len(odd) :]
-        self._length *= 2
-        self._before = None
-
-    def total(self) -> list[Evidence]:
-        """The sum, with its information divided by the inflation, in a list; empty if there is no likelihood."""
+    def total(self) -> Evidence | None:
+        """The sum, with its information divided by the inflation; None if there is no likelihood."""
         if not self._blocks:
-            return []
+            return None
         *earlier, last = self._blocks
         if earlier and self._before is None:
             self._before = sum(earlier[1:], earlier[0])
         whole = last if self._before is None else self._before + last
-        return [whole.scaled(1 / self.inflation)]
+        return whole.scaled(1 / self.inflation)
 
     def update_inflation(self, mean: Array, covariance: Array) -> None:
         """Estimate the inflation from the scatter of the blocks' gradients about the solution of the blocks alone.
 
         About a solution that the prior holds elsewhere all gradients point the same way, which is no scatter.
 
-        Args:
-            mean: of the parameters (n,), near that solution or not.
-            covariance: of the parameters, residual fields left out (n, n).
+        `mean` (n,) is near that solution or not; `covariance` (n, n) is without residual fields.
         """
         count = len(self._blocks)
         if count < 2:
@@ -134,9 +118,41 @@ class Accumulator:
             gradient = e - S @ own
             scatter += float(gradient @ covariance @ gradient)
             terms += float(np.sum(S * covariance))
-        if terms <= 0:
-            return
-        ratio = scatter / (terms * (1 - 1 / count))
-        weight = terms / self.inflation * (count - 1)  # parameters that the data determine, for each block
-        total = _PRIOR_TERMS * self._prior + weight * ratio
-        self.inflation = max(1.0, total / (_PRIOR_TERMS + weight))
+        if terms > 0:
+            ratio = scatter / (terms * (1 - 1 / count))
+            weight = terms / self.inflation * (count - 1)  # parameters that the data determine, for each block
+            self.inflation = max(1.0, (_PRIOR_TERMS * self._prior + weight * ratio) / (_PRIOR_TERMS + weight))
+
+
+def student_weights(squared: Array, dof: int, least: float) -> Array:
+    """Weights (N,) of residuals by Student's t distribution, as factors on their information.
+
+    Args:
+        squared: squared residuals (N,), in units of a covariance of unknown scale.
+        dof: dimension of a residual.
+        least: least scale, as a standard deviation. The squared scale is the median of `squared` over that of χ².
+    """
+    if not len(squared):
+        return squared
+    scale = max(median(squared) / chi_square_limit(dof, 0.5), least**2)
+    # 4.0: degrees of freedom of Student's t, with tails like those of matches, a few of which are wrong
+    return np.asarray((4.0 + dof) / (4.0 + squared / scale) / scale)
+
+
+def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> tuple[Evidence, Evidence]:
+    """Likelihood of the parameters by one frame's vertical disparities, which an ideal rectified pair does not have.
+
+    `points` ``(x, y, d)`` (N, 3) [px] of the matches and `vertical`, right row less left row (N,) [px], are as
+    measured; outliers are identified at `parameters` (n,).
+
+    Returns:
+        The evidence of the parameters (n), and of them followed by the right camera's residual fields of y (n + k). The
+        left camera's fields have the same effect with opposite sign.
+    """
+    A, fields = model.vertical(points), model.residual_vertical(points)
+    residual = vertical + A @ parameters
+    weights = student_weights(residual**2, 1, 0.03)[:, None]  # 0.03: of a row [px], the least that is believed
+    both = np.column_stack([A, fields[:, -len(RESIDUAL) :]])
+    weighted, n = both * weights, A.shape[1]
+    S, e = weighted.T @ both, -(weighted.T @ vertical)
+    return Evidence(S[:n, :n], e[:n], weighted[:, :n].T @ fields), Evidence(S, e, np.zeros((len(e), 0)))

@@ -11,13 +11,13 @@ from slam.calibration.evidence import RecordingEvidence
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import RigPosterior, solve
 from slam.calibration.prior import factory_prior, residual_variance, systematic_variance
-from slam.calibration.saved import RigNumbers, SavedCalibration
+from slam.calibration.saved import SavedCalibration, rig_numbers
 from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
 
-#: Recordings agree in a parameter if they differ by less than this many standard deviations of the difference.
-AGREES = 2.0
-_DIFFERS = 3.0  # and disagree if by more than this many; differences between the two limits may be chance
+#: Recordings agree in a parameter if they differ by less than this many standard deviations of the difference, and
+#: disagree if by more than the second number; differences between the two limits may be chance.
+_AGREES, _DIFFERS = 2.0, 3.0
 
 
 def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> SavedCalibration:
@@ -37,30 +37,28 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
     """
     if not evidence:
         raise CalibrationError("calibration: in no recording was there a motion that shows the rig's errors")
-    variance, alone = systematic_variance(model, systematic), len(evidence) == 1
-    known = [part.whole if alone else part.whole.with_error(variance) for part in evidence]
-    scaled_by = [part.motion if alone else part.whole for part in evidence]
-    residual = max(part.residual for part in evidence)
-    solution = solve(factory_prior(model), residual, scaled_by, known)
-    covariance = solution.covariance + (np.diag(variance) if alone else 0.0)
+    first, variance, prior = evidence[0], systematic_variance(model, systematic), factory_prior(model)
+    if len(evidence) == 1:
+        solution = solve(prior, first.residual, first.motion, first.whole)
+        covariance = solution.covariance + np.diag(variance)
+    else:
+        whole = [part.whole for part in evidence]
+        known = [part.with_error(variance) for part in whole]
+        residual = max(part.residual for part in evidence)
+        solution = solve(prior, residual, sum(whole[1:], whole[0]), sum(known[1:], known[0]))
+        covariance = solution.covariance
     posterior = RigPosterior(model.names, model.units, solution.mean, 0.5 * (covariance + covariance.T))
-    return SavedCalibration(posterior, RigNumbers.of(model.rig), solution.residual)
+    return SavedCalibration(posterior, rig_numbers(model.rig), solution.residual)
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """Differences between recordings, each by its own evidence.
+    """Differences between recordings, each by its own evidence."""
 
-    Attributes:
-        names: of the parameters (n,).
-        largest: the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN if fewer
-            than two determine it.
-        pairs: the recordings (n, 2) that differ most; meaningless where `largest` is NaN.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the parameters (n,)
+    # the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN if fewer than two
+    # determine it
     largest: Array
-    pairs: np.ndarray
 
     @property
     def words(self) -> str:
@@ -71,25 +69,20 @@ class Agreement:
         worst, total = int(np.nanargmax(self.largest)), len(known)
         every = "every parameter" if known.all() else f"all {known.sum()} of {total} parameters that two of them show"
         least = f"the largest difference is {self.largest[worst]:.1f} sigma, in {self.names[worst]}"
-        if self.largest[worst] <= AGREES:
+        if self.largest[worst] <= _AGREES:
             return f"The recordings agree in {every}: {least}."
-        differing = [name for name, z in zip(self.names, self.largest) if z > AGREES]
+        differing = ", ".join(name for name, z in zip(self.names, self.largest) if z > _AGREES)
         if self.largest[worst] <= _DIFFERS:
-            return f"The recordings agree, but for {', '.join(differing)}, where chance may do it: {least}."
-        return f"The recordings do not agree in {', '.join(differing)}: {least}. Is it one rig, and has it not changed?"
+            return f"The recordings agree, but for {differing}, where chance may do it: {least}."
+        return f"The recordings do not agree in {differing}: {least}. Is it one rig, and has it not changed?"
 
 
 def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> Agreement | None:
-    """Compare recordings in pairs; None for a single recording.
+    """Compare recordings in pairs; None for a single recording. For the arguments see `joint_calibration`.
 
     The prior, which they share, is no evidence of agreement. So each parameter's marginal posterior is divided by the
     prior, which gives that parameter's likelihood by the recording alone, with the others marginalised. A recording
     with less information on a parameter than the prior is left out.
-
-    Args:
-        model: the parameters' meaning.
-        evidence: of each recording, without any prior.
-        systematic: see `joint_calibration` [px].
     """
     if len(evidence) < 2:
         return None
@@ -108,5 +101,4 @@ def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic
     mean, own = np.array(means), 1 / np.array(informations)
     first, second = np.triu_indices(len(evidence), 1)
     z = np.abs(mean[first] - mean[second]) / np.sqrt(own[first] + own[second])
-    rows = np.argmax(np.nan_to_num(z, nan=-1.0), axis=0)
-    return Agreement(model.names, z[rows, np.arange(z.shape[1])], np.column_stack([first[rows], second[rows]]))
+    return Agreement(model.names, np.fmax.reduce(z, axis=0))

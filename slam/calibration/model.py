@@ -80,11 +80,11 @@ class RigModel:
         the pose rotate with each revision, the ideal rig is rotated such that the left image as a whole does not move.
         """
         by_turn = _turn(points, self.focal).reshape(-1, 3) @ self._gauge
-        return np.asarray(self._unturned(points) + by_turn.reshape(len(points), 3, len(self.names)))
+        return np.asarray(_field(points, self.focal) + by_turn.reshape(len(points), 3, len(self.names)))
 
     def shift(self, points: Array, parameters: Array) -> Array:
         """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,): ``field(points) @ parameters``."""
-        field = self._unturned(points)
+        field = _field(points, self.focal)
         shift = field.reshape(-1, field.shape[2]) @ parameters
         shift += _turn(points, self.focal).reshape(-1, 3) @ (self._gauge @ parameters)
         return np.asarray(shift.reshape(-1, 3))
@@ -94,13 +94,9 @@ class RigModel:
         """Rotation of the ideal rig (3, n) [rad] that cancels the left image's mean displacement by the parameters."""
         far = self.far()
         turned, moved = (
-            rows[:, :2].reshape(2 * len(far), -1) for rows in (_turn(far, self.focal), self._unturned(far))
+            rows[:, :2].reshape(2 * len(far), -1) for rows in (_turn(far, self.focal), _field(far, self.focal))
         )
         return -np.asarray(np.linalg.lstsq(turned, moved, rcond=None)[0])
-
-    def _unturned(self, points: Array) -> Array:
-        """`field` without the rotation."""
-        return _field(points, self.focal)
 
     def vertical(self, points: Array) -> Array:
         """Change (N, n) [px] of the vertical disparity, right row less left row, by the parameters.

@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.calibration.evidence import Evidence
+from slam.calibration.evidence import Evidence, student_weights
 from slam.calibration.model import RigModel
-from slam.calibration.robust import student_weights
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, so3_exp
@@ -21,61 +20,39 @@ from slam.geometry.se3 import Array, so3_exp
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """The same still points in two views.
+    """The same still points in two views."""
 
-    Attributes:
-        first, second: ``(x, y, d)`` (N, 3) [px], d the disparity, as measured.
-        R, t: first guess of the motion (3, 3), (3,) [baselines] that takes the first view's points to the second's.
-    """
-
-    first: Array
+    first: Array  # ``(x, y, d)`` (N, 3) [px], d the disparity, as measured
     second: Array
-    R: Array
+    R: Array  # first guess of the motion (3, 3), (3,) [baselines] that takes the first view's points to the second's
     t: Array
 
 
 class Linear(NamedTuple):
-    """A motion at some points, linearised.
+    """A motion at some points, linearised."""
 
-    Attributes:
-        moved: where the motion takes the points (N, 3) [px].
-        J_point, J_motion: derivatives of `moved` (N, 3, 3), (N, 3, 6) by the points and by ``[rotation (left), t]``.
-        motion: `J_motion`, whitened.
-        white: whitening matrices of the residuals (N, 3, 3), lower triangular; NaN where their covariance is not
-            positive definite.
-        residual: second view less its prediction from the first (N, 3), whitened.
-    """
-
-    moved: Array
-    J_point: Array
-    J_motion: Array
-    motion: Array
-    white: Array
-    residual: Array
+    moved: Array  # where the motion takes the points (N, 3) [px]
+    J_point: Array  # derivatives of `moved` by the points (N, 3, 3)
+    J_motion: Array  # and by ``[rotation (left), t]`` (N, 3, 6)
+    motion: Array  # `J_motion`, whitened
+    white: Array  # lower triangular whitening matrices (N, 3, 3) of the residuals; NaN where there is none
+    residual: Array  # second view less its prediction from the first (N, 3), whitened
 
     @classmethod
     def empty(cls, n: int) -> Linear:
         """Of n points, to be filled in."""
-        J_motion, motion = np.empty((2, n, 3, 6))
-        return cls(np.empty((n, 3)), np.empty((n, 3, 3)), J_motion, motion, np.empty((n, 3, 3)), np.empty((n, 3)))
+        return cls(*(np.empty((n, *shape)) for shape in ((3,), (3, 3), (3, 6), (3, 6), (3, 3), (3,))))
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The motion that takes one view's points to the other's, and the linear problem about it.
+    """The motion that takes one view's points to the other's, and the linear problem about it."""
 
-    Attributes:
-        R, t: the motion.
-        points: the first view's, estimated from both views (N, 3) [px].
-        linear: the problem of the last step.
-        weights: of the points (N,).
-    """
-
-    R: Array
+    R: Array  # the motion
     t: Array
-    points: Array
-    linear: Linear
-    weights: Array
+    points: Array  # the first view's, estimated from both views (N, 3) [px]
+    linear: Linear  # the problem of the last step
+    weights: Array  # of the points (N,)
 
 
 def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Fit | None:
@@ -83,20 +60,16 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
 
     Points are weighted by Student's t distribution, whose scale is estimated.
 
-    Args:
-        first: points ``(x, y, d)`` (N, 3) [px] of an ideal rig.
-        second: the same points in the second view.
-        R: first guess of the rotation (3, 3).
-        t: of the translation (3,) [baselines].
-        focal: focal length [px].
-        noise: covariance of a point (3, 3) [px²]; only its form matters.
+    `first` and `second` are the same points ``(x, y, d)`` (N, 3) [px] of an ideal rig with a focal length `focal` [px],
+    `R` (3, 3) and `t` (3,) [baselines] a first guess. Of the `noise`, a point's covariance (3, 3) [px²], only the form
+    matters.
     """
     from slam.calibration.motion_kernels import move_points
 
     first, second = (np.ascontiguousarray(a, float) for a in (first, second))
     points, at = first, Linear.empty(len(first))
     for _ in range(20):  # 20: of Gauss-Newton at most
-        _linearise(first, second, points, R, t, focal, noise, at)
+        at = linearised(first, second, points, R, t, focal, noise, at)
         distance = np.einsum("ni,ni->n", at.residual, at.residual)
         if not np.isfinite(distance).all():
             return None
@@ -123,18 +96,11 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
     estimated points, not at the measured ones: else the noise would be correlated with the Jacobian, and the result
     biased.
 
-    Args:
-        model: the parameters' meaning.
-        pair: the views.
-        parameters: where to linearise (n,).
-        noise: covariance of a point (3, 3) [px²]; only its form matters, the scale is estimated.
+    It is linearised at `parameters` (n,). Of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
     """
-    first = pair.first + model.shift(pair.first, parameters)
-    second = pair.second + model.shift(pair.second, parameters)
+    first, second = (points + model.shift(points, parameters) for points in (pair.first, pair.second))
     fit = fit_motion(first, second, pair.R, pair.t, model.focal, noise)
-    if fit is None:
-        return None
-    return _eliminated(model, fit, parameters)
+    return None if fit is None else _eliminated(model, fit, parameters)
 
 
 def squared_distance(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Array:
@@ -200,21 +166,16 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     return at.moved, at.J_point, at.J_motion
 
 
-def linearised(first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
-    """A motion linearised at estimates of the first view's points, as `fit_motion` needs it.
+def linearised(
+    first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array,
+    out: Linear | None = None,
+) -> Linear:  # fmt: skip
+    """A motion linearised at estimates of the first view's points, as `fit_motion` needs it; into `out` if given.
 
     The residuals carry the points' own corrections to first order.
     """
-    first, second, points = (np.ascontiguousarray(a, float) for a in (first, second, points))
-    out = Linear.empty(len(points))
-    _linearise(first, second, points, R, t, focal, noise, out)
-    return out
-
-
-def _linearise(
-    first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array, out: Linear
-) -> None:
-    """`linearised` into `out`."""
     from slam.calibration.motion_kernels import linearise
 
-    linearise(first, second, points, np.ascontiguousarray(R), np.ascontiguousarray(t), focal, noise, *out)
+    out = Linear.empty(len(points)) if out is None else out
+    linearise(*(np.ascontiguousarray(a, float) for a in (first, second, points, R, t)), focal, noise, *out)
+    return out

@@ -1,60 +1,35 @@
-"""The posterior of a rig's parameters: mean, covariance, names and units; as JSON and back."""
+"""The posterior of a rig's parameters, given evidence and a prior whose scales are not known."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from slam.calibration.evidence import Evidence
 from slam.calibration.prior import RESIDUAL_SCALES, Prior, residual_variance
-from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
 
 
 @dataclass(frozen=True, eq=False)
 class RigPosterior:
-    """Gaussian belief about the parameters of `slam.calibration.model`.
+    """Gaussian belief about the parameters of `slam.calibration.model`."""
 
-    Attributes:
-        names: of the parameters (n,).
-        units: of the parameters (n,).
-        mean: (n,).
-        covariance: (n, n).
-
-    Raises:
-        CalibrationError: shapes do not fit each other, or a value is not finite.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    mean: Array
-    covariance: Array
-
-    def __post_init__(self) -> None:
-        n = len(self.names)
-        if len(self.units) != n or self.mean.shape != (n,) or self.covariance.shape != (n, n):
-            raise CalibrationError("calibration: names, units, mean and covariance differ in length")
-        if not (np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()):
-            raise CalibrationError("calibration: mean and covariance must be finite")
+    names: tuple[str, ...]  # of the parameters (n,)
+    units: tuple[str, ...]  # of the parameters (n,)
+    mean: Array  # (n,)
+    covariance: Array  # (n, n)
 
     def __repr__(self) -> str:
-        most = int(np.argmax(np.abs(self.mean) / self.sigma)) if len(self.names) else -1
-        text = f"; {self.names[most]} is {self.mean[most] / self.sigma[most]:+.1f} sigma" if most >= 0 else ""
-        return f"RigPosterior({len(self.names)} parameters{text})"
+        most = int(np.argmax(np.abs(self.mean) / self.sigma))
+        text = f"{self.names[most]} is {self.mean[most] / self.sigma[most]:+.1f} sigma"
+        return f"RigPosterior({len(self.names)} parameters; {text})"
 
     @property
     def sigma(self) -> Array:
         """Standard deviations (n,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    def marginal(self, indices: Sequence[int] | Array) -> RigPosterior:
-        """The belief about some of the parameters."""
-        rows = [int(i) for i in indices]
-        names, units = ([values[i] for i in rows] for values in (self.names, self.units))
-        return RigPosterior(tuple(names), tuple(units), self.mean[rows], self.covariance[np.ix_(rows, rows)])
 
     def to_json(self) -> dict[str, Any]:
         """As plain types."""
@@ -62,43 +37,18 @@ class RigPosterior:
         parameters = [dict(zip(("name", "unit", "mean", "sigma"), row)) for row in values]
         return {"parameters": parameters, "covariance": self.covariance.tolist()}
 
-    @classmethod
-    def from_json(cls, tree: Mapping[str, Any]) -> RigPosterior:
-        """The inverse of `to_json`.
-
-        Raises:
-            CalibrationError: a key is missing, or a value is of the wrong kind.
-        """
-        try:
-            rows = tree["parameters"]
-            names, units = (tuple(str(row[key]) for row in rows) for key in ("name", "unit"))
-            mean = np.array([row["mean"] for row in rows], float)
-            covariance = np.array(tree["covariance"], float).reshape(len(rows), len(rows))
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
-        return cls(names, units, mean, covariance)
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Posterior of the parameters.
+    """Posterior of the parameters."""
 
-    Attributes:
-        mean: (n,).
-        inner: covariance (n, n) without residual fields.
-        covariance: including the effect of unknown residual fields on the mean (n, n).
-        residual: scale of the residual fields, from 0 to 1.
-    """
-
-    mean: Array
-    inner: Array
-    covariance: Array
-    residual: float
+    mean: Array  # (n,)
+    inner: Array  # covariance (n, n) without residual fields
+    covariance: Array  # including the effect of unknown residual fields on the mean (n, n)
+    residual: float  # scale of the residual fields, from 0 to 1
 
 
-def solve(
-    prior: Prior, residual: float, evidence: Sequence[Evidence], known: Sequence[Evidence] | None = None
-) -> Solution:
+def solve(prior: Prior, residual: float, evidence: Evidence, known: Evidence | None = None) -> Solution:
     """Posterior, averaged over the unknown scales of the calibration's errors.
 
     The scales are weighted by their marginal likelihood, so that a calibration without evidence against it is left
@@ -110,16 +60,29 @@ def solve(
         evidence: of the data, from which the prior's scales follow.
         known: evidence of which the parameters' posterior is computed; None if it is `evidence`.
     """
-    given = _by_scale(prior, evidence)
-    logs = given.log_likelihoods(prior)
+    e, information, covariances, steps = _by_scale(prior, evidence)
+    logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(information)[1] + steps @ e)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    whole, _, _, covariances, steps = given if known is None else _by_scale(prior, known)
+    if known is None:
+        known = evidence
+    else:
+        _, _, covariances, steps = _by_scale(prior, known)
     step = weights @ steps
     off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
-    moved = residual * np.tensordot(weights, covariances, axes=1) @ whole.cross
+    moved = residual * np.tensordot(weights, covariances, axes=1) @ known.cross
     return Solution(prior.mean + step, inner, inner + residual_variance() * moved @ moved.T, residual)
+
+
+def _by_scale(prior: Prior, evidence: Evidence) -> tuple[Array, Array, Array, Array]:
+    """Information vector about the prior's mean (n,); for each scale of the prior (K) the posterior's information and
+    covariance (K, n, n), and the change of the mean (K, n).
+    """
+    information = prior.information + evidence.S
+    covariances = np.linalg.inv(information)
+    e = evidence.e - evidence.S @ prior.mean
+    return e, information, covariances, covariances @ e
 
 
 def residual_scale(prior: Prior, rows: Evidence) -> float:
@@ -129,9 +92,7 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
     which cannot be observed as directly, are taken to be as large as those across. Errors of neighbouring frames are
     taken to be independent; where they are not, the fields and so the uncertainty are overestimated.
 
-    Args:
-        prior: of the parameters.
-        rows: evidence of the parameters and of the fields across the rows (n + k).
+    `rows` is the evidence of the parameters and of the fields across the rows (n + k).
     """
     n = len(prior.mean)
     known, shared = prior.information[-1] + rows.S[:n, :n], rows.S[:n, n:]
@@ -144,34 +105,3 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
     logs = 0.5 * np.sum(np.square(vectors.T @ g) * variances / added - np.log(added), axis=1)
     weights = np.exp(logs - logs.max())
     return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
-
-
-class _ByScale(NamedTuple):
-    """The posterior for each scale of the prior (K).
-
-    Attributes:
-        whole: total evidence.
-        e: its information vector (n,), about the prior's mean.
-        information: of the posterior (K, n, n).
-        covariances: of the posterior (K, n, n).
-        steps: changes of the mean (K, n).
-    """
-
-    whole: Evidence
-    e: Array
-    information: Array
-    covariances: Array
-    steps: Array
-
-    def log_likelihoods(self, prior: Prior) -> Array:
-        """Logarithms of the marginal likelihoods (K,)."""
-        return np.asarray(0.5 * (prior.log_determinants - np.linalg.slogdet(self.information)[1] + self.steps @ self.e))
-
-
-def _by_scale(prior: Prior, evidence: Sequence[Evidence]) -> _ByScale:
-    """The posterior of the sum of `evidence` for each scale of the prior."""
-    whole = sum(evidence[1:], evidence[0])
-    information = prior.information + whole.S
-    covariances = np.linalg.inv(information)
-    e = whole.e - whole.S @ prior.mean
-    return _ByScale(whole, e, information, covariances, covariances @ e)

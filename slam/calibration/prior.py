@@ -48,15 +48,10 @@ _OFFSETS = (0.03, 0.3, 1.0)  # the same of an offset of the disparity alone
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Prior of the parameters: a mixture of Gaussians with one mean and several covariances.
+    """Prior of the parameters: a mixture of Gaussians with one mean and several covariances."""
 
-    Attributes:
-        mean: (n,).
-        covariances: equally probable ones (K, n, n).
-    """
-
-    mean: Array
-    covariances: Array
+    mean: Array  # (n,)
+    covariances: Array  # equally probable ones (K, n, n)
 
     @cached_property
     def information(self) -> Array:
@@ -84,10 +79,7 @@ def factory_prior(model: RigModel) -> Prior:
 def resumed_prior(model: RigModel, mean: Array, covariance: Array) -> Prior:
     """Prior of a rig calibrated by earlier recordings; its cameras may have rotated since.
 
-    Args:
-        model: the parameters' meaning.
-        mean: of the parameters, by the recordings (n,).
-        covariance: of the mean (n, n).
+    `mean` (n,) of the parameters and its `covariance` (n, n) are by those recordings.
     """
     sigma = offset_sigma(model)
     turned = np.array(_OFFSETS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,58 +22,27 @@ _NOT_KEPT = (
     "neither a file of `slam calibrate` nor the summary.json of a run; the calibration file of a rig belongs to the "
     "sequence: 'FOLDER?calibration=FILE'"
 )
-_SUMMARY, _KEY = "summary.json", "self_calibration"
+_NUMBERS = ("width", "height", "focal", "u0", "v0", "right_u0", "baseline")
 
 
-@dataclass(frozen=True)
-class RigNumbers:
-    """The rectified cameras as delivered, to which all corrections refer; they identify the rig of a calibration file.
+def rig_numbers(rig: StereoRig) -> dict[str, float]:
+    """The rectified cameras as delivered, to which all corrections refer: they identify a rig in a calibration file.
 
-    Attributes:
-        width, height: size of the images [px].
-        focal: focal length [px].
-        u0, v0: principal point of the left camera [px].
-        right_u0: of the right camera [px].
-        baseline: distance of the cameras [m].
+    Size of the images, focal length, principal point of the left camera and that of the right one along the rows [px],
+    distance of the cameras [m].
     """
+    r = rig.rectified.rig
+    values = r.width, r.height, r.left.fu, r.left.u0, r.left.v0, r.right.u0, r.baseline
+    return dict(zip(_NUMBERS, map(float, values)))
 
-    width: float
-    height: float
-    focal: float
-    u0: float
-    v0: float
-    right_u0: float
-    baseline: float
 
-    @classmethod
-    def of(cls, rig: StereoRig) -> RigNumbers:
-        """Those of a rig."""
-        r = rig.rectified.rig
-        numbers = r.width, r.height, r.left.fu, r.left.u0, r.left.v0, r.right.u0, r.baseline
-        return cls(*(float(number) for number in numbers))
-
-    @classmethod
-    def from_json(cls, tree: Any) -> RigNumbers:
-        """The inverse of `dataclasses.asdict`.
-
-        Raises:
-            CalibrationError: a number is missing, or is no number.
-        """
-        try:
-            numbers = cls(**{field.name: float(tree[field.name]) for field in fields(cls)})
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise CalibrationError("calibration: it does not say of which rig it is") from error
-        if not np.isfinite(list(asdict(numbers).values())).all():
-            raise CalibrationError("calibration: the numbers of its rig must be finite")
-        return numbers
-
-    def difference(self, other: RigNumbers) -> str:
-        """The first number that differs, in words; empty if none does."""
-        for name, mine, theirs in zip(asdict(self), asdict(self).values(), asdict(other).values()):
-            # 1e-5: relative difference of numbers of the same calibration, written and read
-            if abs(mine - theirs) > 1e-5 * max(abs(mine), abs(theirs)):
-                return f"{name} {mine:g} there, {theirs:g} here"
-        return ""
+def rig_difference(there: Mapping[str, float], here: Mapping[str, float]) -> str:
+    """The first number of two rigs, see `rig_numbers`, that differs, in words; empty if none does."""
+    for name in _NUMBERS:
+        # 1e-5: relative difference of numbers of the same calibration, written and read
+        if abs(there[name] - here[name]) > 1e-5 * max(abs(there[name]), abs(here[name])):
+            return f"{name} {there[name]:g} there, {here[name]:g} here"
+    return ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,17 +51,17 @@ class SavedCalibration:
 
     Attributes:
         posterior: estimated corrections of the rig as calibrated.
-        rig: numbers of the rig as calibrated, to recognise it.
+        rig: numbers of the rig as calibrated, to recognise it, see `rig_numbers`.
         residual: scale, from 0 to 1, of the errors that no parameter describes (see `slam.calibration.prior`).
     """
 
     posterior: RigPosterior
-    rig: RigNumbers
+    rig: Mapping[str, float]
     residual: float = 1.0
 
     def __repr__(self) -> str:
         r = self.rig
-        rig = f"{r.width:.0f}x{r.height:.0f}, focal length {r.focal:.1f} px, baseline {r.baseline:.4f} m"
+        rig = f"{r['width']:.0f}x{r['height']:.0f}, focal length {r['focal']:.1f} px, baseline {r['baseline']:.4f} m"
         return f"SavedCalibration({rig}; {self.posterior!r})"
 
     def require_fits(self, rig: StereoRig) -> None:
@@ -101,13 +70,12 @@ class SavedCalibration:
         Raises:
             CalibrationError: a number of the rig as calibrated differs.
         """
-        difference = self.rig.difference(RigNumbers.of(rig))
-        if difference:
-            raise CalibrationError(f"the kept calibration is of another rig: {difference}")
+        if found := rig_difference(self.rig, rig_numbers(rig)):
+            raise CalibrationError(f"the kept calibration is of another rig: {found}")
 
     def to_json(self) -> dict[str, Any]:
         """As plain types."""
-        return {"rig": asdict(self.rig), "residual_scale": self.residual, **self.posterior.to_json()}
+        return {"rig": dict(self.rig), "residual_scale": self.residual, **self.posterior.to_json()}
 
     @classmethod
     def from_json(cls, tree: Mapping[str, Any]) -> SavedCalibration:
@@ -116,19 +84,30 @@ class SavedCalibration:
         Raises:
             CalibrationError: a key is missing, a value is of the wrong type, or the parameters are of another version.
         """
-        posterior = RigPosterior.from_json(tree)
-        if posterior.names != RigModel.names:
+        try:
+            rows, residual = tree["parameters"], tree.get("residual_scale")
+            names, units = (tuple(str(row[key]) for row in rows) for key in ("name", "unit"))
+            mean = np.array([row["mean"] for row in rows], float)
+            covariance = np.array(tree["covariance"], float).reshape(len(rows), len(rows))
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
+        try:
+            rig = {name: float(tree["rig"][name]) for name in _NUMBERS}
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise CalibrationError("calibration: it does not say of which rig it is") from error
+        if not all(np.isfinite(numbers).all() for numbers in (mean, covariance, list(rig.values()))):
+            raise CalibrationError("calibration: all its numbers must be finite")
+        if names != RigModel.names:
             raise CalibrationError("calibration: its parameters are not those of this version")
         # 1.0: correction [rad, focal lengths, 1] and variance that a file may hold
-        if max(np.abs(posterior.mean).max(), np.diag(posterior.covariance).max()) > 1.0:
+        if max(np.abs(mean).max(), np.diag(covariance).max()) > 1.0:
             raise CalibrationError("calibration: a correction or its deviation is larger than the rig itself")
-        symmetric = np.allclose(posterior.covariance, posterior.covariance.T, rtol=1e-6, atol=0)
-        if not symmetric or np.linalg.eigvalsh(posterior.covariance).min() <= 0:
+        symmetric = np.allclose(covariance, covariance.T, rtol=1e-6, atol=0)
+        if not symmetric or np.linalg.eigvalsh(covariance).min() <= 0:
             raise CalibrationError("calibration: its covariance is none")
-        residual = tree.get("residual_scale")
         if not isinstance(residual, (int, float)) or not 0 <= residual <= 1:
             raise CalibrationError("calibration: residual_scale must lie in 0..1")
-        return cls(posterior, RigNumbers.from_json(tree.get("rig")), float(residual))
+        return cls(RigPosterior(names, units, mean, covariance), rig, float(residual))
 
 
 def load_calibration(path: str | Path) -> SavedCalibration:
@@ -141,14 +120,14 @@ def load_calibration(path: str | Path) -> SavedCalibration:
         CalibrationError: the file cannot be read, or is something else.
     """
     file = expanded(path, CalibrationError)
-    file = file / _SUMMARY if os.path.isdir(file) else file  # noqa: PTH112 unlike Path's, without errors
+    file = file / "summary.json" if os.path.isdir(file) else file  # noqa: PTH112 unlike Path's, without errors
     text = read_text(file, _LIMIT, CalibrationError)
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{file}: {_NOT_KEPT}") from error
     if isinstance(tree, Mapping):
-        tree = tree.get(_KEY, tree)
+        tree = tree.get("self_calibration", tree)
     if not isinstance(tree, Mapping) or "parameters" not in tree:
         raise CalibrationError(f"{file}: {_NOT_KEPT}")
     try:

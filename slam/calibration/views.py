@@ -28,21 +28,13 @@ NO_MATCHES: Rows = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The stereo features of one frame, as measured.
+    """The stereo features of one frame, as measured."""
 
-    Attributes:
-        points: ``(x, y, d)`` (N, 3), rectified pixel from the principal point and disparity [px].
-        vertical: right row less left row (N,) [px].
-        descriptors: (N, D).
-        laplacian: (N,).
-        T_world_left: pose of the rectified left camera (4, 4) as the system has it.
-    """
-
-    points: Array
-    vertical: Array
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    T_world_left: Array
+    points: Array  # ``(x, y, d)`` (N, 3), rectified pixel from the principal point and disparity [px]
+    vertical: Array  # right row less left row (N,) [px]
+    descriptors: NDArray[np.float32]  # (N, D)
+    laplacian: NDArray[np.int8]  # (N,)
+    T_world_left: Array  # pose of the rectified left camera (4, 4) as the system has it
 
     def __len__(self) -> int:
         return len(self.points)
@@ -56,38 +48,26 @@ class View:
     @classmethod
     def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array, most: int) -> View:
         """Of the strongest features as measured, `most` at the most, at a pose (4, 4) of the left camera."""
-        rectified_rig = model.rig.rectified
-        rows = np.flatnonzero(features.has_stereo)
+        rectified, rows = model.rig.rectified, np.flatnonzero(features.has_stereo)
         if len(rows) > most:
             rows = np.sort(rows[np.argsort(-features.response[rows], kind="stable")[:most]])
-        left, right = (
-            rectified_rig.rectify_left(features.uv_left[rows]),
-            rectified_rig.rectify_right(features.uv_right[rows]),
-        )
-        points = model.points(np.column_stack([left, right[:, 0]]))
-        vertical = right[:, 1] - left[:, 1]
+        left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
+        points, vertical = model.points(np.column_stack([left, right[:, 0]])), right[:, 1] - left[:, 1]
         good = np.isfinite(points).all(axis=1) & np.isfinite(vertical)
-        rows = rows[good]
-        return cls(
-            points[good],
-            vertical[good],
-            features.descriptors[rows],
-            features.laplacian[rows],
-            T_world_left @ rectified_rig.T_left_rectified,
-        )
+        rows, T = rows[good], T_world_left @ rectified.T_left_rectified
+        return cls(points[good], vertical[good], features.descriptors[rows], features.laplacian[rows], T)
 
 
 def match(first: View, second: View) -> Rows:
     """Rows of features matched in two views: mutual nearest neighbours that pass the ratio test."""
     if min(len(first), len(second)) < 2 or not first.descriptors.shape[1]:
         return NO_MATCHES
-    found = [
-        (rows[i], others[j])
-        for sign, (rows, descriptors) in first.by_sign.items()
-        if sign in second.by_sign
-        for others, other_descriptors in (second.by_sign[sign],)
-        for i, j in (_nearest(descriptors, other_descriptors),)
-    ]
+    found = []
+    for sign, (rows, looks) in first.by_sign.items():
+        if sign in second.by_sign:
+            others, other_looks = second.by_sign[sign]
+            i, j = _nearest(looks, other_looks)
+            found.append((rows[i], others[j]))
     a, b = (np.concatenate([pair[k] for pair in found] or [np.zeros(0, np.intp)]) for k in (0, 1))
     order = np.argsort(a)
     return a[order], b[order]
@@ -108,26 +88,15 @@ def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[N
 
 
 def pair_of(
-    model: RigModel,
-    first: View,
-    second: View,
-    parameters: Array,
-    noise: Array,
-    seed: int,
-    matched: Rows | None = None,
+    model: RigModel, first: View, second: View, parameters: Array, noise: Array, seed: int, matched: Rows | None = None
 ) -> Pair:
     """Matches of two views that agree on one motion, and that motion.
 
     The motion of the system's poses is tried first; others are tried only if most matches disagree with it.
 
-    Args:
-        model: the parameters' meaning.
-        first: the earlier view.
-        second: the later view.
-        parameters: of the rig (n,), as known so far.
-        noise: covariance (3, 3) of a point [px²]; only its form matters.
-        seed: of the random choice in the geometric check.
-        matched: features that look alike, where that is known already.
+    The rig is corrected by `parameters` (n,). Of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
+    `seed` is of the random choice in the geometric check; `matched` are features that look alike, where that is known
+    already.
     """
     a, b = match(first, second) if matched is None else matched
     one, two = first.points[a], second.points[b]

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
-from slam.evaluation.truth_error import RowArray, doubtful, truth_covariances
+from slam.evaluation.truth_error import RowArray, doubtful, interpolated, truth_covariances
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.se3 import adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -44,7 +44,7 @@ def consistency_figures(
     """The figures of a run's summary; those that the path is too short for are left out.
 
     One run's errors are correlated over time: its mean may leave the band, which holds for independent ones, without
-    a fault. The first pose defines the world and is left out.
+    a fault. The first pose defines the world and is left out; the start is the first pose whose truth was measured.
 
     Args:
         own: the online path (N poses).
@@ -59,8 +59,9 @@ def consistency_figures(
         left out because the truth contradicts itself or an old place was measured again within them, where there are
         any; "scale error [%]" and "scale sigma [%]".
     """
-    first = np.zeros(len(own) - 1, np.intp)
-    from_start = stretch_nees(own, true, covariances, noise, first, np.arange(1, len(own)), common)
+    start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
+    later = np.arange(start + 1, len(own))
+    from_start = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common)
     low, high = chi_square_band(_DOF, max(int(np.isfinite(from_start).sum()), 1))
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
     closed = _closings(covariances)
@@ -108,11 +109,10 @@ def stretch_nees(
     estimated = inverse(own.poses[first]) @ own.poses[last]
     residuals = pose_residuals(estimated, inverse(true.poses[first]) @ true.poses[last])
     A = adjoint(inverse(estimated))
-    noises = covariances if common is None else covariances - np.array([one.covariance for one in common])
+    common = common or [CommonError()] * len(own)
+    noises = covariances - np.array([one.covariance for one in common])
     N = noises[last] - A @ noises[first] @ np.swapaxes(A, 1, 2) + truth_covariances(true, noise, first, last, A)
-    G: Array = np.zeros((len(first), _DOF, 0))
-    if common is not None and len(first):
-        N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
+    N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
     N = 0.5 * (N + np.swapaxes(N, 1, 2))
     usable = np.isfinite(residuals).all(axis=1) & ~doubtful(true, noise, first, last)
     usable[usable] = _are_covariances(N[usable]) & _are_covariances(_with(N[usable], G[usable]))
@@ -158,11 +158,6 @@ def _remounted(errors: Array, J: Array, P: Array) -> Array:
 
     The rig's errors are treated as the residuals are: else a turn of the rig, that a mounting explains, would count in
     the covariance alone.
-
-    Args:
-        errors: of relative poses (M, 6, k), a column for each kind.
-        J: their derivatives (M, 6, m) by what is the same in all poses, of unit variance.
-        P: covariances of the first column (M, 6, 6).
     """
     JW = np.swapaxes(np.linalg.solve(P, J), 1, 2)
     information = np.tensordot(JW, J, axes=((0, 2), (0, 1))) + np.eye(J.shape[2])
@@ -170,13 +165,8 @@ def _remounted(errors: Array, J: Array, P: Array) -> Array:
 
 
 def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array) -> tuple[Array, Array]:
-    """What errors of unit variance that the poses at their ends share make of relative poses (M).
-
-    Returns:
-        the covariances `N` (M, 6, 6), and how the relative poses depend on the shared errors (M, 6, k). Where one end
-        is after a loop nothing is apart: there the difference of both covariances is added to `N`.
-    """
-    N, G = N.copy(), np.zeros((len(ends), _DOF, max(last.root.shape[1] for _, last in ends)))
+    """What errors of unit variance that the poses at their ends share make of relative poses (M)."""
+    N, G = N.copy(), np.zeros((len(ends), _DOF, max((last.root.shape[1] for _, last in ends), default=0)))
     for row, (a, (first, last)) in enumerate(zip(A, ends)):
         if first.jacobian.shape == last.jacobian.shape:
             G[row, :, : last.root.shape[1]] = (last.jacobian - a @ first.jacobian) @ last.root

@@ -98,9 +98,6 @@ class SegmentErrors:
         return float(np.mean(self.translation)) if len(self.lengths) else float("nan")
 
 
-# ------------------------------------------------------------------------------------------- common stamps
-
-
 def associate(
     estimate: Trajectory, truth: Trajectory, tolerance: float = 0.01, interpolated: bool = False
 ) -> tuple[Trajectory, Trajectory]:
@@ -164,9 +161,6 @@ def _covered(own: Array, stamps: Array, tolerance: float) -> np.ndarray:
 
 def _span(name: str, stamps: Array) -> str:
     return f"{name} from {stamps[0]:.3f} to {stamps[-1]:.3f} s" if len(stamps) else f"{name} is empty"
-
-
-# ------------------------------------------------------------------------------------------- accuracy
 
 
 def absolute_errors(
@@ -275,9 +269,6 @@ def _motion_errors(estimate: Trajectory, truth: Trajectory, first: np.ndarray, l
     estimated = inverse(estimate.poses[first]) @ estimate.poses[last]
     error = inverse(true) @ estimated
     return np.linalg.norm(error[:, :3, 3], axis=1), np.degrees(rotation_angle(error[:, :3, :3]))
-
-
-# ------------------------------------------------------------------------------------------- consistency
 
 
 def pose_residuals(estimated: Array, true: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,38 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import FrameResult, StereoFeatures
+from slam.evaluation.metrics import PathErrors
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
+from slam.object_data import MovingObject
 
 _SINGULAR = 1e-9  # numerics: smallest eigenvalue of a matrix of correlations that counts
 _OUTLINE = 0.25  # a feature sees as far as this, as a share of its size
 
 
-@dataclass(frozen=True, eq=False)
-class PoseErrors:
-    """Rotation [deg] and translation [m] of errors, a row each."""
-
-    rotation: Array
-    translation: Array
-
-    @classmethod
-    def of(cls, E: Array) -> PoseErrors:
-        """Of error motions (N, 4, 4)."""
-        return cls(np.degrees(rotation_angle(E[:, :3, :3])), np.linalg.norm(E[:, :3, 3], axis=1))
-
-    def summary(self) -> dict[str, float]:
-        """Median and RMSE of both."""
-        if not len(self.rotation):
-            return {}
-        return {
-            "rotation median [deg]": float(np.median(self.rotation)),
-            "rotation RMSE [deg]": float(np.sqrt(np.mean(self.rotation**2))),
-            "translation median [m]": float(np.median(self.translation)),
-            "translation RMSE [m]": float(np.sqrt(np.mean(self.translation**2))),
-        }
-
-
-def motion_errors(estimated: Array, true: Array, delta: int = 1) -> PoseErrors:
+def motion_errors(estimated: Array, true: Array, delta: int = 1) -> PathErrors:
     """Errors of the motions over `delta` rows, in the true body's frame before the motion.
 
     ``E = T⁻¹ (H_est⁻¹ H_true) T`` with ``H = T_k T_{k−Δ}⁻¹`` in world coordinates and T the true pose at k − Δ. It
@@ -55,7 +32,22 @@ def motion_errors(estimated: Array, true: Array, delta: int = 1) -> PoseErrors:
     H = estimated[delta:] @ inverse(estimated[:-delta])
     G = true[delta:] @ inverse(true[:-delta])
     before = true[:-delta]
-    return PoseErrors.of(inverse(before) @ inverse(H) @ G @ before)
+    return _of_motions(inverse(before) @ inverse(H) @ G @ before)
+
+
+def _of_motions(E: Array) -> PathErrors:
+    """Of error motions (N, 4, 4)."""
+    return PathErrors(np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angle(E[:, :3, :3])))
+
+
+def _summed(errors: PathErrors) -> dict[str, float]:
+    """Median and RMSE of rotation and translation; empty without errors."""
+    parts = (("rotation", "deg", errors.rotation), ("translation", "m", errors.translation))
+    figures: dict[str, float] = {}
+    for name, unit, values in parts if len(errors.rotation) else ():
+        figures[f"{name} median [{unit}]"] = float(np.median(values))
+        figures[f"{name} RMSE [{unit}]"] = float(np.sqrt(np.mean(values**2)))
+    return figures
 
 
 def body_alignment(estimated: Array, true: Array) -> Array:
@@ -68,9 +60,9 @@ def body_alignment(estimated: Array, true: Array) -> Array:
     return mean
 
 
-def absolute_pose_errors(estimated: Array, true: Array) -> PoseErrors:
+def absolute_pose_errors(estimated: Array, true: Array) -> PathErrors:
     """Errors ``(T_estimated D)⁻¹ T_true`` of poses (N, 4, 4) after one change D of body frame for all."""
-    return PoseErrors.of(inverse(estimated @ body_alignment(estimated, true)) @ true)
+    return _of_motions(inverse(estimated @ body_alignment(estimated, true)) @ true)
 
 
 def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
@@ -100,19 +92,26 @@ def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
 
 @dataclass(eq=False)
 class _Life:
-    """What was reported of one object."""
+    """What was reported of one object: the frames, and the object in each of them."""
 
     frames: list[int] = field(default_factory=list)
-    poses: list[Array] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    measured: list[bool] = field(default_factory=list)
-    found: list[tuple[float, Array]] = field(default_factory=list)  # when its estimate began, and its pose then
-    votes: dict[int, int] = field(default_factory=dict)
+    things: list[MovingObject] = field(default_factory=list)
+    votes: dict[int, int] = field(default_factory=dict)  # number of its features on each body, 0 for the still world
 
     @property
     def truth(self) -> int:
         """The body on which most of its features lie, over its life; 0 for the still world."""
         return max(self.votes, key=lambda body: (self.votes[body], -body)) if self.votes else 0
+
+    @property
+    def poses(self) -> Array:
+        """Its poses T_world_object (N, 4, 4)."""
+        return np.array([thing.estimate.T_world_object for thing in self.things])
+
+    @property
+    def measured(self) -> NDArray[np.intp]:
+        """Rows in which it was measured."""
+        return np.flatnonzero([thing.estimate.measured for thing in self.things])
 
 
 class ObjectScore:
@@ -132,11 +131,9 @@ class ObjectScore:
         self.stamps = stamps
         self.moves_from = [_first_motion(poses, cameras, focal, pixel) for poses in bodies]
         self.lives: dict[int, _Life] = {}
-        self.right = self.wrong = self.missed = self.still = 0
-        self.false_frames = 0
-        self.counted = self.counted_right = 0
-        self.covered: dict[int, list[bool]] = {}
-        self.frames = 0
+        self._right = self._wrong = self._missed = self._still = 0  # features
+        self._frames = self._false_frames = self._counted_right = 0  # frames
+        self._covered: dict[int, list[bool]] = {}
         self._world: Array | None = None
         self._seen_from: dict[int, Array] = {}  # the camera's pose by frame, as it was estimated
 
@@ -151,62 +148,54 @@ class ObjectScore:
         if self._world is None:
             self._world = result.estimate.T_world_left @ inverse(self.cameras[frame])
         self._seen_from[frame] = result.estimate.T_world_left
-        self.frames += 1
         flagged = np.zeros(len(labels), bool)
         flagged[result.moving_features] = True
         started = np.array([False] + [frame >= k for k in self.moves_from])
-        moving = (labels > 0) & started[np.maximum(labels, 0)]
-        still, stereo = labels == 0, result.features.has_stereo
-        self.right += int((flagged & moving & stereo).sum())
-        self.missed += int((~flagged & moving & stereo).sum())
-        self.wrong += int((flagged & still).sum())
-        self.still += int(still.sum())
-        self._count(frame, result, labels, moving & stereo)
-
-    def _count(self, frame: int, result: FrameResult, labels: NDArray, moving: NDArray) -> None:
+        moving = (labels > 0) & started[np.maximum(labels, 0)] & result.features.has_stereo
+        still = labels == 0
+        self._right += int((flagged & moving).sum())
+        self._missed += int((~flagged & moving).sum())
+        self._wrong += int((flagged & still).sum())
+        self._still += int(still.sum())
         named = set()
         for thing in result.objects:
             life = self.lives.setdefault(thing.id, _Life())
-            for label in labels[thing.features]:
+            for label in labels[thing.features].tolist():
                 if label >= 0:
-                    life.votes[int(label)] = life.votes.get(int(label), 0) + 1
-            life.found.append((thing.found_at, inverse(thing.motion_since_found) @ thing.estimate.T_world_object))
+                    life.votes[label] = life.votes.get(label, 0) + 1
             life.frames.append(frame)
-            life.poses.append(thing.estimate.T_world_object)
-            life.covariances.append(thing.estimate.covariance)
-            life.measured.append(thing.estimate.measured)
+            life.things.append(thing)
             if thing.estimate.measured:
                 named.add((thing.id, life.truth))
         in_view = {b for b in range(1, len(self.bodies) + 1) if (moving & (labels == b)).sum() > MINIMAL_POINTS}
         for body in in_view:
-            self.covered.setdefault(body, []).append(any(truth == body for _, truth in named))
+            self._covered.setdefault(body, []).append(any(truth == body for _, truth in named))
         relevant = [truth for _, truth in named if truth == 0 or truth in in_view]
-        self.counted += 1
-        self.counted_right += sorted(relevant) == sorted(in_view)
-        self.false_frames += any(truth == 0 for _, truth in named)
+        self._frames += 1
+        self._counted_right += sorted(relevant) == sorted(in_view)
+        self._false_frames += any(truth == 0 for _, truth in named)
 
     def summary(self) -> dict[str, Any]:
         """All figures; see docs/objects.md."""
-        precision = self.right / max(self.right + self.wrong, 1)
-        recall = self.right / max(self.right + self.missed, 1)
-        figures: dict[str, Any] = {
+        precision = self._right / max(self._right + self._wrong, 1)
+        recall = self._right / max(self._right + self._missed, 1)
+        return {
             "features": {
                 "precision": precision,
                 "recall": recall,
                 "F1": 2 * precision * recall / max(precision + recall, 1e-12),
-                "false moving per 1000 still": 1e3 * self.wrong / max(self.still, 1),
+                "false moving per 1000 still": 1e3 * self._wrong / max(self._still, 1),
             },
-            "false movers per frame": self.false_frames / max(self.frames, 1),
-            "counted right": self.counted_right / max(self.counted, 1),
+            "false movers per frame": self._false_frames / max(self._frames, 1),
+            "counted right": self._counted_right / max(self._frames, 1),
             "bodies": {str(b): self.body(b) for b in range(1, len(self.bodies) + 1)},
             "false objects": [len(life.frames) for life in self.lives.values() if life.truth == 0],
         }
-        return figures
 
     def body(self, body: int) -> dict[str, Any]:
         """Figures of one true body; its longest-lived object is measured."""
         lives = {id: life for id, life in self.lives.items() if life.truth == body}
-        covered = self.covered.get(body, [])
+        covered = self._covered.get(body, [])
         figures: dict[str, Any] = {
             "frames in view": len(covered),
             "coverage": float(np.mean(covered)) if covered else None,
@@ -217,19 +206,17 @@ class ObjectScore:
         first = min(min(life.frames) for life in lives.values())
         figures["delay [frames]"] = first - self.moves_from[body - 1]
         life = max(lives.values(), key=lambda one: len(one.frames))
-        rows = np.flatnonzero(life.measured)
+        rows, frames, own = life.measured, np.array(life.frames), life.poses
         if len(rows) < 3:
             return figures
-        frames = np.array(life.frames)
-        own = np.array(life.poses)
         true = self._world @ self.bodies[body - 1][frames]
         both = rows[1:][(np.diff(rows) == 1) & (np.diff(frames[rows]) == 1)]
         me = [motion_errors(own[[k - 1, k]], true[[k - 1, k]]) for k in both]
-        errors = PoseErrors(np.array([e.rotation[0] for e in me]), np.array([e.translation[0] for e in me]))
-        values = self._nees(body, life, rows)
-        figures["ME"] = errors.summary()
-        figures["relative, 10 frames"] = motion_errors(own, true, 10).summary() if len(own) > 10 else {}
-        figures["absolute"] = absolute_pose_errors(own[rows], true[rows]).summary()
+        errors = PathErrors(np.array([e.translation[0] for e in me]), np.array([e.rotation[0] for e in me]))
+        values = self._nees(body, life)
+        figures["ME"] = _summed(errors)
+        figures["relative, 10 frames"] = _summed(motion_errors(own, true, 10)) if len(own) > 10 else {}
+        figures["absolute"] = _summed(absolute_pose_errors(own[rows], true[rows]))
         figures["mean NEES"] = float(np.mean(values)) if len(values) else None
         figures["dof"] = 6.0
         return figures
@@ -245,39 +232,33 @@ class ObjectScore:
             return None
         life = max(lives, key=lambda one: len(one.frames))
         frames = np.array(life.frames)[life.measured]
-        return frames, np.array(life.poses)[life.measured], self._world @ self.bodies[body - 1][frames]
+        return frames, life.poses[life.measured], self._world @ self.bodies[body - 1][frames]
 
-    def _nees(self, body: int, life: _Life, rows: NDArray[np.intp]) -> Array:
+    def _nees(self, body: int, life: _Life) -> Array:
         """NEES of an object's motion since its estimate began, which may have been before it was first reported.
 
         Where an estimate restarted, it is that of the motion since.
         """
         assert self._world is not None
-        begun = np.array([at for at, _ in life.found])
+        rows, poses = life.measured, life.poses
+        begun = np.array([thing.found_at for thing in life.things])
+        P = np.array([thing.estimate.covariance for thing in life.things])
         values: list[Array] = [np.zeros(0)]
         for at in np.unique(begun[rows]):
-            mine = rows[begun[rows] == at] if np.isfinite(at) else rows
-            first = life.found[mine[0]][1] if np.isfinite(at) else life.poses[0]
-            found = int(np.searchsorted(self.stamps, at - 1e-6)) if np.isfinite(at) else life.frames[0]
+            mine, first, found = rows, poses[0], life.frames[0]
+            if np.isfinite(at):
+                mine = rows[begun[rows] == at]
+                first = inverse(life.things[mine[0]].motion_since_found) @ poses[mine[0]]
+                found = int(np.searchsorted(self.stamps, at - 1e-6))
             frames = np.array([found, *np.array(life.frames)[mine]])
             if found in self._seen_from:
                 first = self._world @ self.cameras[found] @ inverse(self._seen_from[found]) @ first
-            own = np.stack([first, *np.array(life.poses)[mine]])
-            covariances = np.concatenate([np.zeros((1, 6, 6)), np.array(life.covariances)[mine]])
+            own, covariances = np.stack([first, *poses[mine]]), np.concatenate([np.zeros((1, 6, 6)), P[mine]])
             later = np.concatenate([[True], frames[1:] > found])
             true = self._world @ self.bodies[body - 1][frames]
             if later[1:].any():
                 values.append(object_nees(own[later], covariances[later], true[later]))
         return np.concatenate(values)
-
-
-def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A nested summary with its keys joined by ``·``."""
-    out: dict[str, Any] = {}
-    for key, value in figures.items():
-        name = f"{prefix}{key}"
-        out.update(flat(value, name + " · ") if isinstance(value, Mapping) else {name: value})
-    return out
 
 
 def _first_motion(poses: Array, cameras: Array, focal: float, pixel: float) -> int:

@@ -11,7 +11,9 @@ in two ways:
 
 Two signs make a stretch doubtful, so that it is left out:
 
-- It turns at a constant rate from pose to pose, far more evenly than elsewhere: it was interpolated over a gap.
+- One of its ends lies where the path turns at a constant rate from pose to pose, far more evenly than a vehicle can
+  move: that pose was not measured but interpolated over a gap, or extrapolated to where the path begins or ends. Which
+  of the poses there were measured is not known, so that all of a gap at the begin or the end count as made up.
 - A vehicle on wheels slips sideways by more than the truth's errors allow.
 """
 
@@ -27,9 +29,11 @@ from slam.geometry.trajectory import Trajectory, TruthNoise
 RowArray = NDArray[np.intp]
 
 _EVEN = 0.01  # of the large changes of the turn from step to step: chance makes this in one of some 100,000
+_NEARLY = 0.1  # the same beside such a one, where a gap begins or ends between two poses: one of some 200
 _LARGE = 0.9  # quantile of the changes: even where most of a short path was interpolated, some tenth was not
 _LEVER, _LEVER_SIGMA = 1.5, 1.0  # from the axle that does not steer forward to the camera [m]
 _SIGMAS = 3.0  # of what may seem to be a slip
+_LEAST = 1e-12  # numerics: change of the turn [rad] below which nothing can be told
 _MEDIAN = 0.6745  # derived: median of the absolute value of a Gaussian number of unit variance
 
 
@@ -62,8 +66,8 @@ def doubtful(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArra
     """Whether the truth is doubtful between rows `first` and `last` (M,); never where it has no noise."""
     if len(true) < 3 or not noise.covariance.any():
         return np.zeros(len(first), bool)
-    turn = so3_log((inverse(true.poses[:-1]) @ true.poses[1:])[:, :3, :3])
-    bad = _within(_interpolated(turn), first, last - 1)
+    made_up = interpolated(true, noise)
+    bad = made_up[first] | made_up[last]
     if not noise.wheels:
         return bad
     slip, unknown = _slip(true, noise)
@@ -128,19 +132,28 @@ def _slip(true: Trajectory, noise: TruthNoise) -> tuple[Array, Array]:
     return sideways - np.nanmedian(sideways / forward) * middle[:, 2], unknown
 
 
-def _interpolated(turn: Array) -> BoolArray:
-    """Whether a step's turn (N, 3) [rad] and the next one's are the same to rounding (N − 1,)."""
-    change = np.linalg.norm(np.diff(turn, axis=0), axis=1)
-    return np.asarray(change < _EVEN * np.quantile(change, _LARGE))
+def interpolated(true: Trajectory, noise: TruthNoise) -> BoolArray:
+    """Which poses (N,) of a moving vehicle or camera were not measured: the steps to and from them turn by the same.
+
+    Without motion, by less than the noise of the truth, equal turns are no sign of it.
+    """
+    made_up = np.zeros(len(true), bool)
+    if len(true) < 3 or not noise.covariance.any():
+        return made_up
+    motion = inverse(true.poses[:-1]) @ true.poses[1:]
+    change = np.linalg.norm(np.diff(so3_log(motion[:, :3, :3]), axis=0), axis=1)
+    moves = np.linalg.norm(motion[:, :3, 3], axis=1) > noise.translation
+    large = float(np.quantile(change, _LARGE))
+    if large < _LEAST:
+        return made_up
+    ratio = np.where(moves[:-1] & moves[1:], change / large, np.inf)
+    run = np.cumsum(ratio >= _NEARLY)  # the number of each run of nearly even changes
+    made_up[1:-1] = (ratio < _NEARLY) & np.isin(run, run[ratio < _EVEN])
+    made_up[0], made_up[-1] = made_up[1], made_up[-2]
+    return made_up
 
 
 def _between(steps: Array, first: RowArray, last: RowArray) -> Array:
     """Sums (M, ...) of steps (N, ...) between rows."""
     total = np.concatenate([steps[:1] * 0, np.cumsum(steps, axis=0)])
     return np.asarray(total[last] - total[first])
-
-
-def _within(flags: BoolArray, first: RowArray, last: RowArray) -> BoolArray:
-    """Whether any of the flags (N,) from `first` to before `last` (M,) is set."""
-    total = np.concatenate([[0], np.cumsum(flags)])
-    return np.asarray(total[np.maximum(last, first)] > total[first])

@@ -13,7 +13,7 @@ import numpy as np
 from slam.errors import TrajectoryError
 from slam.files import read_text, write_text
 from slam.geometry.se3 import Array, pose, quaternion, rotation_from_quaternion
-from slam.showing import card, count, path_svg, widest
+from slam.showing import count, widest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,9 +57,6 @@ class Trajectory:
     def __repr__(self) -> str:
         seconds = float(self.stamps[-1] - self.stamps[0]) if len(self) else 0.0
         return f"Trajectory({count(len(self), 'pose')}, {seconds:.3f} s, {self.length:.3f} m)"
-
-    def _repr_html_(self) -> str:
-        return card(repr(self), [path_svg(self.positions)])
 
     def plot(self, axis: Axes | None = None, plane: str = "", **options: Any) -> Axes:
         """Draw the path, two of its coordinates, both on one scale.

@@ -10,7 +10,7 @@ import numpy as np
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry.rig import StereoRig
-from slam.input.features import documented
+from slam.input.features import documented, outside_masks
 from slam.input.warnings import InputWarnings
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
@@ -97,8 +97,6 @@ class Extractor:
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
         with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
-            features = documented(frontend.extract(frame), self._rig)
-            if not (frame.left_mask is None and frame.right_mask is None):
-                features = features.outside(frame.left_mask, frame.right_mask)
+            features = outside_masks(documented(frontend.extract(frame), self._rig), frame)
         self._warnings.look(frame, features)
         return Extracted(frame, features, stages.milliseconds, checksum_of(frame))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from slam.checks import LATEST_STAMP
-from slam.data import ImagePair, StereoFeatures
+from slam.data import BoolArray, ImagePair, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -47,6 +47,25 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
             raise MeasurementError(f"features: a pixel of {name} lies far outside of the image")
     _require_images(features.images, rig)
     return replace(features, stamp=stamp, threshold=threshold, **columns)
+
+
+def outside_masks(features: StereoFeatures, frame: StereoFrame) -> StereoFeatures:
+    """The features where the masks of their frame are True; under the right camera's only the right pixel goes."""
+    if frame.left_mask is not None:
+        rows = _at(frame.left_mask, features.uv_left)
+        features = replace(features, **{name: getattr(features, name)[rows] for name in _COLUMNS})
+    if frame.right_mask is None:
+        return features
+    there = _at(frame.right_mask, features.uv_right)[:, None]
+    return replace(features, uv_right=np.where(there, features.uv_right, np.nan))
+
+
+def _at(mask: BoolArray, uv: Array) -> BoolArray:
+    """The mask (H, W) at pixels (N, 2); True beyond its border and where a pixel is NaN."""
+    out, there = np.ones(len(uv), bool), np.isfinite(uv).all(axis=1)
+    column, row = np.rint(uv[there]).astype(int).T.clip(0, np.array([mask.shape[1] - 1, mask.shape[0] - 1])[:, None])
+    out[there] = mask[row, column]
+    return out
 
 
 def following(features: StereoFeatures, dimensions: int | None, after: float) -> StereoFeatures:

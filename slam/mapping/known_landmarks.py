@@ -7,22 +7,17 @@ import numpy as np
 from slam.checks import FARTHEST_POSITION
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import LEAST_VARIANCE, Array
 from slam.table import LandmarkTable
 
 _NEAREST = 1e-3  # guard: least depth [m] of a landmark that a camera sees
 _LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having
+_ROUNDING = 1e-14  # numerics: share of a covariance's largest eigenvalue below which the smallest is rounding
 _SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from its transpose
 
 
 def require_known(backend: str, ids: IdArray, positions: Array, covariances: Array) -> None:
-    """Check the landmarks handed to `slam.interfaces.MapBackend`.
-
-    Args:
-        backend: its name, for the message.
-        ids: (N,).
-        positions: (N, 3) [m].
-        covariances: (N, 3, 3) [m²].
+    """Check landmarks (N) at positions (N, 3) [m] with covariances (N, 3, 3) [m²], as given to a back end of this name.
 
     Raises:
         MeasurementError: shapes differ, an id occurs twice, a position is not finite or absurdly far, or a covariance
@@ -34,17 +29,25 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
         raise MeasurementError(f"{backend}: {n} landmark ids, but {shapes}")
     if len(np.unique(ids)) != n:
         raise MeasurementError(f"{backend}: a landmark id stands twice")
-    bad = ~np.isfinite(positions).all(axis=1)
-    if bad.any():
-        raise MeasurementError(f"{backend}: the position of landmark {ids[bad][0]} is not finite")
-    bad = (np.abs(positions) > FARTHEST_POSITION).any(axis=1)
-    if bad.any():
-        raise MeasurementError(f"{backend}: landmark {ids[bad][0]} lies more than {FARTHEST_POSITION:g} m off")
-    bad = ~_positive_definite(covariances)
-    if bad.any():
-        raise MeasurementError(
-            f"{backend}: the covariance of landmark {ids[bad][0]} is not symmetric and positive definite"
-        )
+    far = f"landmark {{}} lies more than {FARTHEST_POSITION:g} m off"
+    for bad, what in (
+        (~np.isfinite(positions).all(axis=1), "the position of landmark {} is not finite"),
+        ((np.abs(positions) > FARTHEST_POSITION).any(axis=1), far),
+        (~_positive_definite(covariances), "the covariance of landmark {} is not symmetric and positive definite"),
+    ):
+        if bad.any():
+            raise MeasurementError(f"{backend}: {what.format(ids[bad][0])}")
+
+
+def definite(covariances: Array) -> Array:
+    """Covariances (N, 3, 3) [m²] symmetric and positive definite: what rounding took from the least variance is added.
+
+    A landmark that is hardly known in one direction may have lost its variance in another one.
+    """
+    P = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
+    values = np.linalg.eigvalsh(P)
+    short = np.maximum(np.maximum(LEAST_VARIANCE, _ROUNDING * values[:, 2]) - values[:, 0], 0)
+    return np.asarray(P + short[:, None, None] * np.eye(3))
 
 
 def known_landmarks(
@@ -70,22 +73,16 @@ def in_front(local: Array) -> BoolArray:
 
 
 def require_in_front(backend: str, ids: IdArray, local: Array) -> None:
-    """Check that landmarks at `local` (N, 3) [m] in the camera's coordinates lie in front of it.
-
-    Raises:
-        MeasurementError: one does not.
-    """
+    """Raise MeasurementError where a landmark at `local` (N, 3) [m] in the camera's coordinates is not before it."""
     bad = ~in_front(local)
     if bad.any():
         raise MeasurementError(f"{backend}: landmark {ids[bad][0]} does not lie in front of the camera")
 
 
-def _positive_definite(covariances: Array) -> np.ndarray:
+def _positive_definite(covariances: Array) -> BoolArray:
     """Which matrices (N,) are finite, symmetric and positive definite."""
     good = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
     C = np.where(good[:, None, None], covariances, np.eye(3))
     scale = np.abs(C).max(axis=(1, 2))
-    good &= np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2)) <= _SYMMETRIC * scale
-    good &= scale < _LARGEST
-    C = np.where(good[:, None, None], C, np.eye(3))
-    return np.asarray(good & (np.linalg.eigvalsh(C)[:, 0] > 0))
+    good &= (np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2)) <= _SYMMETRIC * scale) & (scale < _LARGEST)
+    return np.asarray(good & (np.linalg.eigvalsh(np.where(good[:, None, None], C, np.eye(3)))[:, 0] > 0))

@@ -11,10 +11,10 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,22 +27,15 @@ from slam.files import read_bytes, whole_file
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.known_landmarks import require_known
+from slam.mapping.known_landmarks import definite, require_known
 from slam.showing import count
 from slam.tracks.table import LandmarkTable
-
-
-class HasMap(Protocol):
-    """Whatever has a map to save, such as a running system."""
-
-    def snapshot(self) -> SavedMap:
-        """The map as it is now; raises SlamError where there is none."""
-        ...
-
+from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
 _VERSION = 4  # fixed: of the file format
 _WITHOUT_PLACES = "2"  # also read; version 3 had keyframes without the common errors of their poses, and is not
+_TEXTS = ("frontend", "world_frame", "written_by")  # of the header
 _DATE = (1980, 1, 1, 0, 0, 0)  # fixed: of all members, so that the same map gives the same bytes
 
 #: World frame of a map that was built from scratch.
@@ -56,20 +49,14 @@ _FAR, _HALF = FARTHEST_POSITION, 65504.0  # guard: [m]; the largest half float
 
 
 class _Kind(NamedTuple):
-    """What an array must be.
+    """What an array must be."""
 
-    Attributes:
-        dtype: of its entries.
-        shape: a letter for each size that other arrays share, a figure for each that is fixed.
-        least, most: bounds of its entries.
-        what: "pose" or "covariance" where each row must be one; "unknown" where entries may be NaN.
-    """
-
-    dtype: type
-    shape: str
-    least: float
+    dtype: type  # of its entries
+    shape: str  # a letter for each size that other arrays share, a figure for each that is fixed
+    least: float  # bounds of its entries
     most: float
-    what: str = ""
+    what: str = ""  # "pose" or "covariance" where each row must be one; "unknown" where entries may be NaN
+    field: str = ""  # attribute of a keyframe or loop that it holds
 
 
 #: Arrays of the landmarks.
@@ -81,23 +68,26 @@ _LANDMARKS = {
     "seen_from": _Kind(np.float64, "n3", -_FAR, _FAR, "unknown"),
 }  # fmt: skip
 
-#: Scalars, poses and covariances by keyframe, features of all keyframes in succession, and loops.
+#: Keyframes by their attributes, the features of all of them in succession, and loops.
 _PLACES = {
-    "keyframe_stamps": _Kind(np.float64, "k", -_GREATEST, _GREATEST),
+    "keyframe_stamps": _Kind(np.float64, "k", -_GREATEST, _GREATEST, field="stamp"),
     "keyframe_poses": _Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
-    "keyframe_odometry": _Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
-    "keyframe_covariances": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance"),
-    "keyframe_steps": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance"),
-    "keyframe_shares": _Kind(np.float64, "k6m", -_GREATEST, _GREATEST),
-    "keyframe_travelled": _Kind(np.float64, "k", -_FAR, _FAR),
-    "keyframe_depths": _Kind(np.float64, "k", np.nextafter(0, 1), _FAR),
+    "keyframe_odometry": _Kind(np.float64, "k44", -_FAR, _FAR, "pose", "T_odom_left"),
+    "keyframe_covariances": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance", "covariance"),
+    "keyframe_steps": _Kind(np.float64, "k66", -_GREATEST, _GREATEST, "covariance", "step_covariance"),
+    "keyframe_shares": _Kind(np.float64, "k6m", -_GREATEST, _GREATEST, field="jacobian"),
+    "keyframe_travelled": _Kind(np.float64, "k", -_FAR, _FAR, field="travelled"),
+    "keyframe_depths": _Kind(np.float64, "k", np.nextafter(0, 1), _FAR, field="depth"),
     "keyframe_features": _Kind(np.int64, "k", 0, MOST_ID),
-    "place_points": _Kind(np.float32, "f3", -_FAR, _FAR), "place_descriptors": _Kind(np.float16, "fd", -_HALF, _HALF),
-    "place_laplacian": _Kind(np.int8, "f", -128, 127), "place_landmarks": _Kind(np.int64, "f", -1, MOST_ID),
-    "loop_pairs": _Kind(np.int64, "l2", 0, MOST_ID), "loop_motions": _Kind(np.float64, "l44", -_FAR, _FAR, "pose"),
-    "loop_covariances": _Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance"),
-    "loop_inliers": _Kind(np.int64, "l", 0, MOST_ID),
-}  # fmt: skip
+    "place_points": _Kind(np.float32, "f3", -_FAR, _FAR, field="points"),
+    "place_descriptors": _Kind(np.float16, "fd", -_HALF, _HALF, field="descriptors"),
+    "place_laplacian": _Kind(np.int8, "f", -128, 127, field="laplacian"),
+    "place_landmarks": _Kind(np.int64, "f", -1, MOST_ID, field="landmarks"),
+    "loop_pairs": _Kind(np.int64, "l2", 0, MOST_ID, field="pair"),
+    "loop_motions": _Kind(np.float64, "l44", -_FAR, _FAR, "pose", "T_first_second"),
+    "loop_covariances": _Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance", "covariance"),
+    "loop_inliers": _Kind(np.int64, "l", 0, MOST_ID, field="inliers"),
+}
 
 
 def _require(arrays: Mapping[str, Any], kinds: Mapping[str, _Kind], source: str) -> None:
@@ -215,20 +205,14 @@ class SavedMap:
 
     @classmethod
     def of(
-        cls,
-        landmarks: LandmarkTable,
-        estimate: Estimate,
-        frontend: str,
-        world_frame: str,
-        version: str,
-        atlas: Atlas,
+        cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, world_frame: str, atlas: Atlas
     ) -> SavedMap:
         """The map of a running system: landmark rows, the back end's estimate, what both belong to, and keyframes."""
-        P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
+        P = definite(estimate.covariances)
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
             landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
-            f"surf-stereo-slam {version}", seen_from=landmarks.seen_from,
+            f"surf-stereo-slam {__version__}", seen_from=landmarks.seen_from,
             keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map(), loops=atlas.loops,
         )  # fmt: skip
 
@@ -250,8 +234,8 @@ class SavedMap:
             )
 
 
-def save_map(path: str | Path, what: HasMap | SavedMap) -> None:
-    """Write a map, or a system's map, to a file: completely or not at all.
+def save_map(path: str | Path, what: Any) -> None:
+    """Write a `SavedMap`, or the map of a `StereoSlam`, to a file: completely or not at all.
 
     Raises:
         SlamError: there is no map yet, or the file cannot be written.
@@ -273,8 +257,7 @@ def load_map(path: str | Path) -> SavedMap:
 
 def encode(saved: SavedMap) -> bytes:
     """The bytes of a file; the same for the same map."""
-    texts = {"world_frame": saved.world_frame, "frontend": saved.frontend, "written_by": saved.written_by}
-    header = {**texts, "holds": saved.holds}
+    header = {name: getattr(saved, name) for name in (*_TEXTS, "holds")}
     members = {"header.json": json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False).encode() + b"\n"}
     arrays = {name: getattr(saved, name) for name in _LANDMARKS} | places_to_arrays(saved)
     for name, values in arrays.items():
@@ -301,45 +284,36 @@ def decode(data: bytes, source: str) -> SavedMap:
         raise SlamError(f"{source}: a map of version {version!r}; {known}")
     if hashlib.sha256(body).hexdigest().encode() != digest:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
-    return SavedMap(**_members(body, source, version != _WITHOUT_PLACES), source=source)
-
-
-def _members(body: bytes, source: str, with_places: bool) -> dict[str, Any]:
-    """The attributes of `SavedMap` in an archive."""
     members = unpack(body, source)
-    names = [*_LANDMARKS, *(_PLACES if with_places else ())]
+    names = [*_LANDMARKS, *(_PLACES if version != _WITHOUT_PLACES else ())]
     missing = {"header.json", *(f"{name}.npy" for name in names)} - set(members)
     if missing:
         raise SlamError(f"{source}: the map lacks {min(missing)}")
-    header, texts = (
-        json_text(members["header.json"], f"{source}: header.json"),
-        ("frontend", "world_frame", "written_by"),
-    )
-    if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in texts):
-        raise SlamError(f"{source}: header.json must give {', '.join(texts)}")
+    header = json_text(members["header.json"], f"{source}: header.json")
+    if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in _TEXTS):
+        raise SlamError(f"{source}: header.json must give {', '.join(_TEXTS)}")
     arrays = {name: array(members[f"{name}.npy"], name, source) for name in names}
-    content = {name: header[name] for name in texts} | {name: arrays[name] for name in _LANDMARKS}
-    return content | (places_from_arrays(arrays, source) if with_places else {})
+    places: dict[str, Any] = places_from_arrays(arrays, source) if version != _WITHOUT_PLACES else {}
+    landmarks: dict[str, Any] = {name: arrays[name] for name in _LANDMARKS}
+    return SavedMap(**landmarks, **{name: header[name] for name in _TEXTS}, **places, source=source)
 
 
 def places_to_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
     """Keyframes, their poses in the map, and loops of a map as arrays by the names of `_PLACES`."""
     k, loops = saved.keyframes, saved.loops
     m = max((f.jacobian.shape[1] for f in k), default=0)
-    shares = [f.jacobian if f.jacobian.shape[1] == m else np.zeros((6, m)) for f in k]
+    k = tuple(f if f.jacobian.shape[1] == m else replace(f, jacobian=np.zeros((6, m))) for f in k)
     sizes = {"k": len(k), "m": m, "l": len(loops), "d": saved.dimensions, "f": sum(map(len, k))}
-    names = ("points", "descriptors", "laplacian", "landmarks")
-    columns: list[Any] = [
-        [f.stamp for f in k], saved.keyframe_poses, [f.T_odom_left for f in k], [f.covariance for f in k],
-        [f.step_covariance for f in k], shares, [f.travelled for f in k], [f.depth for f in k], [len(f) for f in k],
-        *(np.concatenate([getattr(f, name) for f in k]) if k else () for name in names),
-        [x.pair for x in loops], [x.T_first_second for x in loops], [x.covariance for x in loops],
-        [x.inliers for x in loops],
-    ]  # fmt: skip
-    return {
-        name: np.array(column, kind.dtype).reshape([sizes[c] if c.isalpha() else int(c) for c in kind.shape])
-        for (name, kind), column in zip(_PLACES.items(), columns)
-    }
+    whole = {"keyframe_poses": saved.keyframe_poses, "keyframe_features": [len(f) for f in k]}
+    arrays: dict[str, np.ndarray] = {}
+    for name, kind in _PLACES.items():
+        values: Any = whole.get(name)
+        if values is None:
+            values = [getattr(x, kind.field) for x in (loops if kind.shape[0] == "l" else k)]
+            values = np.concatenate(values) if kind.shape[0] == "f" and values else values
+        shape = [sizes[c] if c.isalpha() else int(c) for c in kind.shape]
+        arrays[name] = np.array(values, kind.dtype).reshape(shape)
+    return arrays
 
 
 def places_from_arrays(arrays: Mapping[str, np.ndarray], source: str) -> dict[str, Any]:
@@ -348,22 +322,24 @@ def places_from_arrays(arrays: Mapping[str, np.ndarray], source: str) -> dict[st
     Raises:
         SlamError: the arrays do not fit together, or a value is impossible; `source` names them in the message.
     """
-    a = arrays
-    _require(a, {"descriptors": _LANDMARKS["descriptors"]} | _PLACES, source)
-    begin, pairs = np.concatenate([[0], np.cumsum(a["keyframe_features"])]).astype(int), a["loop_pairs"]
-    if begin[-1] != len(a["place_points"]):
+    _require(arrays, {"descriptors": _LANDMARKS["descriptors"]} | _PLACES, source)
+    begin = np.concatenate([[0], np.cumsum(arrays["keyframe_features"])]).astype(int).tolist()
+    pairs = arrays["loop_pairs"]
+    if begin[-1] != len(arrays["place_points"]):
         raise SlamError(f"{source}: the keyframes have other features than there are")
     if (pairs >= len(begin) - 1).any() or (pairs[:, :1] >= pairs[:, 1:]).any():
         raise SlamError(f"{source}: a loop is between keyframes that there are not")
-    keyframes = tuple(
-        Keyframe(
-            -1, float(a["keyframe_stamps"][i]), a["keyframe_odometry"][i], a["keyframe_covariances"][i],
-            a["keyframe_steps"][i], a["keyframe_shares"][i], float(a["keyframe_travelled"][i]),
-            float(a["keyframe_depths"][i]), a["place_points"][s], a["place_descriptors"][s], a["place_laplacian"][s],
-            a["place_landmarks"][s],
-        )
-        for i, s in enumerate(slice(x, y) for x, y in pairwise(begin))
-    )  # fmt: skip
-    columns = pairs.tolist(), a["loop_motions"], a["loop_covariances"], a["loop_inliers"].tolist()
-    loops = tuple(Loop(first, second, *rest) for (first, second), *rest in zip(*columns))
-    return {"keyframes": keyframes, "keyframe_poses": a["keyframe_poses"], "loops": loops}
+
+    def fields_of(sizes: dict[str, Any]) -> dict[str, Any]:
+        """Fields of a keyframe or loop, given its row, or the slice of its rows, in arrays of each size."""
+        found = {k.field: arrays[name][sizes[k.shape[0]]] for name, k in _PLACES.items() if k.shape[0] in sizes}
+        return {name: x.item() if x.ndim == 0 else x for name, x in found.items() if name}
+
+    spans = [slice(*span) for span in pairwise(begin)]
+    keyframes = tuple(Keyframe(-1, **fields_of({"k": i, "f": span})) for i, span in enumerate(spans))
+    loops = []
+    for i, (first, second) in enumerate(pairs.tolist()):
+        fields = fields_of({"l": i})
+        del fields["pair"]
+        loops.append(Loop(first, second, **fields))
+    return {"keyframes": keyframes, "keyframe_poses": arrays["keyframe_poses"], "loops": tuple(loops)}

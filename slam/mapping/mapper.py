@@ -12,12 +12,12 @@ from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import transform
 from slam.interfaces import Backend, MapBackend
 from slam.mapping.config import MapConfig
-from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
-from slam.mapping.duplicates import doubled_landmarks, known_features
+from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.known_landmarks import in_front
-from slam.mapping.monocular import MonocularDepth, unclaimed
+from slam.mapping.monocular import MonocularDepth, frame_covariance, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
 from slam.tracks.localizer import LandmarkMatches, Localizer
@@ -26,41 +26,19 @@ from slam.tracks.visibility import MapView, expected_landmarks
 
 
 @dataclass(frozen=True, eq=False)
-class Returned:
-    """Features of an old keyframe that the present frame shows again.
+class OldPlace:
+    """Features of an old keyframe, as landmarks at positions that are known by now."""
 
-    Attributes:
-        rows: of the present features (M,).
-        ids: of the landmarks that the old features belonged to (M,), −1 for none.
-        local: positions in present left-camera coordinates (M, 3) [m].
-        covariances: of the positions (M, 3, 3) [m²].
-    """
+    landmarks: LandmarkTable  # their bookkeeping (M); ids that they had, −1 for none
+    rows: NDArray[np.intp]  # of the present frame's features that show them, or of the keyframe's (M,)
+    positions: Array  # (M, 3) [m]
+    covariances: Array  # of the positions (M, 3, 3) [m²]
 
-    rows: NDArray[np.intp]
-    ids: IdArray
-    local: Array
-    covariances: Array
-
-
-@dataclass(frozen=True, eq=False)
-class KnownPlace:
-    """Landmarks of a place whose pose is known.
-
-    Attributes:
-        ids: landmark ids that they had (M,), −1 for none.
-        positions: (M, 3) [m] in the back end's world frame.
-        covariances: of the positions (M, 3, 3) [m²].
-        descriptors: (M, D).
-        laplacian: signs of the Laplacian (M,).
-        seen_from: where the camera was when it saw them (3,) [m].
-    """
-
-    ids: IdArray
-    positions: Array
-    covariances: Array
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    seen_from: Array
+    @classmethod
+    def at(cls, landmarks: LandmarkTable, rows: NDArray[np.intp], T: Array, points: Array, P: Array) -> OldPlace:
+        """From points (M, 3) [m] with covariances (M, 3, 3) in coordinates that `T` (4, 4) transforms."""
+        P = T[:3, :3] @ P @ T[:3, :3].T
+        return cls(landmarks, rows, transform(T, points), 0.5 * (P + np.swapaxes(P, 1, 2)))
 
 
 class Mapper:
@@ -105,53 +83,42 @@ class Mapper:
             backend.remove(erased)
         return replace(step, landmarks=landmarks, added=added, erased=erased)
 
-    def restore(self, backend: Backend, step: Step, returned: Returned) -> Step:
+    def restore(self, backend: Backend, step: Step, place: OldPlace) -> Step:
         """Let landmarks of a revisited place rejoin the map, if the back end can place them.
 
-        They keep the ids that they had. If the back end still holds such a landmark, at its old, drifted position, that
-        one is erased first. Features that are landmarks of the map already, or that move, are left out.
+        They are in the present camera's coordinates, and keep the ids that they had. If the back end still holds such a
+        landmark, at its old, drifted position, that one is erased first. Features that are landmarks of the map
+        already, or that move, are left out.
         """
         if not isinstance(backend, MapBackend):
             return step
         taken = np.concatenate([step.matches.rows, step.added.rows, step.withheld.rows, step.labels.moving])
-        free = np.flatnonzero(~np.isin(returned.rows, taken) & in_front(returned.local))
+        free = np.flatnonzero(~np.isin(place.rows, taken) & in_front(place.positions))
         if not len(free):
             return step
-        ids = returned.ids[free]
-        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
+        ids, rows = self._named(place.landmarks.ids[free]), place.rows[free]
         stale = np.isin(step.landmarks.ids, ids)
         if stale.any():
             backend.remove(step.landmarks.ids[stale])
         landmarks = step.landmarks.select(~stale)
-        backend.place(ids, returned.local[free], returned.covariances[free])
-        rows = returned.rows[free]
+        backend.place(ids, place.positions[free], place.covariances[free])
         landmarks = landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
         erased = step.erased[~isin(step.erased, ids)]
         return replace(step, landmarks=landmarks, erased=erased, returned=LandmarkMatches(ids, rows))
 
-    def insert(self, backend: Backend, landmarks: LandmarkTable, place: KnownPlace) -> LandmarkTable:
-        """Add landmarks of a known place to the map, as from a saved map; those already in it are left unchanged."""
+    def insert(self, backend: Backend, landmarks: LandmarkTable, place: OldPlace) -> LandmarkTable:
+        """Add landmarks of a place in the world to the map, as from a saved map; those already in it are unchanged."""
         assert isinstance(backend, MapBackend)  # only such back ends start in a map
-        new = np.flatnonzero(~np.isin(place.ids, landmarks.ids) | (place.ids < 0))
-        ids = place.ids[new]
-        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
+        old = place.landmarks.ids
+        new = np.flatnonzero(~np.isin(old, landmarks.ids) | (old < 0))
+        ids = self._named(old[new])
         backend.insert(ids, place.positions[new], place.covariances[new])
-        once = np.ones(len(ids), np.int64)
-        seen_from = np.tile(place.seen_from, (len(ids), 1))
-        rows = LandmarkTable(
-            ids, place.descriptors[new], place.laplacian[new], once, once, 0 * once, 0 * once - 1, seen_from
-        )
-        return landmarks.joined(rows)
+        return landmarks.joined(replace(place.landmarks.select(new), ids=ids))
 
     def reconcile(self, backend: Backend, landmarks: LandmarkTable | None) -> LandmarkTable | None:
         """Make rows and back end agree after an interrupted step: landmarks that only one of them has are erased.
 
-        Args:
-            backend: as the interrupted step left it, after its prediction.
-            landmarks: the rows before the step.
-
-        Returns:
-            the rows that stay.
+        The back end is as that step left it, the rows are those before it; those that stay are returned.
         """
         if self._monocular is not None:
             self._monocular = self._new_monocular()
@@ -222,19 +189,27 @@ class Mapper:
         features, matches = step.features, step.matches
         if len(matches) < MINIMAL_POINTS:
             return landmarks, added
-        estimate = backend.estimate(landmarks=False)
+        T = step.estimate.T_world_left
         view = self._view(backend, landmarks, step)
         rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
-        covariance = monocular.pose_covariance(estimate, view, landmarks, features, matches)
-        new = monocular.step(features, rows, estimate.T_world_left, covariance, step.index)
+        there = isin(matches.ids, landmarks.ids)
+        local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
+        P = frame_covariance(self.rig, local, stereo, self._localizer.pixel_sigma)
+        rows, local, covariances = monocular.step(features, rows, T, P, step.index)
         wanted = max(self.config.target_in_view - len(matches) - len(added), 0)
-        best = np.sort(np.argsort(-features.response[new.rows], kind="stable")[:wanted])
+        best = np.sort(np.argsort(-features.response[rows], kind="stable")[:wanted])
         if not len(best):
             return landmarks, added
         ids = self._new_ids(len(best))
-        backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
-        landmarks = landmarks.with_new(step.index, ids, features, new.rows[best], step.estimate.T_world_left[:3, 3])
-        return landmarks, added.joined(LandmarkMatches(ids, new.rows[best]))
+        backend.place(ids, local[best], covariances[best])  # type: ignore[attr-defined]
+        landmarks = landmarks.with_new(step.index, ids, features, rows[best], T[:3, 3])
+        return landmarks, added.joined(LandmarkMatches(ids, rows[best]))
+
+    def _named(self, ids: IdArray) -> IdArray:
+        """The ids (N,) with new ones in place of −1."""
+        ids = ids.copy()
+        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
+        return ids
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

@@ -4,27 +4,25 @@ Paper B takes two successive images. A hand-held camera moves a centimetre betwe
 beyond arm's length; so a feature's first view is kept while it is tracked from frame to frame, and its depth is
 computed once the parallax is large enough.
 
-The camera's motion between the two views comes from both pose estimates, whose errors are taken to be independent. A
-pose's covariance is that by which its own frame's measurements fix it (`frame_covariance`), or the back end's if that
-is smaller, as in a well-known map. So a new landmark's covariance contains the noise of both views and of the motion.
-Correlations are neglected: landmarks made in the same frame share the error of that motion, and it is part of the
-present pose's error.
+The camera's motion between the two views comes from both pose estimates, whose errors are taken to be independent: each
+is as uncertain as its own frame's measurements leave it (`frame_covariance`). So a new landmark's covariance contains
+the noise of both views and of the motion. Correlations are neglected: landmarks made in the same frame share the error
+of that motion, and it is part of the present pose's error.
 
 A point that moves along its epipolar line gets a wrong depth: a single moving camera cannot tell.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, Estimate, IdArray, StereoFeatures
+from slam.data import BoolArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
+from slam.geometry.se3 import Array, adjoint, exp, inverse, points_by_pose
 from slam.tracks.follow import match_in_boxes, pairs_in_boxes
-from slam.tracks.localizer import LandmarkMatches
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView
 
@@ -33,26 +31,19 @@ _RADIUS = 20.0  # most that a feature moves between two frames, besides the came
 _D_MATCH, _RATIO = 0.5, 0.7  # paper: descriptor distance; ratio of the nearest two (paper B, 2.2)
 _KEPT = 45  # cost: frames in which a view is kept at most
 _MISFIT = 6.6  # derived: χ²(1) at 99 %, of two views of one point
-_STEPS = 4  # numerics: Gauss-Newton steps on a point's depth
 _VIEWS = 400  # cost: views kept at most
 _CLAIM = 12.0  # a landmark claims features within this distance of its predicted pixel
+_DIFFERENCES = np.repeat([1e-2, 1e-5], [4, 6])  # numerics: steps of numerical derivatives by pixels and by the motion
 
 
 @dataclass(frozen=True, eq=False)
 class Depths:
-    """Points triangulated from two views, in the camera's coordinates at the second one (N rows).
+    """Points triangulated from two views, in the camera's coordinates at the second one (N rows)."""
 
-    Attributes:
-        local: positions (N, 3) [m]; NaN where the rays do not meet in front of both cameras.
-        covariances: (N, 3, 3) [m²].
-        misfit: how far the two views are from showing one point (N,), χ² with one degree of freedom.
-        parallax: angle between the rays (N,) [rad].
-    """
-
-    local: Array
-    covariances: Array
-    misfit: Array
-    parallax: Array
+    local: Array  # positions (N, 3) [m]; NaN where the rays do not meet in front of both cameras
+    covariances: Array  # (N, 3, 3) [m²]
+    misfit: Array  # how far the two views are from showing one point (N,), χ² with one degree of freedom
+    parallax: Array  # angle between the rays (N,) [rad]
 
     def good(self, depth_error: float) -> BoolArray:
         """Which are known well enough (N,), `depth_error` being the largest relative standard deviation of depth."""
@@ -64,7 +55,10 @@ class Depths:
 def two_view_depth(
     rig: StereoRig, uv_then: Array, uv_now: Array, T_then_now: Array, motion_covariance: Array, sigma: float
 ) -> Depths:
-    """Triangulate points from two views of the left camera: linearly, then by Gauss-Newton on the reprojection errors.
+    """Triangulate points from two views of the left camera, to first order of the pixels' and the motion's errors.
+
+    Both rays pass each other at a distance. The point between them is the estimate; that the true distance is zero is
+    one more measurement of it, which also says whether the two views show one point.
 
     Args:
         rig: the cameras.
@@ -76,59 +70,43 @@ def two_view_depth(
     """
     n = len(uv_now)
     T = np.broadcast_to(T_then_now, (n, 4, 4))
-    P = np.broadcast_to(motion_covariance, (n, 6, 6))
+    P = np.zeros((n, 10, 10))
+    P[:, :4, :4], P[:, 4:, 4:] = sigma**2 * np.eye(4), motion_covariance
+    z = np.concatenate([uv_then, uv_now, np.zeros((n, 6))], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        met, parallax = _meeting(rig, z, T)
+        steps = np.diag(_DIFFERENCES)
+        J = np.stack([(_meeting(rig, z + d, T)[0] - _meeting(rig, z - d, T)[0]) / (2 * d.sum()) for d in steps], axis=2)
+        C = J @ P @ np.swapaxes(J, 1, 2)
+        gain = C[:, :3, 3] / C[:, 3, 3:]
+        local = met[:, :3] - gain * met[:, 3:]
+        covariances = C[:, :3, :3] - gain[:, :, None] * C[:, 3:, :3]
+        return Depths(local, covariances, met[:, 3] ** 2 / C[:, 3, 3], parallax)
+
+
+def _meeting(rig: StereoRig, z: Array, T: Array) -> tuple[Array, Array]:
+    """Where rays come closest to each other (N, 4): a point of the second camera and their distance; and their angles.
+
+    `z` (N, 10) are pixels then and now, and changes of the motion `T` (N, 4, 4). NaN behind a camera.
+    """
+    T = T @ exp(z[:, 4:])
     R, t = T[:, :3, :3], T[:, :3, 3]
-    then = _rays(rig, uv_then)
-    now = _rays(rig, uv_now)
+    then, now = _rays(rig, z[:, :2]), _rays(rig, z[:, 2:4])
     turned = (R @ now[:, :, None])[:, :, 0]
-    local = now * _depth(then, turned, t)[:, None]
-    cosine = (then * turned).sum(axis=1) / (np.linalg.norm(then, axis=1) * np.linalg.norm(turned, axis=1))
-    covariance, misfit = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
-    for _ in range(_STEPS):
-        step, covariance, misfit = _step(rig, uv_then, uv_now, R, t, P, local, sigma)
-        local = local + step
-    local[~(local[:, 2] > 0)] = np.nan
-    return Depths(local, covariance, misfit, np.arccos(np.clip(cosine, -1, 1)))
+    across = np.cross(then, turned)
+    size = (across * across).sum(axis=1)
+    depth_then = (np.cross(t, turned) * across).sum(axis=1) / size
+    depth = (np.cross(t, then) * across).sum(axis=1) / size
+    gap = (across * t).sum(axis=1) / np.sqrt(size)
+    between = (depth_then[:, None] * then - t + depth[:, None] * turned) / 2
+    local = (np.swapaxes(R, 1, 2) @ between[:, :, None])[:, :, 0]
+    local[~((depth > 0) & (depth_then > 0))] = np.nan
+    return np.column_stack([local, gap]), np.arctan2(np.sqrt(size), (then * turned).sum(axis=1))
 
 
 def _rays(rig: StereoRig, uv: Array) -> Array:
     """Rays (N, 3) with z = 1 of left pixels."""
     return np.concatenate([rig.left.normalise(uv), np.ones((len(uv), 1))], axis=1)
-
-
-def _depth(then: Array, turned: Array, t: Array) -> Array:
-    """Depth (N,) along the second rays at which both rays are closest to each other; NaN behind a camera."""
-    a, b, c = (then * then).sum(axis=1), (then * turned).sum(axis=1), (turned * turned).sum(axis=1)
-    d, e = (then * t).sum(axis=1), (turned * t).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = a * c - b * b
-        depth = (b * d - a * e) / determinant
-        depth_then = (c * d - b * e) / determinant
-    return np.where((depth > 0) & (depth_then > 0), depth, np.nan)
-
-
-def _step(
-    rig: StereoRig, uv_then: Array, uv_now: Array, R: Array, t: Array, P: Array, local: Array, sigma: float
-) -> tuple[Array, Array, Array]:
-    """A Gauss-Newton step (N, 3), the covariance (N, 3, 3) at its start, and the misfit (N,)."""
-    z_now, J_now = rig.left.project_with_jacobian(local)
-    z_then, J_then = rig.left.project_with_jacobian((R @ local[:, :, None])[:, :, 0] + t)
-    J_then = J_then @ R  # by the point in the second camera
-    by_motion = J_then @ -points_by_pose(local)
-    noise = by_motion @ P @ np.swapaxes(by_motion, 1, 2) + sigma**2 * np.eye(2)
-    bad = ~(np.isfinite(noise).all(axis=(1, 2)) & np.isfinite(J_now).all(axis=(1, 2)))
-    noise[bad], J_now[bad], J_then[bad] = np.eye(2), 0, 0
-    weight = np.linalg.inv(noise)
-    r_now, r_then = np.nan_to_num(uv_now - z_now)[:, :, None], np.nan_to_num(uv_then - z_then)[:, :, None]
-    Jt, Kt = np.swapaxes(J_now, 1, 2), np.swapaxes(J_then, 1, 2)
-    information = Jt @ J_now / sigma**2 + Kt @ weight @ J_then
-    singular = bad | ~(np.linalg.cond(information) < 1e14)
-    information[singular] = np.eye(3)
-    covariance = np.linalg.inv(information)
-    step = (covariance @ (Jt @ r_now / sigma**2 + Kt @ weight @ r_then))[:, :, 0]
-    misfit = (r_now * r_now).sum(axis=(1, 2)) / sigma**2 + (np.swapaxes(r_then, 1, 2) @ weight @ r_then)[:, 0, 0]
-    step[singular], covariance[singular], misfit[singular] = 0, np.nan, np.inf
-    return step, covariance, misfit
 
 
 def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma: float) -> Array:
@@ -150,57 +128,12 @@ def unclaimed(view: MapView, landmarks: LandmarkTable, features: StereoFeatures,
         return np.asarray(rows)
     at, which = pairs_in_boxes(view.uv_left[shown], np.full((len(shown), 2), _CLAIM), features.uv_left[rows])
     gap = np.linalg.norm(landmarks.descriptors[shown[at]] - features.descriptors[rows[which]], axis=1)
-    claimed = np.zeros(len(rows), bool)
-    claimed[which[gap < _D_MATCH]] = True
-    return np.asarray(rows[~claimed])
+    return np.delete(rows, which[gap < _D_MATCH])
 
 
-@dataclass(frozen=True, eq=False)
-class _Views:
-    """First views of the features being tracked, one row each."""
-
-    uv_first: Array
-    uv_last: Array
-    T_first: Array  # camera pose in the first view
-    covariance: Array  # of that pose, see `frame_covariance`
-    T_last: Array
-    frame: IdArray
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def select(self, rows: NDArray) -> _Views:
-        return _Views(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
-
-    def joined(self, other: _Views) -> _Views:
-        names = self.__dataclass_fields__
-        return _Views(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
-
-    @classmethod
-    def of(cls, features: StereoFeatures, rows: NDArray, T: Array, covariance: Array, frame: int) -> _Views:
-        n, uv = len(rows), features.uv_left[rows]
-        poses = np.tile(T, (n, 1, 1))
-        return cls(
-            uv, uv, poses, np.tile(covariance, (n, 1, 1)), poses, np.full(n, frame), features.descriptors[rows],
-            features.laplacian[rows],
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class NewPoints:
-    """Features whose depth has become known.
-
-    Attributes:
-        rows: of the features (N,).
-        local: positions (N, 3) [m] in the camera's coordinates.
-        covariances: (N, 3, 3) [m²].
-    """
-
-    rows: NDArray[np.intp]
-    local: Array
-    covariances: Array
+#: Columns of first views of features that are being tracked, a row each: "uv_first" and "uv_last" (N, 2), "T_first"
+#: and "T_last" (N, 4, 4), "covariance" (N, 6, 6) of the former, "frame" (N,), "descriptors" (N, D), "laplacian" (N,).
+_Views = dict[str, NDArray]
 
 
 class MonocularDepth:
@@ -216,25 +149,11 @@ class MonocularDepth:
         self._rig = rig
         self._sigma = sigma
         self._depth_error = depth_error
-        self._views: _Views | None = None
-
-    def pose_covariance(
-        self,
-        estimate: Estimate,
-        view: MapView,
-        landmarks: LandmarkTable,
-        features: StereoFeatures,
-        found: LandmarkMatches,
-    ) -> Array:
-        """Covariance (6, 6) of the pose: by this frame alone or by the back end, whichever is smaller."""
-        there = np.isin(found.ids, landmarks.ids)
-        local, stereo = view.local[landmarks.rows(found.ids[there])], features.has_stereo[found.rows[there]]
-        alone = frame_covariance(self._rig, local, stereo, self._sigma)
-        return min(alone, estimate.covariance, key=lambda P: float(np.trace(P[3:, 3:])))
+        self._views: _Views = {}
 
     def step(
         self, features: StereoFeatures, rows: NDArray[np.intp], T_world_left: Array, covariance: Array, frame: int
-    ) -> NewPoints:
+    ) -> tuple[NDArray[np.intp], Array, Array]:
         """Take in a frame.
 
         Args:
@@ -243,39 +162,51 @@ class MonocularDepth:
             T_world_left: pose (4, 4) after the update.
             covariance: of the pose by this frame, see `frame_covariance`.
             frame: the frame's number.
+
+        Returns:
+            rows of the features whose depth has become known (N,), their positions (N, 3) [m] in the camera's
+            coordinates, and covariances (N, 3, 3) [m²].
         """
-        views = self._views or _Views.of(features, rows[:0], T_world_left, covariance, frame)
+        views = self._views or _first_views(features, rows[:0], T_world_left, covariance, frame)
         row, view = self._followed(views, features, rows, T_world_left)
-        seen = views.select(view)
-        back = inverse(seen.T_first)
-        motion = adjoint(inverse(T_world_left) @ seen.T_first)
-        P = covariance + motion @ seen.covariance @ np.swapaxes(motion, 1, 2)
-        depths = two_view_depth(
-            self._rig, seen.uv_first, features.uv_left[row], back @ T_world_left, P, self._sigma
-        )  # fmt: skip
+        seen = _select(views, view)
+        motion = adjoint(inverse(T_world_left) @ seen["T_first"])
+        P = covariance + motion @ seen["covariance"] @ np.swapaxes(motion, 1, 2)
+        T_first_now, uv = inverse(seen["T_first"]) @ T_world_left, features.uv_left[row]
+        depths = two_view_depth(self._rig, seen["uv_first"], uv, T_first_now, P, self._sigma)
         good = depths.good(self._depth_error)
         again = ~good & (depths.misfit < _MISFIT)
-        kept = replace(
-            seen, uv_last=features.uv_left[row], T_last=np.tile(T_world_left, (len(row), 1, 1)),
-            descriptors=features.descriptors[row],
-        ).select(again)  # fmt: skip
-        lost = views.select(np.setdiff1d(np.arange(len(views)), view))
-        fresh = _Views.of(features, np.setdiff1d(rows, row[good | again]), T_world_left, covariance, frame)
-        everything = kept.joined(lost).joined(fresh)
-        everything = everything.select(everything.frame > frame - _KEPT)
-        self._views = everything.select(np.arange(len(everything))[-_VIEWS:])
-        return NewPoints(row[good], depths.local[good], depths.covariances[good])
+        now = _first_views(features, row, T_world_left, covariance, frame)
+        kept = _select({**seen, **{name: now[name] for name in ("uv_last", "T_last", "descriptors")}}, again)
+        lost = {name: np.delete(column, view, axis=0) for name, column in views.items()}
+        fresh = _first_views(features, np.setdiff1d(rows, row[good | again]), T_world_left, covariance, frame)
+        every = {name: np.concatenate([kept[name], lost[name], fresh[name]]) for name in views}
+        self._views = _select(every, np.flatnonzero(every["frame"] > frame - _KEPT)[-_VIEWS:])
+        return row[good], depths.local[good], depths.covariances[good]
 
     def _followed(
         self, views: _Views, features: StereoFeatures, rows: NDArray[np.intp], T: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Matches of features and kept views: rows of features and rows of views, each at most once."""
-        turn = np.swapaxes(views.T_last[:, :3, :3], 1, 2) @ T[:3, :3]
-        expected = self._rig.left.project((_rays(self._rig, views.uv_last)[:, None, :] @ turn)[:, 0])
+        turn = np.swapaxes(views["T_last"][:, :3, :3], 1, 2) @ T[:3, :3]
+        expected = self._rig.left.project((_rays(self._rig, views["uv_last"])[:, None, :] @ turn)[:, 0])
         # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
-        found = match_in_boxes(
-            expected, 2 * _RADIUS, views.descriptors, views.laplacian, features, rows, _D_MATCH, _RATIO
-        )  # fmt: skip
+        looks = views["descriptors"], views["laplacian"]
+        found = match_in_boxes(expected, 2 * _RADIUS, *looks, features, rows, _D_MATCH, _RATIO)
         gap = np.abs(features.uv_left[found.features] - expected[found.landmarks])
         found = found.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))
         return found.features, found.landmarks
+
+
+def _first_views(features: StereoFeatures, rows: NDArray, T: Array, covariance: Array, frame: int) -> _Views:
+    """Views of the features `rows` (N,) in a frame that has just been seen from a pose (4, 4)."""
+    n, uv = len(rows), features.uv_left[rows]
+    poses = np.tile(T, (n, 1, 1))
+    return {
+        "uv_first": uv, "uv_last": uv, "T_first": poses, "T_last": poses, "covariance": np.tile(covariance, (n, 1, 1)),
+        "frame": np.full(n, frame), "descriptors": features.descriptors[rows], "laplacian": features.laplacian[rows],
+    }  # fmt: skip
+
+
+def _select(views: _Views, rows: NDArray) -> _Views:
+    return {name: column[rows] for name, column in views.items()}

@@ -13,37 +13,27 @@ from slam.tracks.follow import crowded, pairs_in_boxes
 
 
 def new_landmarks(
-    features: StereoFeatures,
-    free: BoolArray,
-    occupied: Array,
-    rig: StereoRig,
-    pixel_sigma: float,
-    config: MapConfig,
+    features: StereoFeatures, free: BoolArray, occupied: Array, rig: StereoRig, pixel_sigma: float, config: MapConfig
 ) -> NDArray[np.intp]:
     """Rows of the features that become landmarks.
 
-    Args:
-        features: of the frame.
-        free: which features belong to no landmark (N,).
-        occupied: pixels of the landmarks in view (M, 2), the measured ones first.
-        rig: the cameras, for the depth's uncertainty.
-        pixel_sigma: noise of uL, vL, uR [px].
-        config: settings.
+    `free` (N,) says which features belong to no landmark; `occupied` (M, 2) are pixels of the landmarks in view, the
+    measured ones first.
     """
     wanted = config.target_in_view - len(occupied)
     if wanted <= 0 or not len(features):
         return np.zeros(0, np.intp)
     rows = np.flatnonzero(free & features.has_stereo)
     rows = rows[~crowded(features.uv_left[rows], occupied, config.separation)]
-    rows = rows[_depth_is_good(features, rows, rig, pixel_sigma, config.max_depth_error)]
+    rows = rows[depth_is_known(rig, features, rows, pixel_sigma, config.max_depth_error)]
     rows = rows[np.argsort(-features.response[rows], kind="stable")]
     return _spread(features.uv_left, rows, occupied, wanted, rig, config)
 
 
-def _depth_is_good(
-    features: StereoFeatures, rows: NDArray[np.intp], rig: StereoRig, pixel_sigma: float, limit: float
+def depth_is_known(
+    rig: StereoRig, features: StereoFeatures, rows: NDArray[np.intp], pixel_sigma: float, limit: float
 ) -> BoolArray:
-    """Which rows have a positive depth whose relative standard deviation is below the limit."""
+    """Which rows (K,) of stereo features have a positive depth whose relative standard deviation is below the limit."""
     points = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
     return np.asarray(rig.depth_deviation(points, pixel_sigma) < limit * points[:, 2])
 

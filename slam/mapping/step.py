@@ -22,55 +22,34 @@ _NOWHERE = Estimate(-np.inf, np.eye(4), np.eye(6), _NONE, np.zeros((0, 3)), np.z
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A frame in work. Each stage returns a copy that says more; nothing refers to a frame whose step did not end.
+    """A frame in work. Each stage returns a copy that says more; nothing refers to a frame whose step did not end."""
 
-    Attributes:
-        index: of the frame.
-        measured: the features as measured; those of landmarks aligned with earlier images.
-        features: the same, corrected by the calibration.
-        prediction: of the back end.
-        landmarks: the map.
-        matches: landmarks and the features that show them, without the withheld ones.
-        standing: whether the camera stands.
-        tracking: whether the pose is known.
-        atlas: keyframes and loops.
-        suspects: ids of landmarks that may move.
-        withheld: those of them that were matched; they are withheld from the back end's update.
-        left_out: ids of matched landmarks left out of the update, because others are more informative.
-        report: of the update.
-        estimate: the camera's pose after the update.
-        labels: which features move.
-        objects: the moving bodies.
-        added: landmarks that joined the map.
-        returned: landmarks of a revisited place that rejoined the map, and the features that show them now.
-        erased: ids of the landmarks that left the map.
-        common: the part of the pose's error that other frames share; included in the covariance of `estimate`.
-        correction: of the calibration, with which the features were corrected.
-        repeated: the images are those of the frame before, so that its features were left out.
-    """
-
-    index: int
-    measured: StereoFeatures
-    features: StereoFeatures
-    prediction: Prediction
-    landmarks: LandmarkTable
-    matches: LandmarkMatches
-    standing: Standing
-    tracking: TrackingState
-    atlas: Atlas
-    suspects: IdArray = field(default_factory=_NONE.copy)
+    index: int  # of the frame
+    measured: StereoFeatures  # the features as measured; those of landmarks aligned with earlier images
+    features: StereoFeatures  # the same, corrected by the calibration
+    prediction: Prediction  # of the back end
+    landmarks: LandmarkTable  # the map
+    matches: LandmarkMatches  # landmarks and the features that show them, without the withheld ones
+    standing: Standing  # whether the camera stands
+    tracking: TrackingState  # whether the pose is known
+    atlas: Atlas  # keyframes and loops
+    suspects: IdArray = field(default_factory=_NONE.copy)  # ids of landmarks that may move
+    # those of them that were matched; they are withheld from the back end's update
     withheld: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+    # ids of matched landmarks left out of the update, because others are more informative
     left_out: IdArray = field(default_factory=_NONE.copy)
-    report: UpdateReport = field(default_factory=lambda: UpdateReport.nothing(UpdateStatus.EMPTY, ""))
-    estimate: Estimate = _NOWHERE
-    labels: MotionLabels = field(default_factory=lambda: MotionLabels(_NONE, _NONE, _NONE))
-    objects: tuple[MovingObject, ...] = ()
-    added: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+    report: UpdateReport = field(default_factory=lambda: UpdateReport.nothing(UpdateStatus.EMPTY, ""))  # of the update
+    estimate: Estimate = _NOWHERE  # the camera's pose after the update
+    labels: MotionLabels = field(default_factory=lambda: MotionLabels(_NONE, _NONE, _NONE))  # which features move
+    objects: tuple[MovingObject, ...] = ()  # the moving bodies
+    added: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)  # landmarks that joined the map
+    # landmarks of a revisited place that rejoined the map, and the features that show them now
     returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
-    erased: IdArray = field(default_factory=_NONE.copy)
+    erased: IdArray = field(default_factory=_NONE.copy)  # ids of the landmarks that left the map
+    # the part of the pose's error that other frames share; included in the covariance of `estimate`
     common: CommonError = field(default_factory=CommonError)
-    correction: Correction | None = None
-    repeated: bool = False
+    correction: Correction | None = None  # of the calibration, with which the features were corrected
+    repeated: bool = False  # the images are those of the frame before, so that its features were left out
 
     @property
     def pose(self) -> Array:

@@ -14,7 +14,7 @@ from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
 from slam.calibration.evidence import RecordingEvidence
 from slam.calibration.joint import Agreement, agreement, joint_calibration
-from slam.calibration.saved import RigNumbers
+from slam.calibration.saved import rig_difference, rig_numbers
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
@@ -102,7 +102,7 @@ def calibrate(
     for sequence in sequences:
         if is_live(sequence):
             raise ConfigurationError(f"{sequence.name}: a recording is needed, not a camera")
-        difference = RigNumbers.of(rig).difference(RigNumbers.of(sequence.rig))
+        difference = rig_difference(rig_numbers(rig), rig_numbers(sequence.rig))
         if difference:
             raise CalibrationError(f"{sequence.name}: not the rig of {sequences[0].name}: {difference}")
     targets.require(rig, inputs)

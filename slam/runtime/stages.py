@@ -12,18 +12,18 @@ class Stages:
     """Stages of one step, entered one after the other.
 
     Attributes:
-        current: the stage entered last; after an exception, the one that it ended. None before the first.
+        begun: whether one has been entered.
         milliseconds: wall time of each stage that was completed [ms], without that in which kernels were compiled.
     """
 
     def __init__(self) -> None:
-        self.current: str | None = None
+        self.begun = False
         self.milliseconds: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Enter a stage; its time is taken where no exception ends it."""
-        self.current = name
+        self.begun = True
         start = working_time()
         yield
         self.milliseconds[name] = 1e3 * (working_time() - start)

@@ -17,7 +17,7 @@ from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.door import Masks, at_the_door
 from slam.sequences.faults import FaultLog
-from slam.showing import sequence_html, sequence_line
+from slam.showing import sequence_line
 
 
 @runtime_checkable
@@ -140,7 +140,6 @@ class RecordedSequence:
         return self.frames()
 
     __repr__ = sequence_line
-    _repr_html_ = sequence_html
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
         """Frames `start` up to, but without, `stop`; see `Sequence.frames`."""

@@ -16,7 +16,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
-from slam.showing import sequence_html, sequence_line
+from slam.showing import sequence_line
 from slam.worlds.appearance import Appearance, appearance
 from slam.worlds.faults import Faults
 from slam.worlds.observe import SimulatedFeatures, simulate
@@ -82,7 +82,6 @@ class WorldSequence:
         return self.frames()
 
     __repr__ = sequence_line
-    _repr_html_ = sequence_html
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
         """Images of frames `start` up to, but without, `stop`, each rendered when it is asked for.

@@ -163,7 +163,7 @@ def keep_books(rng: np.random.Generator, folder: Path) -> None:
         if rng.random() < 0.2:
             books.refused()
         if rng.random() < 0.1:
-            books.system.roll_back()
+            books.system.estimate()
         if rng.random() < 0.4:
             books.count()
     books.count()

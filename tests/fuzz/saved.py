@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.calibration.saved import RigNumbers, SavedCalibration, load_calibration
+from slam.calibration.saved import SavedCalibration, load_calibration, rig_numbers
 from slam.config import SystemConfig
 from slam.mapping.map_io import SavedMap, decode, encode
 from slam.objects.config import ObjectsConfig
@@ -45,7 +45,7 @@ def _files() -> dict[str, bytes]:
     save_recording(recording, folder / "a.npz")
     run_recording(recording, RunOptions("ekf", "recording", SystemConfig(), folder / "run"))
     ObjectDatabase.of(frames[0], np.arange(len(frames[0])) < 20, rig, np.eye(4)).save(folder / "objects.npz")
-    rig_errors = json.dumps(SavedCalibration(system.calibration.posterior, RigNumbers.of(rig)).to_json())
+    rig_errors = json.dumps(SavedCalibration(system.calibration.posterior, rig_numbers(rig)).to_json())
     kept = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     return {**kept, "a.map": encode(system.snapshot()), "rig.json": rig_errors.encode()}
 

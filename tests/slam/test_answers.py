@@ -10,7 +10,7 @@ import pytest
 from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
 from slam.config import SystemConfig
-from slam.data import ImagePair, Patches, StereoFrame
+from slam.data import Patches, StereoFrame
 from slam.errors import MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
@@ -95,14 +95,6 @@ def test_a_front_end_of_nonsense_is_named_and_the_next_frame_is_taken(method, ch
     for k in range(3, 6):
         result = system.process(LEFT ^ (k % 2), RIGHT, 0.1 * k)  # a still camera has noise
     assert result.status.measured
-
-
-IMAGES = [
-    (3, "must be an ImagePair"),
-    (ImagePair(LEFT, None), "left image must be float32"),
-    (ImagePair(np.float32(LEFT)[:-1], None), r"left image must be float32 of shape \(240, 320\)"),
-    (ImagePair(np.float32(LEFT), np.float64(RIGHT)), "right image must be float32"),
-]
 
 
 def test_a_front_end_whose_features_are_no_features_ends_in_one_line():

@@ -9,7 +9,6 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, one_line
-from slam.run.options import parse_frames
 from tests.fuzz.settings import CLASSES
 
 HOSTILE = (None, "x", b"x", [], {}, 1j, 10**23, 10**400, 1e308, -1e308, np.nan, np.inf, -1, (1, 2, 3, 4), object())
@@ -30,14 +29,6 @@ def test_every_field_of_every_class_refuses_what_it_cannot_be(kind):
         assert refused >= 8, f"{kind.__name__}.{f.name} takes nearly anything"
 
 
-@pytest.mark.parametrize("value", ["1e308", "1e-308", "9" * 23, "-1", "NaN", "[" * 900, "9" * 5000, '"x"', "null"])
-@pytest.mark.parametrize("key", ["models.pixel_sigma", "map.max_landmarks", "association.hypotheses", "map.grid"])
-def test_settings_refuse_what_they_cannot_be(key, value):
-    with pytest.raises(ConfigurationError) as caught:
-        SystemConfig().with_settings([f"{key}={value}"])
-    assert "\n" not in str(caught.value) and len(str(caught.value)) < 700
-
-
 def test_a_setting_of_any_length_is_refused_in_one_line():
     for text in ("map.grid=" + "[" * 100_000, "x" * 100_000, "models.pixel_sigma=" + "9" * 5000):
         with pytest.raises(ConfigurationError) as caught:
@@ -49,13 +40,6 @@ def test_numpys_numbers_and_lists_are_taken():
     from slam.mapping.selection import MapConfig
 
     assert MapConfig(grid=[8, 4], max_landmarks=np.int64(500), spacing=np.float32(0.5), separation=3)
-
-
-@pytest.mark.parametrize("text", [f"-{10**30}:", f":{10**30}", f"{10**30}:{10**31}", "9" * 5000 + ":", "-1:"])
-def test_ranges_of_frames_beyond_any_sequence(text):
-    with pytest.raises(SlamError, match="frames") as caught:
-        parse_frames(text)
-    assert len(str(caught.value)) < 700
 
 
 def test_one_line():

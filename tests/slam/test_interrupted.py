@@ -89,7 +89,7 @@ def interrupt_often(system: StereoSlam, frames: Iterator[Any], points: int) -> N
         index = index + 2 if results[-1].index == index + 2 else index + 3  # the last lines may not be reached
         assert results[-1].index == index
         assert results[-1].map_size == len(system.landmarks)
-    assert hits > 0.6 * points
+    assert hits >= 0.6 * points  # steps have more and fewer lines than the one that was counted
     assert_agree(system)
 
 

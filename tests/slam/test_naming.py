@@ -9,14 +9,7 @@ from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, UnknownNameError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
-from slam.naming import suggestion
 from slam.sequences import open_sequence
-
-
-def test_only_a_similar_name_is_suggested():
-    assert suggestion("Smother", ["batch", "smoother"]) == " (did you mean 'smoother'?)"
-    assert suggestion("kalman", ["batch", "ekf", "smoother"]) == ""
-    assert suggestion("x", []) == ""
 
 
 @pytest.mark.parametrize(

@@ -96,12 +96,6 @@ def test_what_cannot_be_written_is_said(tmp_path, path, words):
         refused([folder(tmp_path / path)], "cannot be written|no possible", overwrite=True)
 
 
-def test_a_system_that_takes_no_file_is_said():
-    refused([file("/proc/a.map")], "cannot be written")
-    refused([folder("/proc/out")], "cannot be written")
-    refused([file("/dev/full")], "not a regular file", overwrite=True)
-
-
 def test_something_else_in_place_of_a_file_of_a_folder(tmp_path):
     (tmp_path / "a.txt").mkdir()
     refused([folder(tmp_path)], "not a regular file", overwrite=True)

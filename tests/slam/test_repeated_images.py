@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import slam
-from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFrame
 from slam.input.warnings import REPEATED
-from slam.run.options import RunOptions
-from slam.run.runner import run
 
 SEQUENCE = slam.open_sequence("synthetic:desk?frames=20")
 FRAMES = list(SEQUENCE)
@@ -65,13 +61,6 @@ def test_a_camera_that_stands_still_is_tracked_by_its_noise():
     assert {r.status for r in results[1:]} == {FrameStatus.TRACKED} and s.warnings == []
 
 
-def test_a_driver_that_gives_each_image_twice_halves_the_rate():
-    s = system()
-    results = [s.process(frame) for frame in shown([k // 2 for k in range(20)])]
-    assert repeats(results) == list(range(1, 20, 2))
-    assert {r.status for r in results[2::2]} == {FrameStatus.TRACKED}
-
-
 def test_buffers_that_are_filled_again_are_new_images_and_copies_are_old_ones():
     s, left, right = system(), FRAMES[0].left.copy(), FRAMES[0].right.copy()
     results = []
@@ -104,31 +93,3 @@ def test_the_camera_is_looked_for_in_a_map_as_long_as_it_is_not_found():
     results = [s.process(f) for f in shown([0, 0, 1, 1, 2], [StereoFrame(0, 0.0, *noise), *FRAMES[3:5]])]
     assert [r.located for r in results] == [False, False, True, True, True]
     assert repeats(results) == [3]
-
-
-@dataclass
-class Shown:
-    """A sequence of given frames."""
-
-    given: list[StereoFrame]
-    rig: slam.StereoRig = SEQUENCE.rig
-    name = "frozen"
-    format = "test"
-    kind = "handheld"
-    ground_truth = None
-    warnings: list[str] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.given)
-
-    def frames(self, start=0, stop=None):
-        yield from self.given[start:stop]
-
-
-def test_a_run_says_so_at_its_end(tmp_path):
-    options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), tmp_path)
-    run(Shown(shown(FROZEN)), options)
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert [REPEATED in line for line in summary["warnings"]] == [True]
-    assert summary["tracking"] == f"7 of 26 frames were not tracked; likely cause: in 7 of them {REPEATED}"
-    assert (tmp_path / "frames.csv").read_text().count(REPEATED.split(",")[0]) == 7

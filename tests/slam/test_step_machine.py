@@ -126,7 +126,7 @@ class Camera:
             with interrupted(stage, line):
                 result = self.system.process_features(features)
         except KeyboardInterrupt:
-            self.system.roll_back()
+            self.system.estimate()
             self.map = set(self.system.landmarks.ids.tolist())
         else:
             self._account(result)

@@ -67,17 +67,6 @@ def test_starts_late_where_the_first_frames_are_empty(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_missing_right_images_do_not_stop_tracking(backend):
-    def no_right(k, features):
-        return replace(features, uv_right=np.full_like(features.uv_right, np.nan)) if k in (10, 11) else features
-
-    system, results, truth = run(backend, change=no_right)
-    assert all(r.status is FrameStatus.TRACKED for r, _ in results[1:])
-    assert not len(results[10][0].added)  # depth comes from the stereo pair
-    assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.01
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_new_map_forgets_what_the_rig_s_error_does_to_the_landmarks_of_the_old_one(backend):
     """By a baseline 33 times too long nothing is tracked, and map follows map, while the calibration goes on."""
     sequence = slam.open_sequence("synthetic:desk?frames=12&baseline=0.075")
@@ -131,21 +120,6 @@ class CloudFrontend:
 def frames_without_images(count: int = 12) -> list[StereoFrame]:
     none = np.zeros((240, 320), np.uint8)
     return [StereoFrame(k, k / 30, none, none) for k in range(count)]
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_run_with_overlap_gives_the_same_bytes_as_one_step_after_the_other(backend):
-    frames = frames_without_images()
-    poses = []
-    for overlap in (True, False):
-        system = StereoSlam(RIG, CloudFrontend(), backend, config=CONFIG)
-        results = list(system.run(frames, overlap))
-        assert [frame.index for frame, _ in results] == list(range(12))
-        assert "extract" in results[-1][1].milliseconds
-        poses.append(np.array([r.estimate.T_world_left for _, r in results]).tobytes())
-    system = StereoSlam(RIG, CloudFrontend(), backend, config=CONFIG)
-    poses.append(np.array([system.process(f).estimate.T_world_left for f in frames]).tobytes())
-    assert poses[0] == poses[1] == poses[2]
 
 
 def test_a_frame_that_cannot_be_extracted_ends_a_run_after_the_frames_before_it():

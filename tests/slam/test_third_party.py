@@ -69,11 +69,6 @@ def test_an_exception_that_cannot_be_shown_is_named_all_the_same():
         system.process(LEFT, RIGHT, 0.0)
 
 
-def test_a_program_that_ends_itself_while_a_part_works_ends():
-    with pytest.raises(SystemExit), named_failures("frame 0", Failing("update", ValueError())):
-        exec("raise SystemExit(0)", {"__name__": "handler_of_a_signal"})
-
-
 def test_a_front_end_that_stops_does_not_end_the_frames():
     system = StereoSlam(RIG, Blind(RIG), "ekf")
     frames = [StereoFrame(0, 0.0, LEFT, RIGHT)]

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -21,12 +20,10 @@ from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.chain import Chain, between_keyframes
 from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
-from slam.mapping.atlas.places import PlaceIndex, Vectors
+from slam.mapping.atlas.places import PlaceIndex
+from slam.mapping.atlas.pose_graph import PoseGraph
 from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
-
-if TYPE_CHECKING:
-    from slam.mapping.atlas.pose_graph import Solution
 
 _UNKNOWN_DIRECTION = np.pi / np.sqrt(3)  # derived: standard deviation of an unknown angle [rad]
 
@@ -36,21 +33,14 @@ class MapAnchor:
     """A pose with its uncertainty in the map, from which those of later poses are propagated.
 
     It is the newest keyframe's at the last loop closure, or the first pose of a new back end that has started since.
-
-    Attributes:
-        T_odom_left: the pose (4, 4), as the back end estimated it then.
-        noise: its covariance (6, 6) in the back end, without the common errors.
-        covariance: in the map: joint covariance (6 + n, 6 + n) of the pose, perturbing on the right, and of the common
-            errors.
-        common: estimate of the common errors (n,), in units of their prior standard deviations.
-        rig: what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`.
     """
 
-    T_odom_left: Array
-    noise: Array
+    T_odom_left: Array  # the pose (4, 4), as the back end estimated it then
+    noise: Array  # its covariance (6, 6) in the back end, without the common errors
+    # in the map: joint covariance (6 + n, 6 + n) of the pose, perturbing on the right, and of the common errors
     covariance: Array
-    common: Array
-    rig: CommonError
+    common: Array  # estimate of the common errors (n,), in units of their prior standard deviations
+    rig: CommonError  # what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`
 
     def belief(self, rig: CommonError) -> tuple[Array, Array]:
         """The common errors (n,) and their covariance (n, n); zero and unity if there are others by now."""
@@ -69,9 +59,8 @@ class MapAnchor:
 
         The path since the anchor is not corrected by the common errors, so their estimate counts as an error too.
 
-        Args:
-            back: adjoint (6, 6) of the anchor's pose in the later one's coordinates.
-            shares: derivative (6, m) of the motion since by the rig's errors.
+        `back` (6, 6) is the adjoint of the anchor's pose in the later one's coordinates, `shares` (6, m) the derivative
+        of the motion since by the rig's errors.
         """
         J = np.concatenate([back, shares @ self.rig.root], axis=1)
         found = shares @ self.rig.root @ self.common
@@ -80,60 +69,39 @@ class MapAnchor:
 
 @dataclass(frozen=True, eq=False)
 class TrackingGap:
-    """A time in which the camera moved without being tracked, and after which a new back end took over.
+    """A time in which the camera moved without being tracked, and after which a new back end took over."""
 
-    Attributes:
-        since: time of the last measured pose before it [s].
-        until: time of the first pose after it [s].
-        covariance: of that pose (6, 6), perturbing on the right, see `covariance_after_unseen_motion`; None if the
-            camera was found elsewhere, so that nothing is known of its motion.
-        anchor: the first pose after it, if a new map begins there that no loop has tied to the rest so far.
-    """
-
-    since: float
-    until: float
+    since: float  # time of the last measured pose before it [s]
+    until: float  # time of the first pose after it [s]
+    # of that pose (6, 6), perturbing on the right, see `covariance_after_unseen_motion`; None if the camera was found
+    # elsewhere, so that nothing is known of its motion
     covariance: Array | None = None
+    # the first pose after it, if a new map begins there that no loop has tied to the rest so far
     anchor: MapAnchor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """What a run keeps of the places that it has visited.
+    """What a run keeps of the places that it has visited."""
 
-    Attributes:
-        keyframes: in order of time.
-        index: of their appearance, for place recognition.
-        loops: those in the pose graph.
-        inactive_loops: the latest verified loops outside the pose graph: refused, unconfirmed, or not
-            informative.
-        dropped: number of this run's loops taken out of the pose graph to save time.
-        refused: loops that contradict the path, as pairs of keyframe numbers.
-        corrected: poses T_map_left (C, 4, 4) of the first C keyframes, as of the last loop closure.
-        solved: the anchor at the last of these; None without a loop.
-        anchor: from which the present pose's covariance is propagated: `solved`, or where a new map has started since.
-        T_map_odom: pose (4, 4) of the back end's frame in the map.
-        pending: the last loop that passed the gate, whether in the pose graph or not.
-        confirmed: whether another keyframe shortly before agreed with `pending`.
-        gaps: one before each back end but the first.
-        restarts: number of gaps before the last keyframe.
-        prior_count: number of keyframes of the prior map that this run started in; they come first.
-    """
-
-    keyframes: tuple[Keyframe, ...] = ()
-    index: PlaceIndex = field(default_factory=PlaceIndex)
-    loops: tuple[Loop, ...] = ()
+    keyframes: tuple[Keyframe, ...] = ()  # in order of time
+    index: PlaceIndex = field(default_factory=PlaceIndex)  # of their appearance, for place recognition
+    loops: tuple[Loop, ...] = ()  # those in the pose graph
+    # the latest verified loops outside the pose graph: refused, unconfirmed, or not informative
     inactive_loops: tuple[Loop, ...] = ()
-    dropped: int = 0
-    refused: tuple[tuple[int, int], ...] = ()
+    dropped: int = 0  # number of this run's loops taken out of the pose graph to save time
+    refused: tuple[tuple[int, int], ...] = ()  # loops that contradict the path, as pairs of keyframe numbers
+    # poses T_map_left (C, 4, 4) of the first C keyframes, as of the last loop closure
     corrected: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    solved: MapAnchor | None = None
+    solved: MapAnchor | None = None  # the anchor at the last of these; None without a loop
+    # from which the present pose's covariance is propagated: `solved`, or where a new map has started since
     anchor: MapAnchor | None = None
-    T_map_odom: Array = field(default_factory=lambda: np.eye(4))
-    pending: Loop | None = None
-    confirmed: bool = False
-    gaps: tuple[TrackingGap, ...] = ()
-    restarts: int = 0
-    prior_count: int = 0
+    T_map_odom: Array = field(default_factory=lambda: np.eye(4))  # pose (4, 4) of the back end's frame in the map
+    pending: Loop | None = None  # the last loop that passed the gate, whether in the pose graph or not
+    confirmed: bool = False  # whether another keyframe shortly before agreed with `pending`
+    gaps: tuple[TrackingGap, ...] = ()  # one before each back end but the first
+    restarts: int = 0  # number of gaps before the last keyframe
+    prior_count: int = 0  # number of keyframes of the prior map that this run started in; they come first
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -142,19 +110,18 @@ class Atlas:
     def of_earlier_run(cls, keyframes: Sequence[Keyframe], poses: Array, loops: Sequence[Loop] = ()) -> Atlas:
         """The places of a saved map.
 
-        Args:
-            keyframes: with poses in the frame of the back end that estimated them.
-            poses: of the keyframes in the map (K, 4, 4).
-            loops: that gave these poses.
+        Its keyframes have poses in the frame of the back end that estimated them; `poses` (K, 4, 4) are those in the
+        map, which `loops` gave.
         """
         atlas = cls()
         for keyframe in keyframes:
-            atlas = atlas.with_new(replace(keyframe, frame=-1), keyframe.descriptors.astype(np.float32))
+            atlas = atlas.with_new(replace(keyframe, frame=-1))
         return replace(atlas, loops=tuple(loops), corrected=poses, prior_count=len(atlas))
 
-    def with_new(self, keyframe: Keyframe, descriptors: Vectors) -> Atlas:
-        """A copy with one more keyframe, which has descriptors (F, D)."""
-        return replace(self, keyframes=(*self.keyframes, keyframe), index=self.index.with_new(descriptors))
+    def with_new(self, keyframe: Keyframe) -> Atlas:
+        """A copy with one more keyframe."""
+        index = self.index.with_new(keyframe.descriptors.astype(np.float32))
+        return replace(self, keyframes=(*self.keyframes, keyframe), index=index)
 
     @cached_property
     def stamps(self) -> Array:
@@ -178,7 +145,7 @@ class Atlas:
 
     def poses_in_map(self) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes."""
-        return self._in_map(self.poses)
+        return self.in_map(self.poses)
 
     def summary(self) -> dict[str, int]:
         """Numbers of keyframes, of loops closed in this run, and of loops refused because they contradict the path.
@@ -218,26 +185,19 @@ class Atlas:
             atlas = atlas.with_loop(loop, most)
         return replace(atlas, pending=held[-1], confirmed=True)
 
-    def solved_by(self, solution: Solution, rig: CommonError) -> Atlas:
+    def solved_by(self, graph: PoseGraph, rig: CommonError) -> Atlas:
         """A copy with the keyframes' poses by the pose graph; `rig` says what its common errors stand for."""
-        last = self.keyframes[-1]
+        last, poses = self.keyframes[-1], graph.keyframe_poses()
         shared = replace(rig, jacobian=last.jacobian)
-        anchor = MapAnchor(last.T_odom_left, last.covariance, solution.covariance, solution.common, shared)
-        return replace(
-            self,
-            corrected=solution.poses,
-            solved=anchor,
-            anchor=anchor,
-            gaps=tuple(replace(gap, anchor=None) for gap in self.gaps),
-            T_map_odom=solution.poses[-1] @ inverse(last.T_odom_left),
-        )
+        anchor = MapAnchor(last.T_odom_left, last.covariance, graph.covariance(), graph.common, shared)
+        gaps = tuple(replace(gap, anchor=None) for gap in self.gaps)
+        T_map_odom = poses[-1] @ inverse(last.T_odom_left)
+        return replace(self, corrected=poses, solved=anchor, anchor=anchor, gaps=gaps, T_map_odom=T_map_odom)
 
     def relocalized(self, gap: TrackingGap, place: float | None) -> Atlas:
         """A copy with a gap after which the camera was found in the map.
 
-        Args:
-            gap: which has just ended.
-            place: time of the keyframe by which it was found [s]; None if it was found by the back end's landmarks.
+        `place` [s] is the time of the keyframe by which it was found; None if it was found by the back end's landmarks.
         """
         anchor = self.anchor
         if place is not None:
@@ -250,12 +210,9 @@ class Atlas:
     ) -> Atlas:
         """A copy with a new back end from here on, which takes its first pose for exact; in the map it is uncertain.
 
-        Args:
-            since: time of the last measured pose [s].
-            before: the earlier back end's last estimate, with the rig's uncertainty.
-            after: the new back end's first estimate, at the same pose.
-            common: the part of the pose's error that other frames share.
-            models: motion model, with the speeds of a camera of this kind.
+        `since` [s] is the time of the last measured pose; `before` the earlier back end's last estimate, with the rig's
+        uncertainty, `after` the new one's first, at the same pose; `common` the part of the pose's error that other
+        frames share.
         """
         n = common.root.shape[1]
         error, known = (np.zeros(n), np.eye(n)) if self.anchor is None else self.anchor.belief(common)
@@ -278,9 +235,8 @@ class Atlas:
     def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as estimated at the time, or as revised in `path`.
 
-        Args:
-            rig: what the common errors stand for now.
-            path: the present estimate of the whole path; None for the poses as they were estimated at the time.
+        `rig` says what the common errors stand for now. Without a path the poses are as they were estimated at the
+        time.
         """
         poses, count, m = self.poses.copy(), len(self), len(rig.root)
         if path is not None:
@@ -292,12 +248,8 @@ class Atlas:
         common[1:] -= adjoint(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
         return Chain(poses, steps, common)
 
-    def in_map(self, chain: Chain) -> Array:
-        """Poses T_map_left (K, 4, 4) of all keyframes; those since the last loop are computed by `T_map_odom`."""
-        return self._in_map(chain.poses)
-
-    def _in_map(self, poses: Array) -> Array:
-        """All keyframes' poses (K, 4, 4) in odom, transformed to the map."""
+    def in_map(self, poses: Array) -> Array:
+        """Poses (K, 4, 4) of all keyframes in the map, given those in odom; the last loop has set those before it."""
         return np.concatenate([self.corrected, self.T_map_odom @ poses[len(self.corrected) :]])
 
     def pose_in_map(self, number: int) -> Array:
@@ -309,10 +261,8 @@ class Atlas:
     def estimate(self, estimate: Estimate, common: CommonError, gaps: bool = True) -> Estimate:
         """An estimate in odom, transformed to the map; its covariance is propagated from the anchor, if there is one.
 
-        Args:
-            estimate: with covariances by noise and by the common errors.
-            common: the part of the pose's error that other frames share.
-            gaps: whether landmarks also get the uncertainty of the pose at which their map begins, which all share.
+        Its covariances are by noise and by the `common` errors. With `gaps`, landmarks also get the uncertainty of the
+        pose at which their map begins, which all share.
         """
         if self.anchor is None:
             return estimate
@@ -333,12 +283,10 @@ class Atlas:
         """A path in odom, transformed to the map; between keyframes the loops' corrections are interpolated in time."""
         if self.solved is None or not len(path):
             return path
-        from slam.mapping.atlas.pose_graph import solve
-
         chain = self.chain(self.solved.rig, path)
-        moved = self.in_map(chain)
+        moved = self.in_map(chain.poses)
         with suppress(np.linalg.LinAlgError):  # then the keyframes stay as the last loop left them
-            moved = solve(chain, self.loops, moved).poses
+            moved = PoseGraph.solved(chain, self.loops, moved).keyframe_poses()
         stamps = self.stamps[self.prior_count :]
         return Trajectory(path.stamps, between_keyframes(path, stamps, moved[self.prior_count :], self._unseen_time))
 
@@ -356,10 +304,7 @@ def covariance_after_unseen_motion(covariance: Array, duration: float, models: E
     motion model's initial velocity uncertainty acts throughout the gap as well, up to a wholly unknown direction and
     position.
 
-    Args:
-        covariance: by the motion model (6, 6).
-        duration: of the gap [s].
-        models: motion model, with the speeds of a camera of this kind.
+    `covariance` (6, 6) is by the motion model, `duration` [s] that of the gap.
     """
     speeds = np.array([models.initial_angular_velocity_sigma, models.initial_velocity_sigma])
     most = np.array([_UNKNOWN_DIRECTION, ANYWHERE])

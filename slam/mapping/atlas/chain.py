@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,29 +22,24 @@ from slam.geometry.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """The path of the keyframes as the back end estimated it, step by step.
+    """The path of the keyframes as the back end estimated it, step by step."""
 
-    Attributes:
-        poses: T_odom_left (K, 4, 4).
-        steps: covariance (K, 6, 6) by noise of the motion from the keyframe before, perturbing on the right; the first
-            has no meaning.
-        common: derivative (K, 6, m) of the same motion by the common errors, which have unit variance; m is 0 by
-            default.
-    """
-
-    poses: Array
+    poses: Array  # T_odom_left (K, 4, 4)
+    # covariance (K, 6, 6) by noise of the motion from the keyframe before, perturbing on the right; the first has no
+    # meaning
     steps: Array
+    # derivative (K, 6, m) of the same motion by the common errors, which have unit variance; m is 0 by default
     common: Array = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         if self.common is None:
             object.__setattr__(self, "common", np.zeros((len(self.poses), 6, 0)))
 
-    def propagated(self, ends: NDArray[np.intp]) -> Propagated:
+    def propagated(self, ends: NDArray[np.intp]) -> tuple[Array, Array]:
         """Error accumulated from the begin of its stretch to each keyframe, perturbing the pose at the stretch's end.
 
-        Args:
-            ends: the keyframes that bound the stretches, ascending, including the first and the last one.
+        `ends` are the keyframes that bound the stretches, ascending, including the first and the last one. The errors
+        are the covariance (K, 6, 6) by noise, and the derivative (K, 6, m) by the common errors.
         """
         number = np.arange(len(self.poses))
         end = ends[np.searchsorted(ends, number)]
@@ -57,7 +51,7 @@ class Chain:
             total = np.cumsum(step, axis=0)
             total -= total[begin]
             parts.append(total)
-        return Propagated(*parts)
+        return parts[0], parts[1]
 
     def motion(self, first: int, second: int) -> tuple[Array, Array]:
         """Motion (4, 4) from one keyframe to another, and its covariance (6, 6), perturbing on the right."""
@@ -73,38 +67,22 @@ class Chain:
         return T, P
 
 
-class Propagated(NamedTuple):
-    """Error accumulated from the begin of its stretch to each keyframe.
-
-    Attributes:
-        noise: covariance (K, 6, 6).
-        common: derivative (K, 6, m) by the common errors.
-    """
-
-    noise: Array
-    common: Array
-
-
-def spread(chain: Chain, ends: NDArray[np.intp], propagated: Propagated, moved: Array, common: Array) -> Array:
+def spread(chain: Chain, ends: NDArray[np.intp], propagated: tuple[Array, Array], moved: Array, common: Array) -> Array:
     """Poses (K, 4, 4) of all keyframes, from those that bound stretches: each stretch's change is distributed.
 
     Each motion gets its part by the common errors; the rest is distributed in proportion to the noise.
 
-    Args:
-        chain: the path.
-        ends: the keyframes (M,) that bound stretches.
-        propagated: see `Chain.propagated`.
-        moved: their new poses (M, 4, 4).
-        common: the common errors (m,).
+    `ends` (M,) are the keyframes that bound stretches, `moved` (M, 4, 4) their new poses, `common` (m,) the common
+    errors; for `propagated` see `Chain.propagated`.
     """
     number = np.arange(len(chain.poses))
     at = np.maximum(np.searchsorted(ends, number), 1) - 1  # row of each keyframe's stretch
     rest = inverse(chain.poses) @ chain.poses[ends[at + 1]]
-    expected = propagated.common @ common
+    noise, expected = propagated[0], propagated[1] @ common
     change = log(inverse(chain.poses[ends[1:]]) @ chain.poses[ends[:-1]] @ inverse(moved[:-1]) @ moved[1:])
-    whole = propagated.noise[ends[1:]] + LEAST_VARIANCE * np.eye(6)
+    whole = noise[ends[1:]] + LEAST_VARIANCE * np.eye(6)
     weight = np.linalg.solve(whole, (change - expected[ends[1:]])[:, :, None])
-    part = expected + (propagated.noise @ weight[at])[:, :, 0]
+    part = expected + (noise @ weight[at])[:, :, 0]
     part[ends[0]] = 0
     part[ends[1:]] = change
     out = spread_over(moved[at], inverse(chain.poses[ends[:-1]])[at] @ chain.poses, rest, part)

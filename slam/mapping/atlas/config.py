@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from slam.chi_square import chi_square_beyond
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN, require_not_negative
+from slam.models import require_not_negative
 
 _RANGES = {
     "features": (1, 100_000),
@@ -41,7 +41,6 @@ class AtlasConfig:
         most_loops: largest number of loops in the pose graph, as each makes the next one slower; beyond it, those
             spread most evenly along the path are kept.
         give_back: landmarks of a revisited place return to the back end, if it can place landmarks.
-        on_disk: keep the keyframes' features in a temporary file; some 6 kB of each keyframe stay in memory.
     """
 
     enabled: bool = True
@@ -58,9 +57,6 @@ class AtlasConfig:
     gate_sigmas: float = 5.0
     most_loops: int = 200
     give_back: bool = True
-    on_disk: bool = False
-
-    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self, _RANGES, "atlas")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import IdArray, StereoFeatures
+from slam.data import IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
@@ -18,37 +18,23 @@ _ROUNDING = 1e-14  # numerics: variances below this share of the largest are rou
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A frame that is kept.
+    """A frame that is kept."""
 
-    Attributes:
-        frame: index of the step.
-        stamp: [s].
-        T_odom_left: pose (4, 4) that the back end estimated then.
-        covariance: of that pose (6, 6), without the common errors.
-        step_covariance: covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the
-            right.
-        jacobian: derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`.
-        travelled: length of the path up to here [m].
-        depth: median depth of the features [m].
-        points: features in coordinates of the rectified left camera (F, 3) [m].
-        descriptors: (F, D).
-        laplacian: signs of the Laplacian (F,).
-        landmarks: ids of the landmarks that the features showed (F,), −1 for none.
-        correction: of the rig's error, with which the points were triangulated; None in a map of an earlier run.
-    """
-
-    frame: int
-    stamp: float
-    T_odom_left: Array
-    covariance: Array
+    frame: int  # index of the step
+    stamp: float  # [s]
+    T_odom_left: Array  # pose (4, 4) that the back end estimated then
+    covariance: Array  # of that pose (6, 6), without the common errors
+    # covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the right
     step_covariance: Array
+    # derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`
     jacobian: Array
-    travelled: float
-    depth: float
-    points: NDArray[np.float32]
-    descriptors: NDArray[np.float16]
-    laplacian: NDArray[np.int8]
-    landmarks: IdArray
+    travelled: float  # length of the path up to here [m]
+    depth: float  # median depth of the features [m]
+    points: NDArray[np.float32]  # features in coordinates of the rectified left camera (F, 3) [m]
+    descriptors: NDArray[np.float16]  # (F, D)
+    laplacian: NDArray[np.int8]  # signs of the Laplacian (F,)
+    landmarks: IdArray  # ids of the landmarks that the features showed (F,), −1 for none
+    # of the rig's error, with which the points were triangulated; None in a map of an earlier run
     correction: Correction | None = None
 
     def __len__(self) -> int:
@@ -67,20 +53,13 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Two keyframes that show the same place.
+    """Two keyframes that show the same place."""
 
-    Attributes:
-        first, second: their numbers, the older one first.
-        T_first_second: the second one's pose in the first one's coordinates (4, 4).
-        covariance: its covariance (6, 6), perturbing on the right.
-        inliers: number of features that agree.
-    """
-
-    first: int
+    first: int  # their numbers, the older one first
     second: int
-    T_first_second: Array
-    covariance: Array
-    inliers: int
+    T_first_second: Array  # the second one's pose in the first one's coordinates (4, 4)
+    covariance: Array  # its covariance (6, 6), perturbing on the right
+    inliers: int  # number of features that agree
 
     @property
     def pair(self) -> tuple[int, int]:
@@ -97,11 +76,7 @@ def distance(expected: Array, found: Array, covariance: Array) -> float:
 def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: AtlasConfig) -> bool:
     """Whether a camera's view differs enough from a keyframe's for a new one: other features, or another viewpoint.
 
-    Args:
-        keyframe: the earlier one.
-        motion: pose (4, 4) of the camera in the keyframe's coordinates.
-        rig: the rectified cameras.
-        config: settings.
+    `motion` is the camera's pose (4, 4) in the keyframe's coordinates.
     """
     if np.linalg.norm(motion[:3, 3]) > config.keyframe_distance * keyframe.depth:
         return True
@@ -109,32 +84,13 @@ def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: 
     return bool(rig.left.in_image(uv).mean() < config.keyframe_share)
 
 
-def features_with_depth(rig: StereoRig, features: StereoFeatures, sigma: float, max_error: float) -> NDArray[np.intp]:
-    """Rows of the features whose depth is known well enough.
-
-    Args:
-        rig: the cameras.
-        features: of a frame.
-        sigma: noise of uL, vL, uR [px].
-        max_error: largest relative standard deviation of the depth.
-    """
-    points = rig.triangulate(features.uv_left, features.uv_right)
-    known = np.flatnonzero(np.isfinite(points).all(axis=1))
-    deviation = rig.depth_deviation(points[known], sigma)
-    return known[deviation < max_error * points[known, 2]]
-
-
 def kept_features(
     rows: NDArray[np.intp], response: Array, landmark_of: IdArray, moving: NDArray[np.intp], most: int
 ) -> NDArray[np.intp]:
     """Rows of the features that a keyframe keeps: landmarks first, then the strongest; none that move.
 
-    Args:
-        rows: of features with a depth.
-        response: of all features (N,).
-        landmark_of: id of the landmark that each feature shows (N,), −1 for none.
-        moving: rows of features that move.
-        most: largest number of rows.
+    They are at most `most` of `rows`, which have a depth. `landmark_of` (N,) is the id of the landmark that each
+    feature shows, −1 for none.
     """
     rows = rows[~np.isin(rows, moving)]
     order = np.lexsort((-response[rows], landmark_of[rows] < 0))[:most]
@@ -150,11 +106,6 @@ def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> 
 
     A pose's error has two parts: the path's drift, and an error of its own frame, which the next frame forgets. Q
     holds the drift alone, so that Q of successive steps can be added; loops carry the error of the frames they end at.
-
-    Args:
-        before: the earlier keyframe.
-        T_odom_left: the later pose (4, 4).
-        covariance: of the later pose (6, 6), by noise.
     """
     back = adjoint(inverse(T_odom_left) @ before.T_odom_left)
     return covariance_growth(covariance, back @ before.covariance @ back.T)

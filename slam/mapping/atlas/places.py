@@ -26,18 +26,13 @@ _NONE = 1e-12  # numerics: length below which a vector counts as zero
 
 @dataclass(frozen=True, eq=False)
 class PlaceIndex:
-    """VLAD vectors of keyframes, and the visual words they are made with.
+    """VLAD vectors of keyframes, and the visual words they are made with."""
 
-    Attributes:
-        words: (W, D); None before they have been learnt.
-        early: descriptors (F, D) of the keyframes so far, kept as long as words are still to be learnt.
-        count: number of keyframes.
-        vectors: of the keyframes, in the first `count` rows; none without words.
-    """
-
-    words: Vectors | None = None
+    words: Vectors | None = None  # (W, D); None before they have been learnt
+    # descriptors (F, D) of the keyframes so far, kept as long as words are still to be learnt
     early: tuple[NDArray[np.float16], ...] = ()
-    count: int = 0
+    count: int = 0  # number of keyframes
+    # of the keyframes, in the first `count` rows; none without words
     vectors: Vectors = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def with_new(self, descriptors: Vectors) -> PlaceIndex:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,8 +12,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, covariance_growth
-from slam.tracks.config import AssociationConfig
-from slam.tracks.follow import Matches, match_everywhere
+from slam.tracks.follow import Matches
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
 from slam.window.pose_only import PoseProblem, least_squares, whitened_residuals
@@ -24,50 +23,25 @@ _ROUNDS = 2  # numerics: of least squares, with the points' noise in the pixels 
 
 @dataclass(frozen=True, eq=False)
 class Verified:
-    """A keyframe's place, seen again.
+    """A keyframe's place, seen again."""
 
-    Attributes:
-        keyframe: that shows it.
-        T_keyframe_left: pose (4, 4) of the present camera in the keyframe's coordinates.
-        covariance: of that pose (6, 6), perturbing on the right.
-        noise: the part of the covariance (6, 6) due to the features' own errors in both frames.
-        matches: inliers, as rows of the keyframe's features and of the present frame's.
-    """
-
-    keyframe: Keyframe
-    T_keyframe_left: Array
-    covariance: Array
-    noise: Array
-    matches: Matches
-
-
-def alike(keyframe: Keyframe, features: StereoFeatures, config: AssociationConfig) -> int:
-    """Number of matches by descriptor alone between a keyframe and the present frame."""
-    return len(match_everywhere(keyframe.descriptors.astype(np.float32), keyframe.laplacian, features, config))
+    keyframe: Keyframe  # that shows it
+    T_keyframe_left: Array  # pose (4, 4) of the present camera in the keyframe's coordinates
+    covariance: Array  # of that pose (6, 6), perturbing on the right
+    noise: Array  # the part of the covariance (6, 6) due to the features' own errors in both frames
+    matches: Matches  # inliers, as rows of the keyframe's features and of the present frame's
 
 
 def verify(
-    keyframe: Keyframe,
-    features: StereoFeatures,
-    rig: StereoRig,
-    localizer: Localizer,
-    config: AtlasConfig,
-    seed: int,
+    keyframe: Keyframe, features: StereoFeatures, rig: StereoRig, localizer: Localizer, config: AtlasConfig, seed: int
 ) -> Verified | None:
     """The present camera's pose relative to a keyframe; None if too few features agree, or all are in one spot.
 
-    Args:
-        keyframe: the older one.
-        features: of the present frame.
-        rig: the cameras.
-        localizer: matches features without a prediction, and finds the inliers.
-        config: settings.
-        seed: of the random choice in the geometric check.
+    `seed` is of the random choice in the geometric check.
     """
     points = keyframe.points.astype(float)
-    landmarks = _rows(keyframe)
-    prediction = nowhere(features.stamp, np.eye(4))
-    found = localizer.match(prediction, landmarks, points, features, seed)
+    landmarks = replace(keyframe_landmarks(keyframe), ids=np.arange(len(points)))
+    found = localizer.match(nowhere(features.stamp, np.eye(4)), landmarks, points, features, seed)
     if found.T_world_left is None or len(found) < config.inliers:
         return None
     ids, seen = found.ids, found.rows
@@ -116,23 +90,14 @@ def refined_pose(
 
 
 def _jackknife(problem: PoseProblem, T: Array, P: Array) -> Array:
-    """Covariance (6, 6) of a least-squares pose (4, 4) by leaving out each match in turn, to first order.
-
-    Args:
-        problem: of which the pose is the solution.
-        T: the pose.
-        P: its covariance (6, 6) by the problem's noise.
-    """
+    """Covariance (6, 6) of a least-squares pose (4, 4) by leaving out each match in turn, to first order."""
     r, G = whitened_residuals(problem, T)
     leverage = G @ P @ np.swapaxes(G, 1, 2)
     moved = P @ (np.swapaxes(G, 1, 2) @ np.linalg.solve(np.eye(3) - leverage, r[:, :, None]))
     return np.asarray(moved[:, :, 0].T @ moved[:, :, 0])
 
 
-def _rows(keyframe: Keyframe) -> LandmarkTable:
-    """A keyframe's features as landmarks, with their rows as ids."""
-    count = len(keyframe)
-    once = np.ones(count, np.int64)
-    return LandmarkTable(
-        np.arange(count), keyframe.descriptors.astype(np.float32), keyframe.laplacian, once, once, 0 * once, -once
-    )
+def keyframe_landmarks(keyframe: Keyframe) -> LandmarkTable:
+    """A keyframe's features as landmarks of an earlier run; the id is −1 of one that was none."""
+    looks, once = keyframe.descriptors.astype(np.float32), np.ones(len(keyframe), np.int64)
+    return LandmarkTable(keyframe.landmarks, looks, keyframe.laplacian, once, once, 0 * once, -once)

@@ -13,7 +13,7 @@ from slam.geometry import se3
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
-from tests.slam.scene import RIG, Cloud, path
+from tests.slam.scene import RIG, Cloud
 
 #: A turn of the right camera after a knock [rad].
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
@@ -112,11 +112,6 @@ def test_a_good_calibration_is_left_as_it_is(seed):
     assert disparity_error(calibration, 0) < 0.03
 
 
-def test_without_motion_only_rows_are_learnt():
-    calibration = drive(parameters(pitch=1e-3), step=0.0)
-    assert calibration.pairs == 0 and calibration.apply() is None
-
-
 def test_what_motion_has_hardly_shown_is_not_applied():
     """Steps of five centimetres and noisy pixels: most of what is believed of the disparities is the prior's."""
     calibration = drive(TURNED, frames=8, step=0.05, noise=1.0, settings={"minimum_parallax": 0.01})
@@ -153,12 +148,6 @@ def test_unrectified_rig():
     assert disparity_error(calibration, theta) < 0.2 * 2e-3 * calibration.model.focal
 
 
-def test_the_poses_of_the_system_are_only_a_start():
-    with_poses, without = (drive(TURNED, seed=3, frames=12, poses=known) for known in (True, False))
-    assert with_poses.pairs == without.pairs
-    assert disparity_error(with_poses, without.posterior.mean) < 0.03
-
-
 def test_a_change_that_does_not_count_is_not_applied():
     calibration = drive(TURNED, seed=2, frames=10)
     assert calibration.apply(least=1e4) is None and not calibration.applied.parameters.any()
@@ -175,32 +164,6 @@ def test_nothing_seen_is_no_error():
     calibration.observe(replace(features, descriptors=np.zeros((len(features), 0), np.float32)), pose(1))
     assert calibration.apply() is None
     assert calibration.summary()["pairs"] == 0
-
-
-def test_the_system_corrects_what_it_is_given():
-    """With the rig's error already known, the system's path is the one of an ideal rig."""
-    cloud, truth = Cloud(150), path(12)
-    frames = [cloud.features(T, k / 30, 0.1)[0] for k, T in enumerate(truth)]
-    correction = RigCorrection(RigModel(RIG), parameters(right_cx=2e-3, yaw=1e-3))
-
-    def run(frames, correction=None):
-        config = SystemConfig().with_settings(["self_calibration.minimum_common=100000"])  # nothing more is learnt
-        system = StereoSlam(RIG, None, "ekf", config=config)
-        if correction is not None:
-            system.calibration.applied = correction
-            known = replace(system.calibration._solution, mean=correction.parameters)
-            system.calibration._solution = replace(known, inner=1e-4 * known.inner)
-            system.calibration._motion_agrees = lambda: True
-        for features in frames:
-            result = system.process_features(features)
-        return result.estimate.T_world_left
-
-    wrong = []
-    for f in frames:
-        z = correction.undone(np.column_stack([f.uv_left, f.uv_right[:, 0]]))
-        wrong.append(replace(f, uv_left=z[:, :2], uv_right=np.column_stack([z[:, 2], f.uv_right[:, 1]])))
-    np.testing.assert_allclose(run(wrong, correction), run(frames), atol=1e-5)
-    assert np.abs(run(wrong) - run(frames)).max() > 1e-3
 
 
 @pytest.mark.parametrize("rig", [RIG, GENERAL_RIG])

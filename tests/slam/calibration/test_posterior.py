@@ -1,17 +1,13 @@
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from slam.calibration import RigPosterior
-from slam.calibration.evidence import Accumulator, Evidence
+from slam.calibration.evidence import Accumulator, Evidence, row_evidence, student_weights
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import residual_scale, solve
-from slam.calibration.prior import Prior, factory_prior, residual_variance
-from slam.calibration.rows import row_evidence
-from slam.errors import CalibrationError
+from slam.calibration.prior import Prior, factory_prior
 from tests.slam.calibration.drives import CAR, parameters, residual_fields
 
 NONE = np.zeros(1)
@@ -21,47 +17,15 @@ def evidence(value, sigma, cross=0.0):
     return Evidence(np.array([[sigma**-2]]), np.array([value / sigma**2]), np.array([[cross]]))
 
 
-def test_json_and_back():
-    posterior = RigPosterior(("yaw", "roll"), ("rad", "rad"), np.array([1e-3, 2e-3]), np.diag([1e-6, 4e-6]))
-    again = RigPosterior.from_json(json.loads(json.dumps(posterior.to_json())))
-    assert (again.names, again.units) == (posterior.names, posterior.units)
-    np.testing.assert_array_equal(again.mean, posterior.mean)
-    np.testing.assert_array_equal(again.covariance, posterior.covariance)
-    assert posterior.marginal([1]).names == ("roll",) and posterior.marginal([1]).sigma[0] == pytest.approx(2e-3)
-
-
-@pytest.mark.parametrize(
-    "tree", [{}, {"parameters": 3}, {"parameters": [{"name": "yaw", "unit": "rad", "mean": "x"}], "covariance": []}]
-)
-def test_what_is_no_posterior_is_refused(tree):
-    with pytest.raises(CalibrationError, match="calibration"):
-        RigPosterior.from_json(tree)
-
-
-def test_a_calibration_that_nothing_speaks_against_is_left_alone():
-    prior = Prior(NONE, np.array([[[0.02]], [[0.1]], [[0.3]], [[1.0]]]) ** 2)
-    near = solve(prior, 0.0, [evidence(0.1, 0.1)])
-    assert abs(near.mean[0]) < 0.06  # one standard deviation from nothing
-    clear = solve(prior, 0.0, [evidence(0.1, 0.01)])
-    assert clear.mean[0] == pytest.approx(0.1, abs=0.01)
-
-
 def test_the_posterior_is_that_of_the_whole_mixture():
     """Against the integral: where the data cannot say which scale is true, the means by scale lie apart."""
     sigmas, theta = np.array([0.05, 0.4]), np.linspace(-2, 2, 400_001)
     likelihood = np.exp(-0.5 * ((theta - 0.25) / 0.15) ** 2)
     p = likelihood * sum(np.exp(-0.5 * (theta / sigma) ** 2) / sigma for sigma in sigmas)
     p /= p.sum()
-    mean, found = p @ theta, solve(Prior(NONE, sigmas[:, None, None] ** 2), 0.0, [evidence(0.25, 0.15)])
+    mean, found = p @ theta, solve(Prior(NONE, sigmas[:, None, None] ** 2), 0.0, evidence(0.25, 0.15))
     assert found.mean[0] == pytest.approx(mean, rel=1e-6)
     assert found.inner[0, 0] == pytest.approx(p @ (theta - mean) ** 2, rel=1e-6)
-
-
-def test_residual_fields_make_the_posterior_wider_and_leave_the_mean():
-    plain, wide = (solve(Prior(NONE, np.ones((1, 1, 1))), 0.5, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 1e5))
-    assert plain.mean == wide.mean and plain.inner == wide.inner
-    expected = residual_variance() * (0.5 * 1e5 / 100) ** 2
-    assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + expected, rel=0.1)
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.3, 1.0])
@@ -117,3 +81,11 @@ def test_what_an_error_of_the_whole_recording_leaves():
     np.testing.assert_allclose(np.linalg.solve(left.S, left.e), mean)
     nothing = Evidence(np.zeros((2, 2)), np.zeros(2), np.zeros((2, 1))).with_error(np.ones(2))
     assert not nothing.S.any()
+
+
+@pytest.mark.parametrize("dof", [1, 3])
+def test_good_residuals_weigh_the_inverse_of_their_variance_and_outliers_next_to_nothing(dof):
+    squared = 4.0 * chi2.ppf((np.arange(1000) + 0.5) / 1000, dof)  # of residuals with twice the configured noise
+    weights = student_weights(np.append(squared, 4e4), dof, 0.01)
+    assert weights[:1000].mean() == pytest.approx(0.25, rel=0.1)
+    assert weights[-1] < 1e-3

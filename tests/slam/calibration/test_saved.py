@@ -33,7 +33,8 @@ def observed(calibration, theta, seed, frames=20):
 def test_what_is_kept_corrects_from_the_first_frame_and_goes_on_being_learnt(first, tmp_path):
     slam.save_calibration(tmp_path / "rig.json", first.kept())
     kept = slam.load_calibration(tmp_path / "rig.json")
-    np.testing.assert_array_equal(kept.posterior.mean, first.posterior.mean)
+    for name in ("mean", "covariance"):
+        np.testing.assert_array_equal(getattr(kept.posterior, name), getattr(first.posterior, name))
     assert kept.rig == first.kept().rig
     assert SelfCalibration(CAR, SelfCalibrationConfig(), kept).kept().residual == kept.residual < 1
     second = SelfCalibration(CAR, SelfCalibrationConfig(), kept)
@@ -78,6 +79,7 @@ def spoilt(tree, change):
         (lambda t: t.update(residual_scale="x"), "residual_scale"),
         (lambda t: t.pop("parameters"), "neither a file of"),
         (lambda t: t["parameters"].pop(), "cannot be read"),
+        (lambda t: t.update(parameters=3), "cannot be read"),
         (lambda t: t["parameters"][0].update(name="colour"), "not those of this version"),
         (lambda t: t["covariance"][0].__setitem__(0, -1.0), "covariance"),
         (lambda t: t["covariance"][0].__setitem__(1, float("nan")), "finite"),
@@ -132,7 +134,7 @@ def test_recordings_of_another_rig_do_not_agree(first):
     other = drive(TURNED + parameters(roll=3e-3), seed=2, frames=20)
     found = agreement(first.model, [first.evidence(), other.evidence()], first.config.systematic)
     assert found.words.startswith("The recordings do not agree in") and "roll" in found.words
-    assert found.largest[18] > 3 and found.pairs[18].tolist() == [0, 1]
+    assert found.largest[18] > 3
 
 
 def test_the_prior_that_recordings_share_is_no_agreement(first):

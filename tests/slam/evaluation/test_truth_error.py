@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.evaluation.truth_error import doubtful, truth_covariances
+from slam.evaluation.truth_error import doubtful, interpolated, truth_covariances
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
 
@@ -53,9 +53,24 @@ def test_interpolated_truth_is_noticed_where_it_is():
     for k in range(20, 30):
         true.poses[k] = true.poses[k - 1] @ step
     found = doubtful(true, NOISE, first, last)
-    assert found[12:27].all()
-    assert not found[:10].any()
-    assert not found[31:].any()
+    assert found[10:19].all() and found[20:29].all()  # they end or begin at poses that were not measured
+    assert not found[:10].any() and not found[19] and not found[29:].any()
+    assert np.flatnonzero(interpolated(true, NOISE)).tolist() == [*range(20, 29)]
+    standing = Trajectory(true.stamps, np.concatenate([np.tile(np.eye(4), (50, 1, 1)), drive(50).poses]))
+    for even in (standing, straight()):  # equal turns by nothing are none that was made up
+        assert not interpolated(even, NOISE).any()
+
+
+def test_steps_at_the_begin_that_are_all_alike_are_no_truth():
+    """As some drives begin: a turn at a constant rate, which then changes in the middle of a step."""
+    true = drive()
+    step = np.array([0, 0.004, 0.001, 0, 0, 1.0])
+    for k in range(12, 0, -1):
+        more = 3e-5 if k == 12 else 1e-6 * k  # rounding; the last step is partly measured
+        true.poses[k - 1] = true.poses[k] @ inverse(exp(step + np.array([more, 0, 0, 0, 0, 0])))
+    assert np.flatnonzero(interpolated(true, NOISE)).tolist() == [*range(12)]
+    first = np.arange(99)
+    assert np.flatnonzero(doubtful(true, NOISE, first, first + 1)).tolist() == [*range(12)]  # single steps as well
 
 
 def test_truth_without_noise_is_exact():

@@ -17,6 +17,7 @@ from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry import se3
+from slam.mapping.known_landmarks import definite, require_known
 from slam.mapping.map_io import SavedMap, decode, encode, load_map, save_map
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
@@ -47,13 +48,6 @@ def first_run(backend, frames=25, cloud=None):
 # --- the file ---
 
 
-def test_the_same_map_byte_for_byte_after_load_and_save(tmp_path):
-    save_map(tmp_path / "one.map", some_map())
-    save_map(tmp_path / "two.map", load_map(tmp_path / "one.map"))
-    assert (tmp_path / "one.map").read_bytes() == (tmp_path / "two.map").read_bytes()
-    assert [f.name for f in sorted(tmp_path.iterdir())] == ["one.map", "two.map"]  # nothing temporary is left
-
-
 def test_everything_comes_back(tmp_path):
     before = some_map()
     save_map(tmp_path / "a.map", before)
@@ -63,17 +57,8 @@ def test_everything_comes_back(tmp_path):
         assert getattr(after, name).dtype == getattr(before, name).dtype
     assert (after.frontend, after.world_frame, after.written_by) == ("surf", "somewhere", "a test")
     assert after.source == str(tmp_path / "a.map")
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_systems_map(backend, tmp_path):
-    system = first_run(backend)
-    save_map(tmp_path / "a.map", system)
-    found, estimate = load_map(tmp_path / "a.map"), system.estimate()
-    np.testing.assert_array_equal(found.ids, estimate.ids)
-    np.testing.assert_array_equal(found.positions, estimate.positions)
-    np.testing.assert_allclose(found.covariances, estimate.covariances, rtol=1e-9, atol=1e-15)
-    np.testing.assert_array_equal(found.descriptors, system.landmarks.descriptors)
+    assert encode(after) == (tmp_path / "a.map").read_bytes()  # byte for byte
+    assert [f.name for f in tmp_path.iterdir()] == ["a.map"]  # nothing temporary is left
 
 
 def test_any_altered_byte_is_found():
@@ -86,10 +71,6 @@ def test_any_altered_byte_is_found():
         with pytest.raises(SlamError, match=r"a\.map") as error:
             decode(bytes(altered), "a.map")
         assert "\n" not in str(error.value)
-
-
-def test_a_map_cut_short_or_longer_is_found():
-    data = encode(some_map())
     for other in (*(data[:n] for n in (0, 5, 22, 60, 90, 500, len(data) - 1)), data + b"\0"):
         with pytest.raises(SlamError, match=r"a\.map"):
             decode(other, "a.map")
@@ -133,6 +114,14 @@ def npy(array, allow_pickle=False):
         ("descriptors.npy", npy(np.full((20, 4), np.inf, np.float32))),
         ("descriptors.npy", npy(np.zeros(20, np.float32))),
         ("seen.npy", npy(np.array([{}] * 20, object), allow_pickle=True)),
+        ("seen.npy", npy(np.full(20, -1))),
+        ("in_view.npy", npy(np.full(20, 2**62))),
+        ("ids.npy", npy(np.arange(2**63 - 20, 2**63, dtype=np.int64))),
+        ("positions.npy", npy(np.full((20, 3), 1e300))),
+        ("descriptors.npy", npy(np.full((20, 16), 1e30, np.float32))),
+        ("covariances.npy", npy(np.tile(1e300 * np.eye(3), (20, 1, 1)))),
+        ("laplacian.npy", npy(np.int8(1))),
+        ("seen_from.npy", npy(np.full((20, 3), np.inf))),
         ("seen_from.npy", npy(np.zeros((20, 2)))),
         ("seen.npy", b""),
     ],
@@ -141,6 +130,16 @@ def test_a_map_that_is_none_is_refused_though_its_checksum_is_right(name, conten
     with pytest.raises(SlamError, match=r"a\.map") as error:
         decode(with_member(name, content), "a.map")
     assert "\n" not in str(error.value)
+
+
+def test_a_landmark_that_is_hardly_known_can_be_kept():
+    """Of a point that is nearly at infinity rounding leaves no variance across, as of one in a recording."""
+    R = se3.so3_exp(np.array([0.3, -0.5, 0.2]))
+    P = np.stack([R @ np.diag([-48.6, 1.6e5, 5.9e17]) @ R.T, 1e-4 * np.eye(3)])
+    with pytest.raises(MeasurementError, match="not symmetric and positive definite"):
+        require_known("a map", np.arange(2), np.ones((2, 3)), P)
+    require_known("a map", np.arange(2), np.ones((2, 3)), definite(P))
+    np.testing.assert_array_equal(definite(P)[1], P[1])
 
 
 def test_other_files_and_versions_are_refused(tmp_path):
@@ -155,18 +154,6 @@ def test_other_files_and_versions_are_refused(tmp_path):
             decode(data, "a.map")
     with pytest.raises(SlamError, match="cannot be written"):
         save_map(tmp_path / "no" / "folder.map", some_map())
-
-
-def test_other_programs_can_read_it(tmp_path):
-    """As docs/saved_maps.md says: two lines, then an archive."""
-    save_map(tmp_path / "a.map", some_map())
-    with (tmp_path / "a.map").open("rb") as file:
-        assert file.readline() == b"surf-stereo-slam map 4\n"
-        file.readline()
-        arrays = np.load(BytesIO(file.read()))
-    np.testing.assert_array_equal(arrays["positions"], some_map().positions)
-    with zipfile.ZipFile(tmp_path / "a.map") as archive:
-        assert json.loads(archive.read("header.json"))["frontend"] == "surf"
 
 
 # --- starting in it ---
@@ -226,17 +213,13 @@ def test_a_prior_map_that_is_larger_than_the_limit_is_kept():
     assert system.config.map.max_landmarks == len(known) > 10
 
 
-def test_an_empty_map_is_refused():
-    known = first_run("ekf").snapshot()
+def test_there_is_no_map_before_the_first_frame_and_an_empty_one_is_refused():
+    none = np.zeros(0, np.int64)
     empty = SavedMap(
-        known.ids[:0], known.positions[:0], known.covariances[:0], known.descriptors[:0], known.laplacian[:0],
-        known.seen[:0], known.in_view[:0],
-    )  # fmt: skip
+        none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 32), np.float32), none.astype(np.int8), none, none
+    )
     with pytest.raises(SlamError, match="holds no landmarks"):
         StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=empty)
-
-
-def test_there_is_no_map_before_the_first_frame():
     with pytest.raises(SlamError, match="no map yet"):
         StereoSlam(RIG, None, "ekf").snapshot()
 

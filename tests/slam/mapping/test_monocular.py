@@ -7,16 +7,13 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-import slam
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.geometry import se3
 from slam.mapping.map_io import SavedMap
 from slam.mapping.monocular import frame_covariance, two_view_depth
-from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
-from slam.tracks.localizer import Localizer, nowhere
 from tests.slam.scene import RIG, Cloud
 
 BACKENDS = ("ekf", "smoother", "window")
@@ -88,18 +85,6 @@ def test_a_frames_own_covariance_is_that_of_its_least_squares_pose():
     assert 0.85 < share < 1.15  # 300 draws of six degrees: sure to 3 %
 
 
-def test_the_pose_in_a_map_from_left_pixels_alone():
-    cloud, T = Cloud(120), se3.exp(np.array([0.05, -0.2, 0.1, 0.4, -0.1, 0.3]))
-    known = map_of(cloud)
-    features, _ = cloud.features(T, 0.0, 0.3)
-    localizer = Localizer(RIG, SystemConfig().association, EstimatorModels(pixel_sigma=0.5))
-    left = replace(features, uv_right=features.uv_right * np.nan)
-    found = localizer.match(nowhere(0.0, np.eye(4)), known.rows, known.positions, left, seed=0)
-    assert np.linalg.norm(se3.log(se3.inverse(T) @ found.T_world_left)[3:]) < 0.02
-    other, _ = Cloud(120, seed=5).features(T, 0.0)
-    assert not len(localizer.match(nowhere(0.0, np.eye(4)), known.rows, known.positions, other, seed=0))
-
-
 def map_of(cloud, rows=slice(None)):
     n = len(cloud.points[rows])
     return SavedMap(
@@ -158,29 +143,3 @@ def test_while_right_pixels_are_missing_landmarks_come_from_two_views_and_none_i
         assert erased < 5  # doubled ones may go; ten are hidden
     assert sum(made[None]) > 20
     assert not any(made[False])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_the_desk_with_left_images_alone(backend):
-    """100 frames of the simulated desk in a quarter of an earlier run's map."""
-    one, two = slam.open_sequence("synthetic:desk?seed=1"), slam.open_sequence("synthetic:desk?seed=2")
-    config = SystemConfig.for_kind("handheld", None).with_settings(["models.pixel_sigma=0.7"])
-    first = StereoSlam(one.rig, None, backend, config=config)
-    for k in range(0, 100, 2):
-        first.process_features(one.observations(k))
-    whole = first.snapshot()
-    rows = np.arange(0, len(whole), 4)
-    names = ("ids", "positions", "covariances", "descriptors", "laplacian", "seen", "in_view")
-    known = SavedMap(*(getattr(whole, name)[rows] for name in names))
-    truth = np.linalg.inv(one.ground_truth.poses[0]) @ two.ground_truth.poses
-    config = config.with_settings(["map.monocular=true"])
-    system, errors = StereoSlam(one.rig, None, backend, config=config, prior_map=known), []
-    for k in range(60, 160):
-        features = two.observations(k)
-        result = system.process_features(replace(features, uv_right=features.uv_right * np.nan))
-        assert result.status is FrameStatus.TRACKED
-        errors.append(np.linalg.norm(result.estimate.T_world_left[:3, 3] - truth[k, :3, 3]))
-    # measured: mean 0.5 to 0.6 cm, worst 1.0 to 1.3
-    assert np.mean(errors) < 0.012 and max(errors) < 0.03
-    assert result.map_size > len(known) + 15

@@ -11,6 +11,7 @@ import pytest
 
 import slam
 from slam.errors import CalibrationError, SequenceError
+from slam.input.features import outside_masks
 from slam.sequences import open_sequence, with_mask
 from slam.sequences.names import keys_of, of_sides
 
@@ -234,12 +235,12 @@ def test_features_under_a_mask_are_not_used(tmp_path: Path) -> None:
         assert frame.left_mask is not None and frame.right_mask.all()
         features = system.frontend.extract(frame)
         assert len(features) > 50 and features.uv_left[:, 0].min() >= 150
-        strict = features.outside(frame.left_mask, frame.right_mask)
+        strict = outside_masks(features, frame)
         assert strict.uv_left[:, 0].min() >= 159.5
         system.process(frame)
     right = open_sequence(with_mask(text, f",{tmp_path / 'left half.png'}"))
     frame = next(iter(right))
-    features = slam.StereoSlam(right.rig).frontend.extract(frame).outside(frame.left_mask, frame.right_mask)
+    features = outside_masks(slam.StereoSlam(right.rig).frontend.extract(frame), frame)
     assert features.uv_left[:, 0].min() < 100
     assert np.nanmin(features.uv_right[:, 0]) >= 159.5
 

@@ -129,11 +129,6 @@ def test_the_path_is_better(closed, sequence):
     assert final < 0.4 * before
 
 
-def test_the_path_has_no_jump_where_it_is_corrected(closed):
-    steps = np.linalg.norm(np.diff(closed[0].trajectory().positions, axis=0), axis=1)
-    assert steps.min() > 0.95 and steps.max() < 1.05
-
-
 def test_nothing_changes_before_the_loop(closed, sequence):
     results = closed[1]
     _, without = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.enabled=false")
@@ -179,31 +174,6 @@ def test_a_loop_that_contradicts_the_path_is_refused(sequence):
 
 
 @pytest.mark.slow
-def test_one_keyframe_alone_closes_no_loop(sequence):
-    _, results = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.agreeing=2")
-    _, single = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.agreeing=1")
-    assert first_loop(single) < first_loop(results)
-
-
-def test_an_interrupted_keyframe_leaves_the_atlas_as_it_was(sequence, monkeypatch: pytest.MonkeyPatch):
-    system = system_for(sequence, "ekf")
-    for k in range(3):
-        system.process_features(sequence.observations(k))
-    before = system.atlas
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("slam.system.frame_result", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            system.process_features(sequence.observations(8))
-    assert system.atlas is before
-    system.process_features(sequence.observations(9))
-    assert len(system.atlas) == len(before) + 1
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_landmarks_of_an_old_place_are_measured_again(sequence, backend: str):
     _, results = drive(sequence, backend, "map.target_in_view=30")  # so that few of them are landmarks already
@@ -220,7 +190,7 @@ def test_a_camera_carried_to_a_place_of_long_ago_is_found(sequence):
         system.process_features(sequence.observations(k))
     blind = [StereoFeatures.empty(6.0 + 0.1 * i, 16) for i in range(6)]
     carried = [replace(sequence.observations(5 + i), stamp=6.6 + 0.1 * i) for i in range(10)]
-    old = system.landmarks.ids.max()
+    old, before = system.landmarks.ids.max(), len(system.atlas)
     results = [system.process_features(f) for f in [*blind, *carried]]
     statuses = [r.status.value for r in results]
     assert "tracked" not in statuses[:6]
@@ -229,20 +199,8 @@ def test_a_camera_carried_to_a_place_of_long_ago_is_found(sequence):
     truth = inverse(sequence.ground_truth.poses[0]) @ sequence.ground_truth.poses[14]
     assert np.linalg.norm(results[-1].estimate.T_world_left[:3, 3] - truth[:3, 3]) < 0.3
     assert (np.concatenate([r.matched for r in results[8:]]) <= old).any()
-
-
-def test_the_way_of_a_camera_that_was_carried_off_is_not_known(sequence):
-    system = system_for(sequence, "ekf", ("map.max_landmarks=60",))
-    for k in range(60):
-        system.process_features(sequence.observations(k))
-    before = len(system.atlas)
-    blind = [StereoFeatures.empty(6.0 + 0.1 * i, 16) for i in range(6)]
-    carried = [replace(sequence.observations(5 + i), stamp=6.6 + 0.1 * i) for i in range(10)]
-    for features in [*blind, *carried]:
-        system.process_features(features)
-    after = system.atlas.keyframes[before]
-    assert np.sqrt(np.trace(after.step_covariance[3:, 3:])) > 50.0
-    assert np.sqrt(np.trace(system.atlas.keyframes[before - 1].step_covariance[3:, 3:])) < 1.0
+    last, new = (system.atlas.keyframes[k].step_covariance for k in (before - 1, before))  # its way is not known
+    assert np.sqrt(np.trace(last[3:, 3:])) < 1.0 and np.sqrt(np.trace(new[3:, 3:])) > 50.0
 
 
 def test_a_run_in_a_saved_map_keeps_its_keyframes_and_loops(closed, sequence, tmp_path: Path):
@@ -272,11 +230,3 @@ def test_loops_stay_bounded_and_spread_along_the_path(closed):
     assert atlas.summary()["closed"] == len(seconds) > 2 * len(kept)
     gaps = np.diff([atlas.keyframes[second].travelled for second in kept])
     assert gaps.max() < 0.5 * gaps.sum()
-
-
-@pytest.mark.slow
-def test_a_bounded_number_of_loops_still_corrects_the_path(closed, sequence):
-    few, _ = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.most_loops=2")
-    assert few.atlas.summary()["closed"] == closed[0].atlas.summary()["closed"] > 2
-    assert len(few.atlas.loops) == 2
-    assert errors(few.trajectory().poses, sequence.ground_truth)[-1] < 0.2

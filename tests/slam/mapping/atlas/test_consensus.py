@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from slam.config import SystemConfig
 from slam.geometry.se3 import Array, exp, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.chain import Chain
-from slam.mapping.atlas.consensus import agreeing, spaced
+from slam.mapping.atlas.closing import agreeing, close, spaced
+from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.atlas.pose_graph import PoseGraph, _Normal
 from slam.rig_error import CommonError
-from tests.slam.scene import RIG
 
 LAP, DEPTH = 60, 2.0
 SIGMAS = np.repeat([2e-3, 0.05], 3)  # of a step
 SURE = np.repeat([1e-3, 0.01], 3)  # of a loop
 LIMIT = 25.0
+ONE_WITNESS = AtlasConfig(agreeing=1)
 FALSE = exp(np.array([0.0, 0.0, 0.0, 1.5, 0.0, 0.0]))  # by which a place that looks alike is off: what drift may be
 
 
@@ -73,23 +71,19 @@ def atlas_of(count: int) -> Atlas:
             Keyframe(
                 k, 0.1 * k, ODOM[k], np.diag(SIGMAS**2), np.diag(SIGMAS**2), none, float(k), DEPTH, points,
                 descriptors, np.ones(1, np.int8), np.full(1, -1),
-            ),
-            descriptors.astype(np.float32),
+            )
         )  # fmt: skip
     return atlas
 
 
 def closed(loops: list[Loop]) -> Atlas:
     """An atlas after these loops, seen one after the other as the camera drives on."""
-    config = SystemConfig.for_kind("driving", None, "ekf")
-    one = replace(config.atlas, agreeing=1, give_back=False)
-    closer, seen = LoopCloser(RIG, one, config.association, config.models, 0.3), SimpleNamespace()
     kept = Atlas()
     for each in loops:
         whole = atlas_of(each.second + 1)
         parts = {name: getattr(whole, name) for name in ("keyframes", "index")}
         path = Trajectory(0.1 * np.arange(each.second + 1), ODOM[: each.second + 1])
-        kept, _ = closer._close(replace(kept, **parts), each, seen, CommonError(), lambda path=path: path)  # type: ignore[arg-type]
+        kept, _ = close(replace(kept, **parts), each, CommonError(), lambda path=path: path, False, ONE_WITNESS)
     return kept
 
 
@@ -123,20 +117,18 @@ def test_false_loops_of_one_place_do_not_outvote_true_ones(number):
 @pytest.mark.parametrize("size", [np.inf, np.nan])
 def test_a_loop_that_cannot_be_judged_is_refused(size, monkeypatch):
     """Numbers beyond computing make the pose graph singular: no reason to end a run."""
-    config = SystemConfig.for_kind("driving", None, "ekf")
-    closer = LoopCloser(RIG, replace(config.atlas, agreeing=1), config.association, config.models, 0.3)
     steps = np.full((81, 6, 6), size)
     chain, path = Chain(ODOM[:81], steps), Trajectory(0.1 * np.arange(81), ODOM[:81])
     monkeypatch.setattr(Atlas, "chain", lambda *_: chain)
     with np.errstate(all="ignore"):
-        after, back = closer._close(atlas_of(81), loop(80), SimpleNamespace(), CommonError(), lambda: path)  # type: ignore[arg-type]
+        after, solved = close(atlas_of(81), loop(80), CommonError(), lambda: path, False, ONE_WITNESS)
         with pytest.raises(np.linalg.LinAlgError):
             PoseGraph.solved(chain, [], ODOM[:81], [20, 80])
     assert after.refused == (loop(80).pair,)
-    assert back is None
+    assert not solved
 
 
 def test_singular_equations_are_said_to_be():
-    one, none = np.eye(6)[None], np.zeros((1, 6, 6))
+    none = np.zeros((1, 6, 6))
     with pytest.raises(np.linalg.LinAlgError, match="singular"):
-        _Normal.of(2, np.array([0]), np.array([1]), one, one, none[:, :, :0], none)
+        _Normal.of(2, np.array([0]), np.array([1]), none, none, none[:, :, :0])

@@ -152,12 +152,6 @@ def test_what_was_seen_before_is_found_again_where_the_camera_returns_at_once(se
     assert np.sqrt(np.trace(results[75].estimate.covariance[3:, 3:])) > 2.0
 
 
-def test_without_an_atlas_the_map_goes_on(sequence):  # noqa: F811
-    run = Run(sequence, "ekf", "atlas.enabled=false")
-    assert not run.system.restarted
-    assert run.results[-1].status.value == "tracked"
-
-
 def test_an_interrupt_while_the_map_begins_anew_leaves_a_system_that_goes_on(sequence, monkeypatch):  # noqa: F811
     done = Run(sequence, "ekf")
     system = system_for(sequence, "ekf")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.mapping.atlas.places import PlaceIndex, aggregate, learn_words
+from slam.mapping.atlas.places import PlaceIndex
 
 
 def places(count: int, seed: int = 0) -> np.ndarray:
@@ -30,12 +30,6 @@ def test_finds_the_place():
     assert np.mean(right) > 0.95
 
 
-def test_knows_nothing_before_the_words_are_learnt():
-    index = PlaceIndex().with_new(places(1)[0])
-    assert index.words is None
-    assert index.similarity(places(1)[0]).tolist() == [0.0]
-
-
 def test_two_that_grow_from_one_do_not_disturb_it():
     every, index = places(40), PlaceIndex()
     for some in every[:30]:
@@ -45,16 +39,6 @@ def test_two_that_grow_from_one_do_not_disturb_it():
     again = index.with_new(every[36])
     assert (index.similarity(every[3]) == before).all()
     assert np.argmax(again.similarity(every[36])) == 30
-
-
-def test_words_are_the_same_each_time():
-    descriptors = places(20).reshape(-1, 16)
-    assert (learn_words(descriptors, 64) == learn_words(descriptors, 64)).all()
-
-
-def test_a_frame_without_features_is_like_none():
-    words = learn_words(places(20).reshape(-1, 16), 64)
-    assert not aggregate(np.zeros((0, 16), np.float32), words).any()
 
 
 def similar_places(count: int) -> np.ndarray:

@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from slam.geometry.se3 import adjoint, exp, inverse, log
-from slam.mapping.atlas.chain import Chain, spread_over
+from slam.geometry.se3 import exp, inverse, log
+from slam.mapping.atlas.chain import Chain
+from slam.mapping.atlas.closing import disagreement, is_informative
 from slam.mapping.atlas.keyframes import Loop
-from slam.mapping.atlas.loop_closer import is_informative
-from slam.mapping.atlas.pose_graph import PoseGraph, solve
+from slam.mapping.atlas.pose_graph import PoseGraph
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
 
@@ -64,26 +64,26 @@ def whole(chain: Chain, loops: tuple[Loop, ...]) -> tuple[gtsam.Values, gtsam.Ma
 
 def test_the_same_as_with_all_keyframes():
     _, chain, loops = problem(0)
-    solution = solve(chain, loops, chain.poses)
+    solution = PoseGraph.solved(chain, loops, chain.poses)
     values, marginals = whole(chain, loops)
     full = np.array([values.atPose3(i).matrix() for i in range(len(chain.poses))])
     # Stretches are linearised where the path is, so it is the same to second order of the change, which is some 0.1 m.
     moved = np.linalg.norm(full[:, :3, 3] - chain.poses[:, :3, 3], axis=1).max()
     assert moved > 0.05
-    assert np.abs(solution.poses - full).max() < 0.05 * moved
+    assert np.abs(solution.keyframe_poses() - full).max() < 0.05 * moved
     expected = marginals.marginalCovariance(len(full) - 1)
-    np.testing.assert_allclose(solution.covariance[:6, :6], expected, atol=0.02 * np.abs(expected).max())
+    np.testing.assert_allclose(solution.covariance()[:6, :6], expected, atol=0.02 * np.abs(expected).max())
 
 
 def test_loops_take_most_of_the_drift_away():
     before, after, nees = [], [], []
     for seed in range(10):
         true, chain, loops = problem(seed)
-        solution = solve(chain, loops, chain.poses)
+        solution = PoseGraph.solved(chain, loops, chain.poses)
         before.append(np.linalg.norm(chain.poses[-1, :3, 3] - true[-1, :3, 3]))
-        after.append(np.linalg.norm(solution.poses[-1, :3, 3] - true[-1, :3, 3]))
-        error = log(inverse(solution.poses[-1]) @ true[-1])
-        nees.append(error @ np.linalg.solve(solution.covariance, error))
+        after.append(np.linalg.norm(solution.keyframe_poses()[-1, :3, 3] - true[-1, :3, 3]))
+        error = log(inverse(solution.keyframe_poses()[-1]) @ true[-1])
+        nees.append(error @ np.linalg.solve(solution.covariance(), error))
     assert np.median(after) < 0.7 * np.median(before)  # the rest is the drift of the first lap
     assert 3.0 < np.mean(nees) < 10.0  # 6 is right; ten draws of χ² with 6 degrees have a deviation of 1.1
 
@@ -92,25 +92,8 @@ def test_a_false_loop_disagrees():
     _, chain, loops = problem(0)
     good = loops[0]
     false = Loop(5, 30, np.eye(4), good.covariance, 50)
-    assert solve(chain, loops, chain.poses).disagreement.max() < 25
-    assert solve(chain, (*loops, false), chain.poses).disagreement.max() > 100
-
-
-def test_relative_pose_without_loops_is_that_of_the_path():
-    _, chain, _ = problem(1)
-    T, P = PoseGraph.solved(chain, (), chain.poses, (10, 25)).relative_pose(10, 25)
-    direct, expected = chain.motion(10, 25)
-    np.testing.assert_allclose(T, direct, atol=1e-9)
-    np.testing.assert_allclose(P, expected, atol=1e-3 * np.abs(expected).max())
-
-
-def test_motion_back_has_the_carried_covariance():
-    _, chain, _ = problem(2)
-    T, P = chain.motion(3, 8)
-    back, Q = chain.motion(8, 3)
-    np.testing.assert_allclose(back @ T, np.eye(4), atol=1e-12)
-    A = adjoint(T)
-    np.testing.assert_allclose(Q, A @ P @ A.T, rtol=1e-9, atol=1e-15)
+    assert PoseGraph.solved(chain, loops, chain.poses).disagreement().max() < 25
+    assert PoseGraph.solved(chain, (*loops, false), chain.poses).disagreement().max() > 100
 
 
 TURN_AND_SCALE = np.array([[0, 4e-3, 0, 0, 0, 0], [0, 0, 0, 0, 0, 2e-2]]).T  # of a step, for errors of unit variance
@@ -131,26 +114,17 @@ def test_common_errors_are_found_and_the_covariance_is_right():
     nees, apart, found = [], [], []
     for seed in range(20):
         true, chain, loops, errors = problem_with_common_errors(seed)
-        solution = solve(chain, loops, chain.poses)
-        error = np.concatenate([log(inverse(solution.poses[-1]) @ true[-1]), errors - solution.common])
-        nees.append(error @ np.linalg.solve(solution.covariance, error))
+        solution = PoseGraph.solved(chain, loops, chain.poses)
+        error = np.concatenate([log(inverse(solution.keyframe_poses()[-1]) @ true[-1]), errors - solution.common])
+        nees.append(error @ np.linalg.solve(solution.covariance(), error))
         found.append(errors[0] - solution.common[0])
         noise = chain.steps + chain.common @ np.swapaxes(chain.common, 1, 2)
-        other = solve(Chain(chain.poses, noise), loops, chain.poses)
-        apart.append(np.linalg.norm(other.poses[:, :3, 3] - true[:, :3, 3], axis=1).mean())
-        apart[-1] -= np.linalg.norm(solution.poses[:, :3, 3] - true[:, :3, 3], axis=1).mean()
+        other = PoseGraph.solved(Chain(chain.poses, noise), loops, chain.poses)
+        apart.append(np.linalg.norm(other.keyframe_poses()[:, :3, 3] - true[:, :3, 3], axis=1).mean())
+        apart[-1] -= np.linalg.norm(solution.keyframe_poses()[:, :3, 3] - true[:, :3, 3], axis=1).mean()
     assert 5.5 < np.mean(nees) < 10.5  # 8 is right, with a deviation of 0.9
     assert np.std(found) < 0.3  # of 1: where the lap closes says how far each step turns
     assert np.mean(apart) > 0  # better than with errors that are taken for noise of each step
-
-
-def test_poses_between_the_ends_are_those_of_the_whole_problem_with_common_errors():
-    true, chain, loops, _ = problem_with_common_errors(3)
-    few = solve(chain, loops, chain.poses)
-    none = [Loop(k, k + 1, np.eye(4), 1e12 * np.eye(6), 0) for k in range(len(true) - 1)]  # that say nothing
-    every = solve(chain, (*loops, *none), chain.poses)
-    moved = np.linalg.norm(every.poses[:, :3, 3] - chain.poses[:, :3, 3], axis=1).max()
-    assert np.linalg.norm(few.poses[:, :3, 3] - every.poses[:, :3, 3], axis=1).max() < 0.05 * moved
 
 
 def test_a_motion_has_the_common_errors_in_its_covariance():
@@ -167,9 +141,9 @@ def test_a_stretch_that_nothing_is_known_of_is_bridged_by_a_loop():
     steps, odom = chain.steps.copy(), chain.poses.copy()
     steps[30] = np.diag(np.repeat([1.0, 100.0], 3) ** 2)
     odom[30:] = exp(np.array([0.2, 0.5, 0.1, 40.0, -9.0, 70.0])) @ odom[30:]  # carried off between 29 and 30
-    solution = solve(Chain(odom, steps), loops, odom)
-    assert np.linalg.norm(solution.poses[-1, :3, 3] - true[-1, :3, 3]) < 0.5
-    assert solution.disagreement.max() < 25
+    solution = PoseGraph.solved(Chain(odom, steps), loops, odom)
+    assert np.linalg.norm(solution.keyframe_poses()[-1, :3, 3] - true[-1, :3, 3]) < 0.5
+    assert solution.disagreement().max() < 25
 
 
 def test_steps_without_noise_leave_a_covariance():
@@ -188,30 +162,20 @@ def test_steps_without_noise_leave_a_covariance():
             Loop(k, k + 40, inverse(true[k]) @ true[k + 40] @ exp(np.linalg.cholesky(P) @ rng.normal(size=6)), P, 50)
             for k in range(9, 16)
         ]
-        solution = solve(Chain(np.array(odom), steps, common), loops, np.array(odom))
-        assert np.linalg.eigvalsh(solution.covariance)[0] > 0
-        error = np.concatenate([log(inverse(solution.poses[-1]) @ true[-1]), errors - solution.common])
-        nees.append(error @ np.linalg.solve(solution.covariance, error))
+        solution = PoseGraph.solved(Chain(np.array(odom), steps, common), loops, np.array(odom))
+        assert np.linalg.eigvalsh(solution.covariance())[0] > 0
+        error = np.concatenate([log(inverse(solution.keyframe_poses()[-1]) @ true[-1]), errors - solution.common])
+        nees.append(error @ np.linalg.solve(solution.covariance(), error))
     assert 10 < np.mean(nees) < 22  # 14 is right, with a deviation of 1.2
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_shared_out_keeps_the_ends(share: float):
-    rng = np.random.default_rng(3)
-    begin, motion, rest = (exp(rng.normal(size=(1, 6))) for _ in range(3))
-    change = 0.1 * rng.normal(size=(1, 6))
-    out = spread_over(begin, motion, rest, share * change)
-    end = out @ rest
-    np.testing.assert_allclose(end, begin @ motion @ rest @ exp(share * change), atol=1e-9)
 
 
 def test_one_loop_more_is_the_same_as_all_at_once():
     _, chain, loops, _ = problem_with_common_errors(6)
     last = loops[-1]
     graph = PoseGraph.solved(chain, loops[:-1], chain.poses, (last.first, last.second)).with_loop(last)
-    one, all_at_once = graph.solution(), solve(chain, loops, chain.poses)
-    np.testing.assert_allclose(one.poses, all_at_once.poses, atol=1e-4)
-    np.testing.assert_allclose(one.covariance, all_at_once.covariance, atol=1e-3 * np.abs(one.covariance).max())
+    one, all_at_once = graph, PoseGraph.solved(chain, loops, chain.poses)
+    np.testing.assert_allclose(one.keyframe_poses(), all_at_once.keyframe_poses(), atol=1e-4)
+    np.testing.assert_allclose(one.covariance(), all_at_once.covariance(), atol=1e-3 * np.abs(one.covariance()).max())
 
 
 def test_a_loop_says_little_where_earlier_ones_have_told_as_much():
@@ -222,3 +186,18 @@ def test_a_loop_says_little_where_earlier_ones_have_told_as_much():
     assert is_informative(untold, loop)
     assert not is_informative(told, loop)
     assert is_informative(told, replace(loop, covariance=0.1 * loop.covariance))
+
+
+@pytest.mark.parametrize("share", [0.1, 1.0, 10.0])  # of the path's covariance, that of the loop
+def test_a_loops_own_covariance_counts_beside_the_paths(share):
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = np.arange(5)
+    steps = np.tile(np.diag([1e-4] * 3 + [1e-2] * 3), (5, 1, 1))
+    graph = PoseGraph.solved(Chain(poses, steps), [], poses, [1, 3])
+    T, P = graph.relative_pose(1, 3)
+    np.testing.assert_allclose(T, poses[2], atol=1e-9)
+    off = 0.05 * rng.standard_normal(6)
+    loop = Loop(1, 3, T @ exp(off), share * P, 30)
+    expected = off @ np.linalg.solve(P, off) / (1 + share)
+    assert disagreement(graph, loop) == pytest.approx(expected, rel=1e-6)

@@ -9,7 +9,6 @@ import pytest
 
 from slam.errors import SlamError
 from slam.geometry.se3 import exp
-from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import Keyframe, Loop
 from slam.mapping.map_io import SavedMap, decode, encode, places_from_arrays, places_to_arrays
 
@@ -59,18 +58,6 @@ def test_all_comes_back(keyframes: tuple[Keyframe, ...]):
 def test_new_landmarks_get_ids_that_no_keyframe_has():
     assert saved(KEYFRAMES).next_id == 7
     assert saved(()).next_id == 1
-
-
-def test_an_atlas_of_an_earlier_run_is_where_it_was():
-    atlas = Atlas.of_earlier_run(KEYFRAMES, POSES, LOOPS)
-    np.testing.assert_array_equal(atlas.poses_in_map()[:, :3, 3], POSES[:, :3, 3])
-    assert all(k.frame == -1 for k in atlas.keyframes)
-    assert atlas.summary() == {"keyframes": 4, "known": 4, "closed": 0, "refused": 0}
-
-
-def test_a_map_says_what_it_holds():
-    assert saved(KEYFRAMES).holds == "1 landmark, 4 keyframes, 2 loops"
-    assert b"1 landmark, 4 keyframes, 2 loops" in encode(saved(KEYFRAMES))
 
 
 @pytest.mark.parametrize(("name", "value"), [

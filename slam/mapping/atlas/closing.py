@@ -1,0 +1,170 @@
+"""Which loops are closed: those that agree with the path and with each other; of contradictory ones the largest set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import eigvalsh
+
+from slam.geometry.se3 import Array, adjoint, inverse
+from slam.geometry.trajectory import Trajectory
+from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.chain import Chain
+from slam.mapping.atlas.config import AtlasConfig
+from slam.mapping.atlas.keyframes import Loop, distance
+from slam.mapping.atlas.pose_graph import PoseGraph
+from slam.rig_error import CommonError
+
+_DIMENSIONS = 6  # fixed: mean of χ² of a pose
+
+
+def close(
+    atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool, config: AtlasConfig
+) -> tuple[Atlas, bool]:
+    """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop; else refuse it.
+
+    One that cannot be judged is refused.
+
+    Args:
+        atlas: whose last keyframe sees the loop.
+        loop: to be closed.
+        rig: what the common errors stand for.
+        path: returns the path in odom so far.
+        same_view: the camera sees the same from the same place, which is believed against the path: the covariance of
+            the path between is then as much too small as the two disagree.
+        config: settings.
+
+    Returns:
+        the atlas after it, and whether the pose graph was solved anew with the loop.
+    """
+    try:
+        return _judged(atlas, loop, rig, path, same_view, config)
+    except np.linalg.LinAlgError:
+        return replace(atlas, refused=(*atlas.refused, loop.pair)), False
+
+
+def _judged(
+    atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool, config: AtlasConfig
+) -> tuple[Atlas, bool]:
+    """`close`, where all numbers can be computed with."""
+    chain = atlas.chain(rig, path())
+    common = None if atlas.solved is None else atlas.solved.common_as(rig)
+    graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain.poses), loop.pair, common)
+    limit, off = config.gate_sigmas**2, disagreement(graph, loop)
+    if off > limit and not (same_view and np.isfinite(off)):
+        return _left_out(atlas, chain, loop, rig, config, off > config.refused_beyond)
+    before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
+    if config.agreeing > 1 and not (before is not None and _agree(chain, before, loop, limit)):
+        return atlas.with_inactive_loop(loop, config.most_loops), False
+    atlas = replace(atlas, confirmed=True)
+    if off > limit:
+        atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
+        chain = atlas.chain(rig, path())
+        graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain.poses), loop.pair, common)
+    elif atlas.loops and not is_informative(graph, loop):
+        return atlas.with_inactive_loop(loop, config.most_loops), False
+    graph = graph.with_loop(loop)
+    if (graph.disagreement() > limit).any():
+        return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
+    return atlas.with_loop(loop, config.most_loops).solved_by(graph, rig), True
+
+
+def _left_out(
+    atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, config: AtlasConfig, refused: bool
+) -> tuple[Atlas, bool]:
+    """Leave out a loop that contradicts the others, or the others if fewer places support them.
+
+    One that is not `refused` contradicts them by no more than may be: it does not count as another place.
+    """
+    limit, start = config.gate_sigmas**2, atlas.in_map(chain.poses)
+    atlas = atlas.with_inactive_loop(loop, config.most_loops)
+    if refused:
+        atlas = replace(atlas, refused=(*atlas.refused, loop.pair))
+    left = config.return_depths * np.array([k.depth for k in atlas.keyframes])
+
+    def places(loops: Sequence[Loop]) -> list[Loop]:
+        return spaced(loops, atlas.travelled, left)
+
+    if not atlas.loops or len(places(atlas.inactive_loops)) < 2:
+        return atlas, False
+    every = (*atlas.loops, *atlas.inactive_loops)
+    rival = agreeing(chain, every, loop, chain.poses, limit)
+    if len(places(rival)) <= len(places(agreeing(chain, every, atlas.loops[-1], start, limit))):
+        return atlas, False
+    before = {x.pair for x in atlas.loops}
+    held = {x.pair: x for x in (*places(rival), *(x for x in rival if x.pair in before), loop)}
+    atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival, config.most_loops)
+    return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig), True
+
+
+def _agree(chain: Chain, before: Loop, loop: Loop, limit: float) -> bool:
+    """Whether two loops, seen by keyframes shortly after each other, are consistent with each other."""
+    if loop.second - before.second > 3:  # keyframes
+        return False
+    T_old, P_old = chain.motion(before.first, loop.first)
+    T_new, P_new = chain.motion(before.second, loop.second)
+    expected = inverse(T_old) @ before.T_first_second @ T_new
+    back, far = adjoint(inverse(T_new)), adjoint(inverse(expected))
+    P = back @ before.covariance @ back.T + P_new + loop.covariance + far @ P_old @ far.T
+    return distance(expected, loop.T_first_second, P) < limit
+
+
+def is_informative(graph: PoseGraph, loop: Loop) -> bool:
+    """Whether a loop is more certain than what path and loops so far say of it, in any direction.
+
+    In a place that is seen again and again they soon know as much, and most loops add nothing.
+    """
+    return bool(eigvalsh(graph.relative_pose(*loop.pair)[1], loop.covariance)[-1] > 1.0)
+
+
+def disagreement(graph: PoseGraph, loop: Loop) -> float:
+    """Squared Mahalanobis distance of a loop that is not in the graph from the graph's relative pose."""
+    T, P = graph.relative_pose(*loop.pair)
+    return distance(T, loop.T_first_second, P + loop.covariance)
+
+
+def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array, limit: float) -> list[Loop]:
+    """Loops that agree with the path, with the seed and with each other, in order of their second keyframes.
+
+    The set grows from the seed: the loops nearest to it on the path are tested first, then each time twice as many.
+    Loops that join shrink the path's covariance, against which the next ones are tested. It is empty if the seed
+    contradicts the path.
+
+    `start` (K, 4, 4) are poses of all keyframes, at which the graph is first linearised; `limit` is the largest squared
+    Mahalanobis distance of a loop from the pose graph.
+    """
+    others = sorted((x for x in loops if x is not seed), key=lambda x: (abs(x.second - seed.second), x.first))
+    also = [k for x in others for k in x.pair]
+    graph = PoseGraph.solved(chain, [], start, [*also, *seed.pair])
+    if disagreement(graph, seed) > limit:
+        return []
+    members, begin, size = [seed], 0, 1
+    graph = PoseGraph.solved(chain, members, start, also)
+    while begin < len(others):
+        joined = [x for x in others[begin : begin + size] if disagreement(graph, x) <= limit]
+        begin, size = begin + size, 2 * size
+        while joined:
+            whole = PoseGraph.solved(chain, [*members, *joined], start, also)
+            off = whole.disagreement()
+            if (off <= limit).all():
+                members, graph = [*members, *joined], whole
+                break
+            del joined[int(np.argmax(off[len(members) :]))]
+    return sorted(members, key=lambda x: x.second)
+
+
+def spaced(loops: Sequence[Loop], travelled: Array, apart: Array) -> list[Loop]:
+    """One loop of each place, in order of the second keyframes.
+
+    Loops at one place are not independent evidence: they see the same things, or the same lookalikes.
+
+    `travelled` (K,) [m] is the length of the path up to each keyframe, `apart` (K,) [m] the distance along it beyond
+    which the keyframe's place is left.
+    """
+    chosen: list[Loop] = []
+    for loop in sorted(loops, key=lambda x: x.second):
+        if not chosen or travelled[loop.second] - travelled[chosen[-1].second] > apart[chosen[-1].second]:
+            chosen.append(loop)
+    return chosen
