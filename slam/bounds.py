@@ -49,10 +49,10 @@ def require_not_negative(config: object, ranges: Ranges | None = None, owner: st
 
 def _require(config: object, ranges: Ranges, owner: str, positive: bool) -> None:
     mark = f"{owner}: " if owner else ""
-    hints = field_types(type(config))  # type: ignore[arg-type]
+    hints = _hints(type(config))  # type: ignore[arg-type]
     for f in fields(config):  # type: ignore[arg-type]
         value = getattr(config, f.name)
-        fault = type_fault(value, hints[f.name])
+        fault = _type_fault(value, hints[f.name])
         if fault:
             raise ConfigurationError(f"{mark}{f.name} must be {fault}, got {value!r}")
         for number in value if isinstance(value, (tuple, list)) else (value,):
@@ -76,15 +76,15 @@ def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool
 
 
 @lru_cache(maxsize=64)
-def field_types(kind: type) -> dict[str, Any]:
-    """Types of a dataclass's fields, by name."""
+def _hints(kind: type) -> dict[str, Any]:
+    """Types of a dataclass's fields."""
     return get_type_hints(kind)
 
 
-def type_fault(value: Any, hint: Any) -> str:
+def _type_fault(value: Any, hint: Any) -> str:
     """What is required of a value of the wrong type; empty if the type is right."""
     if get_origin(hint) in (Union, UnionType):
-        faults = [type_fault(value, kind) for kind in get_args(hint)]
+        faults = [_type_fault(value, kind) for kind in get_args(hint)]
         return "" if "" in faults else " or ".join(filter(None, faults))
     if hint is NoneType:
         return "" if value is None else "none"
@@ -107,7 +107,7 @@ def type_fault(value: Any, hint: Any) -> str:
 
 
 def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
-    """As `type_fault`, for a tuple, or a list in its place."""
+    """As `_type_fault`, for a tuple, or a list in its place."""
     if not isinstance(value, (tuple, list)):
         return "a list"
     if len(kinds) == 2 and kinds[1] is Ellipsis:
@@ -116,7 +116,7 @@ def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
         kinds = (kinds[0],) * len(value)
     if len(value) != len(kinds):
         return f"a list of {len(kinds)} values"
-    faults = [type_fault(v, kind) for v, kind in zip(value, kinds)]
+    faults = [_type_fault(v, kind) for v, kind in zip(value, kinds)]
     return next((f"a list, each {fault}" for fault in faults if fault), "")
 
 

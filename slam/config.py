@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from typing import Any, get_args
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
-from slam.bounds import field_types, type_fault
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.config import MapConfig
-from slam.models import EstimatorModels, models_for, require_not_negative
+from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for, require_not_negative
 from slam.objects.config import ObjectsConfig
 from slam.settings import apply_settings
 from slam.tracks.config import AssociationConfig
@@ -75,6 +75,8 @@ class SystemConfig:
     frontend: dict[str, Any] = field(default_factory=dict)
     backend: dict[str, Any] = field(default_factory=dict)
 
+    __pydantic_config__ = FORBID_UNKNOWN
+
     def __post_init__(self) -> None:
         require_not_negative(self)
         for section in ("frontend", "backend"):
@@ -108,10 +110,14 @@ class SystemConfig:
         """The configuration of a tree of plain types, as `to_json` writes it; what is left out has its default.
 
         Raises:
-            ConfigurationError: a key is unknown, or no longer a setting and of another value than now, or a value is of
-                the wrong type or out of range.
+            ConfigurationError: a key is unknown, or a value is of the wrong type or out of range.
         """
-        return _built(cls, _without_fixed(tree), "")
+        from pydantic import TypeAdapter, ValidationError
+
+        try:
+            return TypeAdapter(cls).validate_python(tree)
+        except ValidationError as error:
+            raise ConfigurationError(_refused(error.errors()[0])) from None
 
     def with_settings(self, settings: list[str]) -> SystemConfig:
         """A copy with ``section.key=value`` settings applied, for instance ``map.max_landmarks=300``.
@@ -129,53 +135,19 @@ class SystemConfig:
 #: What the system itself gives to front ends and back ends that it makes.
 _GIVEN = ("self", "rig", "models")
 
-#: Classes of sections in which settings of earlier versions are constants now, and those that changed no result.
-_FIXED = {"association": AssociationConfig, "map": MapConfig, "self_calibration": SelfCalibrationConfig}
-_GONE = {"atlas": ("on_disk",)}
+#: What is required of a setting, by pydantic's name of the fault.
+_WANTED = {
+    "int": "a whole number", "float": "a number", "finite": "a finite number", "bool": "true or false",
+    "string": "a text", "list": "a list", "tuple": "a list", "is": "a list", "dict": "an object", "none": "null",
+}  # fmt: skip
 
 
-def _without_fixed(tree: dict[str, Any]) -> dict[str, Any]:
-    """The tree without settings of earlier versions; raises ConfigurationError where one had another value than now."""
-    if not isinstance(tree, dict):  # which is refused as any other value of a wrong type
-        return tree
-    kept = dict(tree)
-    for section, own in tree.items():
-        kind = _FIXED.get(section)
-        if not isinstance(own, dict) or (kind is None and section not in _GONE):
-            continue
-        constants = {name for name, value in vars(kind).items() if isinstance(value, (int, float))} if kind else set()
-        fixed = constants - {f.name for f in fields(kind)} if kind else set()
-        for key in fixed.intersection(own):
-            if not (isinstance(own[key], (int, float)) and own[key] == getattr(kind, key)):
-                raise ConfigurationError(
-                    f"setting {section}.{key}: no longer a setting; its value is {getattr(kind, key)}, "
-                    f"not {own[key]!r:.80}"
-                )
-        kept[section] = {key: value for key, value in own.items() if key not in (*fixed, *_GONE.get(section, ()))}
-    return kept
-
-
-def _built(kind: Any, tree: Any, where: str) -> Any:
-    """A configuration class's instance from a tree of plain types; `where` is the section, for messages."""
-    if not isinstance(tree, dict):
-        raise ConfigurationError(f"setting {where}: must be an object, got {tree!r:.80}")
-    hints, values = field_types(kind), {}
-    for key, value in tree.items():
-        name, hint = f"{where}.{key}".lstrip("."), hints.get(key)
-        if hint is None:
-            raise ConfigurationError(f"setting {name}: there is no such setting in this version")
-        if is_dataclass(hint):
-            values[key] = _built(hint, value, name)
-            continue
-        if fault := type_fault(value, hint):
-            raise ConfigurationError(f"setting {name}: must be {fault}, got {value!r:.80}")
-        values[key] = _plain(value, hint)
-    return kind(**values)
-
-
-def _plain(value: Any, hint: Any) -> Any:
-    """A value with whole numbers and lists of JSON turned into what a field of this type holds."""
-    if isinstance(value, list):
-        inner = float if float in get_args(hint) else None
-        return tuple(_plain(each, inner) for each in value)
-    return float(value) if hint is float and not isinstance(value, bool) else value
+def _refused(fault: Mapping[str, Any]) -> str:
+    """The line for a value that pydantic refuses: the setting, what it must be, and what it is."""
+    where = ".".join(str(part) for part in fault["loc"])
+    if fault["type"] == "unexpected_keyword_argument":
+        return f"setting {where}: there is no such setting in this version"
+    wanted = _WANTED.get(fault["type"].partition("_")[0])
+    if wanted is None:
+        return f"setting {where}: {fault['msg']}"
+    return f"setting {where}: must be {wanted}, got {fault['input']!r:.80}"

@@ -143,8 +143,8 @@ class StereoFeatures:
     @classmethod
     def empty(cls, stamp: float, dimensions: int = 64, threshold: float = float("nan")) -> StereoFeatures:
         """No features."""
-        uv, z = np.zeros((0, 2)), np.zeros(0)
-        return cls(stamp, uv, uv, z, z, z, z.astype(np.int8), np.zeros((0, dimensions), np.float32), threshold)
+        uv, z, descriptors = np.zeros((0, 2)), np.zeros(0), np.zeros((0, dimensions), np.float32)
+        return cls(stamp, uv, uv, z, z, z, z.astype(np.int8), descriptors, threshold)
 
 
 @dataclass(frozen=True, eq=False)

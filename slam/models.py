@@ -13,6 +13,7 @@ from slam.checks import FARTHEST_POSITION
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
 from slam.naming import unknown
+from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
 ANYWHERE = 1e3  # numerics: standard deviation of an unknown position [m]
@@ -54,6 +55,8 @@ class MotionModel:
     angular_acceleration: float = 1.0
     wheels: bool = False
 
+    __pydantic_config__ = FORBID_UNKNOWN
+
     def __post_init__(self) -> None:
         require_positive(self, {"acceleration": _DENSITIES, "angular_acceleration": _DENSITIES})
 
@@ -87,6 +90,8 @@ class EstimatorModels:
     initial_angular_velocity_sigma: float = 1.0
     T_world_left: Sequence[Sequence[float]] | None = None
     objects: ObjectModels = field(default_factory=ObjectModels)
+
+    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_positive(self, _RANGES)

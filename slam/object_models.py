@@ -12,6 +12,9 @@ from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array
 from slam.object_data import ObjectEstimate, ObjectObservations
 
+#: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
+FORBID_UNKNOWN = {"extra": "forbid"}
+
 _RANGES = {
     "acceleration": (1e-6, 1e6),
     "angular_acceleration": (1e-6, 1e6),
@@ -56,6 +59,8 @@ class ObjectModels:
     max_acceleration: float = 100.0
     max_turn_rate: float = 20.0
     drift: float = 0.0
+
+    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self, _RANGES, "objects")

@@ -26,6 +26,7 @@ def test_import_slam_loads_numpy_and_nothing_else_that_is_heavy():
         "cv2",
         "gtsam",
         "numba",
+        "pydantic",
         "typer",
         "rich",
         "matplotlib",

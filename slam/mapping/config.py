@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from slam.errors import ConfigurationError
-from slam.models import require_not_negative
+from slam.models import FORBID_UNKNOWN, require_not_negative
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,8 @@ class MapConfig:
     same_distance: ClassVar[float] = 0.02
     #: Largest descriptor distance at which landmarks are merged.
     same_descriptor: ClassVar[float] = 0.4
+
+    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from slam.errors import ConfigurationError
-from slam.models import require_not_negative
+from slam.models import FORBID_UNKNOWN, require_not_negative
 
 _RANGES = {
     "wide_hypotheses": (1, 100_000),
@@ -81,6 +81,8 @@ class AssociationConfig:
     rematch_after: ClassVar[int] = 10
     #: Standard deviation [px] assumed in the second search, around the pose on which matches agreed.
     refined_window: ClassVar[float] = 3.0
+
+    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self, _RANGES, "association")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from slam.chi_square import chi_square_beyond
 from slam.errors import ConfigurationError
-from slam.models import require_not_negative
+from slam.models import FORBID_UNKNOWN, require_not_negative
 
 _RANGES = {
     "features": (1, 100_000),
@@ -57,6 +57,8 @@ class AtlasConfig:
     gate_sigmas: float = 5.0
     most_loops: int = 200
     give_back: bool = True
+
+    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self, _RANGES, "atlas")
