@@ -110,19 +110,19 @@ def gather(camera, marks, cross, left, rows, columns):
 
     A number −1 stands for what is independent of all else.
     """
-    size, n, out = camera.shape[0], camera.shape[1], np.zeros((len(rows), len(columns)))
+    size, n, out = camera.shape[0], camera.shape[1], np.empty((len(rows), len(columns)))
     for i in range(len(rows)):
         r = rows[i]
         for j in range(len(columns)):
             c = columns[j]
             if r < 0 or c < 0:
-                continue
-            if r >= n:
+                out[i, j] = 0.0
+            elif r >= n:
                 out[i, j] = cross[c, r - n] if c < n else left[r - n, c - n]
             elif c >= n:
                 out[i, j] = cross[r, c - n]
-            elif r < size:
-                out[i, j] = camera[r, c]
+            elif r >= size and c >= size:
+                out[i, j] = marks[r - size, c - size]
             else:
-                out[i, j] = camera[c, r] if c < size else marks[r - size, c - size]
+                out[i, j] = camera[r, c] if r < size else camera[c, r]
     return out
