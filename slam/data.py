@@ -109,6 +109,10 @@ def _at(mask: BoolArray, uv: Array) -> BoolArray:
     return out
 
 
+#: Columns of `StereoFeatures`.
+_COLUMNS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+
+
 @dataclass(frozen=True, eq=False)
 class StereoFeatures:
     """Features of one stereo frame, a row each.
@@ -138,13 +142,13 @@ class StereoFeatures:
     images: ImagePair | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name in ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors"):
+        for name in _COLUMNS:
             value = getattr(self, name)
             if not isinstance(value, (np.ndarray, list, tuple)) or (isinstance(value, np.ndarray) and not value.ndim):
                 kind = type(value).__name__
                 raise MeasurementError(f"features: {name} must be an array with a row for each feature, got {kind}")
         n = len(self.uv_left)
-        for name in ("uv_right", "scale", "angle", "response", "laplacian", "descriptors"):
+        for name in _COLUMNS[1:]:
             if len(getattr(self, name)) != n:
                 raise MeasurementError(f"features: {name} has {len(getattr(self, name))} rows, uv_left has {n}")
 
@@ -160,12 +164,14 @@ class StereoFeatures:
         """Which features have a right pixel (N,)."""
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
 
+    def select(self, rows: NDArray) -> StereoFeatures:
+        """The features of these rows (a mask or indices)."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+
     def outside(self, left_mask: BoolArray | None, right_mask: BoolArray | None) -> StereoFeatures:
         """Those where the masks (H, W) of a frame are True; under the right camera's only the right pixel goes."""
         if left_mask is not None:
-            rows = np.flatnonzero(_at(left_mask, self.uv_left))
-            names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
-            return replace(self, **{name: getattr(self, name)[rows] for name in names}).outside(None, right_mask)
+            return self.select(np.flatnonzero(_at(left_mask, self.uv_left))).outside(None, right_mask)
         if right_mask is None:
             return self
         return replace(self, uv_right=np.where(_at(right_mask, self.uv_right)[:, None], self.uv_right, np.nan))

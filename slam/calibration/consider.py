@@ -139,7 +139,7 @@ class SchmidtFilter:
             ids: landmarks that measured it (M,).
             positions: their estimated positions (M, 3) [m] in world coordinates.
         """
-        T, now = T_world_left @ self._model.rig.rectified.T_left_rectified, self._now
+        T, now = T_world_left, self._now
         if self._stamp is None:
             self._now, self._stamp = Sensitivities.start(T, self._columns), stamp
             return
@@ -197,7 +197,7 @@ class SchmidtFilter:
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
         factor = self._factor(covariance)
-        J = self._by_left_camera() @ factor
+        J = self.pose @ factor
         positions = estimate.covariances
         ids, by_rig = self.landmarks()
         if len(estimate.ids) and len(ids):
@@ -221,7 +221,7 @@ class SchmidtFilter:
         Returns:
             J (6, n + 2), in the axes of the left camera, and S (n + 2, n + 2).
         """
-        J = self._by_left_camera()
+        J = self.pose.copy()
         J[:, -1] -= J[:, :-2] @ kept
         known = np.concatenate([kept, [0.0, 1.0]])
         return J, np.column_stack([self._factor(covariance)[:, :-1], known])
@@ -234,10 +234,6 @@ class SchmidtFilter:
     def landmarks(self) -> tuple[IdArray, Array]:
         """Ids (N,), ascending, and derivatives (N, 3, n + 2) of their positions in world coordinates."""
         return self._now.ids, self._now.landmarks
-
-    def _by_left_camera(self) -> Array:
-        """Derivative of the pose (6, n + 2) in the axes of the left camera."""
-        return adjoint(self._model.rig.rectified.T_left_rectified) @ self.pose
 
     def _factor(self, covariance: Array) -> Array:
         """Square root (n + 2, n + 2) of the covariance of parameters (n, n), baseline and unit column.

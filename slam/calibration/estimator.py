@@ -135,16 +135,6 @@ class SelfCalibration:
             return features
         return self.applied.features(features)
 
-    def correct_again(self, corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:
-        """`correct` features that have moved since they were corrected: `now`, those of `before` that moved alone."""
-        if corrected is before:
-            return now
-        moved = (now.uv_left != before.uv_left) | (now.uv_right != before.uv_right)
-        rows = np.flatnonzero(moved.any(axis=1))
-        uv_left, uv_right = corrected.uv_left.copy(), corrected.uv_right.copy()
-        uv_left[rows], uv_right[rows] = self.applied.pixels(now.uv_left[rows], now.uv_right[rows])
-        return replace(now, uv_left=uv_left, uv_right=uv_right)
-
     def observe(self, features: StereoFeatures, T_world_left: Array) -> None:
         """Learn from one frame.
 

@@ -55,25 +55,14 @@ class View:
 
     @classmethod
     def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array, most: int) -> View:
-        """Of the strongest features as measured, `most` at the most, at a pose (4, 4) of the left camera."""
-        rectified_rig = model.rig.rectified
+        """Of the strongest features as measured, in rectified pixels, `most` at the most, at a pose (4, 4)."""
         rows = np.flatnonzero(features.has_stereo)
         if len(rows) > most:
             rows = np.sort(rows[np.argsort(-features.response[rows], kind="stable")[:most]])
-        left, right = (
-            rectified_rig.rectify_left(features.uv_left[rows]),
-            rectified_rig.rectify_right(features.uv_right[rows]),
-        )
+        left, right = features.uv_left[rows], features.uv_right[rows]
         points = model.points(np.column_stack([left, right[:, 0]]))
-        vertical = right[:, 1] - left[:, 1]
-        good = np.isfinite(points).all(axis=1) & np.isfinite(vertical)
-        rows = rows[good]
         return cls(
-            points[good],
-            vertical[good],
-            features.descriptors[rows],
-            features.laplacian[rows],
-            T_world_left @ rectified_rig.T_left_rectified,
+            points, right[:, 1] - left[:, 1], features.descriptors[rows], features.laplacian[rows], T_world_left
         )
 
 

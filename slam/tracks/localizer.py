@@ -96,7 +96,6 @@ class Localizer:
         self.rig = rig
         self.config = config
         self.pixel_sigma = models.pixel_sigma
-        self._rectified_sigma = models.pixel_sigma * rig.rectified.scale
         self._models = models
         self._lost_after = lost_after
 
@@ -303,16 +302,14 @@ class Localizer:
     def _consensus(
         self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False
     ) -> PoseConsensus:
-        """The pose on which matches agree, found in rectified pixels: lenses would be the larger part of its cost."""
-        r, rows = self.rig.rectified, matches.features
-        measured = measurement_rows(r.rectify_left(features.uv_left[rows]), r.rectify_right(features.uv_right[rows]))
-        threshold = self.config.consistency_sigmas * self._rectified_sigma
+        """The pose on which matches agree."""
+        rows, points = matches.features, positions[matches.landmarks]
+        measured = measurement_rows(features.uv_left[rows], features.uv_right[rows])
+        threshold = self.config.consistency_sigmas * self.pixel_sigma
         if wide and len(matches) < self.config.minimum_consistent:
             return PoseConsensus(guess, np.zeros(len(matches), bool))
         hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses
-        X, points = r.T_left_rectified, positions[matches.landmarks]
-        found = find_consensus(r.rig, points, measured, guess @ X, threshold, hypotheses, seed)
-        return PoseConsensus(found.T_world_left @ X.T, found.inliers)
+        return find_consensus(self.rig, points, measured, guess, threshold, hypotheses, seed)
 
     def _expected(
         self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkTable, positions: Array

@@ -8,7 +8,7 @@ alike. While the camera stands, only features that stay are used to measure its 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,9 +162,7 @@ class Standing:
 
     def witnessed(self, features: StereoFeatures) -> StereoFeatures:
         """Those of the features that stay."""
-        rows = self.witnesses
-        parts = {f.name: getattr(features, f.name)[rows] for f in fields(features)[1:8]}
-        return replace(features, **parts)
+        return features.select(self.witnesses)
 
 
 def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array) -> float:

@@ -116,7 +116,7 @@ def map_with(**arrays):
     with zipfile.ZipFile(io.BytesIO(body)) as file:
         found = {name: file.read(name) for name in file.namelist()}
     data = changed(found, **arrays)
-    return b"surf-stereo-slam map 4\n" + hashlib.sha256(data).hexdigest().encode() + b"\n" + data
+    return b"surf-stereo-slam map 5\n" + hashlib.sha256(data).hexdigest().encode() + b"\n" + data
 
 
 def test_maps_with_impossible_values():

@@ -67,10 +67,8 @@ class Found:
 class LoopCloser:
     """Adds keyframes to an atlas and closes loops.
 
-    Internally, pixels and coordinates are those of the rectified rig.
-
     Args:
-        rig: the cameras.
+        rig: the rectified pair.
         config: settings.
         association: settings of the search by descriptor.
         models: with the noise of uL, vL, uR [px].
@@ -85,8 +83,7 @@ class LoopCloser:
         models: EstimatorModels,
         max_depth_error: float,
     ) -> None:
-        self._rectified = rig.rectified
-        self._rig = rig.rectified.rig
+        self._rig = rig
         self._config = config
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
         self._file = FeatureFile() if config.on_disk else None
@@ -109,7 +106,6 @@ class LoopCloser:
             return atlas, None
         landmark_of = step.matches.landmark_of(len(step.features))
         landmark_of[step.added.rows] = step.added.ids
-        step = replace(step, features=self._rectify(step.features))
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:
             return atlas, None
@@ -140,7 +136,6 @@ class LoopCloser:
         """
         if not self._config.enabled or len(features) < self._config.inliers:
             return None
-        features = self._rectify(features)
         likely = self._most_alike(atlas, features.descriptors, np.ones(len(atlas), bool))
         likely = self._ranked(atlas, likely, features)
         verified = self._verified(atlas, likely, features, correction, seed)
@@ -156,27 +151,18 @@ class LoopCloser:
 
     def _place(self, keyframe: Keyframe, T_odom_left: Array) -> KnownPlace:
         """A keyframe's features as landmarks, given its pose (4, 4)."""
-        points, T = keyframe.points.astype(float), T_odom_left @ self._rectified.T_left_rectified
+        points, T = keyframe.points.astype(float), T_odom_left
         P = T[:3, :3] @ self._rig.triangulation_covariance(points, self._sigma) @ T[:3, :3].T
         descriptors = keyframe.descriptors.astype(np.float32)
         P = 0.5 * (P + np.swapaxes(P, 1, 2))
         return KnownPlace(keyframe.landmarks, transform(T, points), P, descriptors, keyframe.laplacian, T[:3, 3])
-
-    def _rectify(self, features: StereoFeatures) -> StereoFeatures:
-        """Features in pixels of the rectified rig."""
-        r = self._rectified
-        if r.original.is_rectified:
-            return features
-        return replace(features, uv_left=r.rectify_left(features.uv_left), uv_right=r.rectify_right(features.uv_right))
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
         """Whether the view differs enough from the last keyframe's, or a loop waits for confirmation."""
         if len(atlas) == atlas.prior_count or self._in_doubt(atlas):
             return True
         last = atlas.keyframes[-1]
-        X = self._rectified.T_left_rectified
-        motion = inverse(X) @ inverse(last.T_odom_left) @ step.estimate.T_world_left @ X
-        return view_has_changed(last, motion, self._rig, self._config)
+        return view_has_changed(last, inverse(last.T_odom_left) @ step.estimate.T_world_left, self._rig, self._config)
 
     def _in_doubt(self, atlas: Atlas) -> bool:
         """Whether the last keyframe has a loop that is not confirmed yet; the next frame may confirm it."""
@@ -283,15 +269,14 @@ class LoopCloser:
 
         Their second number is that of the newest keyframe, which is the present camera's unless it is lost.
         """
-        X = self._rectified.T_left_rectified
-        A, found = adjoint(X), []
+        found = []
         for k in candidates.tolist():
             keyframe = atlas.keyframes[k].corrected(correction, self._rig)
             seen = verify(keyframe, features, self._rig, self._localizer, self._config, seed)
             if seen is not None:
                 # Each of both poses has an error of its own frame too, at most as large as such a measurement's noise.
-                T, P = X @ seen.T_keyframe_left @ inverse(X), A @ (seen.covariance + seen.noise) @ A.T
-                found.append((Loop(k, len(atlas) - 1, T, P, len(seen.matches)), seen))
+                P = seen.covariance + seen.noise
+                found.append((Loop(k, len(atlas) - 1, seen.T_keyframe_left, P, len(seen.matches)), seen))
         return found
 
     def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:
@@ -397,15 +382,15 @@ class LoopCloser:
 
     def _returned(self, seen: Verified) -> Returned:
         """The old keyframe's inliers, in coordinates of the present left camera."""
-        keyframe, m, X = seen.keyframe, seen.matches, self._rectified.T_left_rectified
+        keyframe, m = seen.keyframe, seen.matches
         back = inverse(seen.T_keyframe_left)
         points = keyframe.points[m.landmarks].astype(float)
         near, R = transform(back, points), back[:3, :3]
         J = points_by_pose(near)
         P = R @ self._rig.triangulation_covariance(points, self._sigma) @ R.T
-        P = X[:3, :3] @ (P + J @ seen.covariance @ np.swapaxes(J, 1, 2)) @ X[:3, :3].T
+        P = P + J @ seen.covariance @ np.swapaxes(J, 1, 2)
         symmetric = 0.5 * (P + np.swapaxes(P, 1, 2))
-        return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
+        return Returned(m.features, keyframe.landmarks[m.landmarks], near, symmetric)
 
 
 def is_informative(graph: PoseGraph, loop: Loop) -> bool:
