@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slam.chi_square import SIGMAS, chi_square_limit
-from slam.data import BoolArray, StereoFeatures
+from slam.data import StereoFeatures
 from slam.geometry.arrays import median
 from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
 from slam.geometry.rig import StereoRig
@@ -128,12 +128,16 @@ class Standing:
         if self.places is None or self.places.descriptors.shape[1] != descriptors.shape[1]:
             return begun
         places, rows = self.places.find(z, descriptors, SIGMAS * np.sqrt(2.0) * sigma)
-        stay, at_rest, variance = _staying(rig, self.places.z[places], z[rows], sigma, self.variance)
-        places, rows = places[stay], rows[stay]
+        shift = z[rows] - self.places.z[places]
+        stay = np.square(shift).sum(axis=1) <= _GATE * min(self.variance, 2.0 * sigma**2)
+        places, rows, shift = places[stay], rows[stay], shift[stay]
         most = 2 * len(rows) > min(len(z), int((self.places.missed == 0).sum()))
+        if not (self.stands or most):
+            return begun
         witnesses = stereo[rows[self.places.sights[places] >= _FRAMES]]
         known = self.places.after(places, rows, z, descriptors)
-        if at_rest and (self.stands or most):
+        at_rest, variance = _at_rest(rig, self.places.z[places], shift, self.variance)
+        if at_rest:
             return Standing(known, self.frames + 1, witnesses, variance, self.T_world_left)
         if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, _BLIND):
             return replace(self, places=known, witnesses=witnesses, blind=self.blind + 1)
@@ -174,17 +178,15 @@ def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray
     return float((((moved - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2).mean()) if seen.any() else 0.0
 
 
-def _staying(rig: StereoRig, before: Array, now: Array, sigma: float, variance: float) -> tuple[BoolArray, bool, float]:
-    """Which features (M,) stay, of (uL, vL, uR) (M, 3) before and now [px], whether the camera does, and the variance.
+def _at_rest(rig: StereoRig, before: Array, d: Array, variance: float) -> tuple[bool, float]:
+    """Whether no common motion moves features that stay by more than noise, and the variance of a pixel [px²].
 
-    The camera stays unless a common motion moves those that stay by more than noise; `variance` is that of a pixel.
+    They were at (uL, vL, uR) (M, 3) `before` and have moved by `d` (M, 3) [px].
     """
-    d = now - before
-    stay = (d**2).sum(axis=1) <= _GATE * min(variance, 2.0 * sigma**2)
-    local = rig.triangulate(before[:, :2], np.column_stack([before[:, 2], before[:, 1]]))
-    used = np.flatnonzero(stay & np.isfinite(local).all(axis=1))
+    local = rig.triangulate(before[:, :2], before[:, [2, 1]])
+    used = np.flatnonzero(np.isfinite(local).all(axis=1))
     if len(used) <= _FEW:
-        return stay, False, variance
+        return False, variance
     _, J = rig.project_stereo(local[used])
     J = J @ points_by_pose(local[used])
     d, weight = d[used], np.ones(len(used))
@@ -199,4 +201,4 @@ def _staying(rig: StereoRig, before: Array, now: Array, sigma: float, variance: 
     test = float(np.einsum("n,nij,nij->", weight, by_motion[:, :, None], by_motion[:, :, None])) / variance
     # 0.25: of the variance of a pixel, that features may share: light moves them alike, too
     within_noise = float((by_motion**2).mean()) < 0.25 * variance
-    return stay, test < _MOVES or within_noise, variance
+    return test < _MOVES or within_noise, variance

@@ -116,7 +116,8 @@ class LoopCloser:
         atlas = replace(atlas.with_new(kept, descriptors), restarts=len(atlas.gaps))
         found = self._verified(atlas, candidates, step.features, step.correction, step.index)
         if not found:  # whatever the path says
-            found = self._verified(atlas, self._anywhere(atlas, new, known), step.features, step.correction, step.index)
+            lookalike = self._anywhere(atlas, new, known, step.features)
+            found = self._verified(atlas, lookalike, step.features, step.correction, step.index)
             found = [one for one in found if self._is_same_view(one[1], step.features)]
         best = max(found, key=_inliers, default=None)
         if best is None:
@@ -222,12 +223,19 @@ class LoopCloser:
         likely = np.unique(np.concatenate([likely, _nearest(poses, here, new.depth, possible)]))
         return self._ranked(atlas, self._not_measured(atlas, likely, known), step.features)
 
-    def _anywhere(self, atlas: Atlas, new: Keyframe, known: IdArray) -> NDArray[np.intp]:
-        """Number of the keyframe that looks most like a new one, unless the path says that it shows the same view."""
+    def _anywhere(
+        self, atlas: Atlas, new: Keyframe, known: IdArray, features: StereoFeatures
+    ) -> NDArray[np.intp]:
+        """Number of the keyframe that looks most like a new one, unless the path says that it shows the same view.
+
+        Of the same view most features agree on a pose, so that a third of them at least match by descriptor alone.
+        """
         moved = inverse(atlas.poses[:-1]) @ new.T_odom_left
         apart = np.linalg.norm(moved[:, :3, 3], axis=1) > self._config.keyframe_distance * new.depth
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), np.append(apart, False))
-        return self._not_measured(atlas, likely, known)[:1]
+        best = self._not_measured(atlas, likely, known)[:1]
+        enough = min(self._config.features, int(features.has_stereo.sum())) / 3
+        return best[[alike(atlas.keyframes[k], features, self._localizer.config) >= enough for k in best.tolist()]]
 
     def _not_measured(self, atlas: Atlas, rows: NDArray[np.intp], known: IdArray) -> NDArray[np.intp]:
         """Those keyframes whose landmarks the back end does not measure."""
