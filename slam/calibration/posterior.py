@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -110,11 +110,15 @@ def solve(
         evidence: of the data, from which the prior's scales follow.
         known: evidence of which the parameters' posterior is computed; None if it is `evidence`.
     """
-    given = _by_scale(prior, evidence)
-    logs = given.log_likelihoods(prior)
+    given = sum(evidence[1:], evidence[0])
+    e, information = given.e - given.S @ prior.mean, prior.information + given.S
+    fits = np.linalg.solve(information, np.broadcast_to(e[:, None], (len(information), len(e), 1)))[..., 0] @ e
+    logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(information)[1] + fits)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    whole, _, _, covariances, steps = given if known is None else _by_scale(prior, known)
+    whole = given if known is None else sum(known[1:], known[0])
+    covariances = np.linalg.inv(prior.information + whole.S)
+    steps = covariances @ (whole.e - whole.S @ prior.mean)
     step = weights @ steps
     off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
@@ -144,34 +148,3 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
     logs = 0.5 * np.sum(np.square(vectors.T @ g) * variances / added - np.log(added), axis=1)
     weights = np.exp(logs - logs.max())
     return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
-
-
-class _ByScale(NamedTuple):
-    """The posterior for each scale of the prior (K).
-
-    Attributes:
-        whole: total evidence.
-        e: its information vector (n,), about the prior's mean.
-        information: of the posterior (K, n, n).
-        covariances: of the posterior (K, n, n).
-        steps: changes of the mean (K, n).
-    """
-
-    whole: Evidence
-    e: Array
-    information: Array
-    covariances: Array
-    steps: Array
-
-    def log_likelihoods(self, prior: Prior) -> Array:
-        """Logarithms of the marginal likelihoods (K,)."""
-        return np.asarray(0.5 * (prior.log_determinants - np.linalg.slogdet(self.information)[1] + self.steps @ self.e))
-
-
-def _by_scale(prior: Prior, evidence: Sequence[Evidence]) -> _ByScale:
-    """The posterior of the sum of `evidence` for each scale of the prior."""
-    whole = sum(evidence[1:], evidence[0])
-    information = prior.information + whole.S
-    covariances = np.linalg.inv(information)
-    e = whole.e - whole.S @ prior.mean
-    return _ByScale(whole, e, information, covariances, covariances @ e)
