@@ -209,7 +209,7 @@ class SurfFrontend:
         c = self.config
         assert images.right is not None
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
-        reaches = (_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)
+        reaches = np.array([(_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)])
         return refine(images.left, images.right, uv, size, start, _CORRELATION, reaches, self._windows)
 
     def _disparities(self) -> tuple[float, float]:

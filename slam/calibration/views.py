@@ -61,9 +61,7 @@ class View:
             rows = np.sort(rows[np.argsort(-features.response[rows], kind="stable")[:most]])
         left, right = features.uv_left[rows], features.uv_right[rows]
         points = model.points(np.column_stack([left, right[:, 0]]))
-        return cls(
-            points, right[:, 1] - left[:, 1], features.descriptors[rows], features.laplacian[rows], T_world_left
-        )
+        return cls(points, right[:, 1] - left[:, 1], features.descriptors[rows], features.laplacian[rows], T_world_left)
 
 
 def match(first: View, second: View) -> Rows:

@@ -160,6 +160,38 @@ def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows,
     return found
 
 
+@kernel
+def nearest(points, order, places, radius, looks, others, alike):
+    """Of each place (M, 2 or more) the nearest point (N, 2 or more) that has it as its own nearest place; −1 for none.
+
+    Both are less than `radius` apart, and their descriptors (N, D), (M, D) less than `alike`; `order` is that of the
+    places' columns.
+    """
+    found, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
+    for n in range(len(points)):
+        x, y, best, least = points[n, 0], points[n, 1], -1, radius * radius
+        place, end = 0, len(order)
+        while place < end:
+            middle = (place + end) // 2
+            if places[order[middle], 0] < x - radius:
+                place = middle + 1
+            else:
+                end = middle
+        while place < len(order) and places[order[place], 0] <= x + radius:
+            m = order[place]
+            gap = (places[m, 0] - x) ** 2 + (places[m, 1] - y) ** 2
+            if gap < least:
+                best, least = m, gap
+            place += 1
+        if best >= 0 and least < gaps[best]:
+            off = np.float32(0.0)
+            for k in range(looks.shape[1]):
+                off += (looks[n, k] - others[best, k]) ** 2
+            if off < alike * alike:
+                found[best], gaps[best] = n, least
+    return found
+
+
 @helper
 def grown(array, room):
     """A copy with more room."""

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from slam.chi_square import SIGMAS, chi_square_limit
 from slam.data import StereoFeatures
@@ -54,19 +53,14 @@ class Places:
 
     def find(self, z: Array, descriptors: NDArray[np.float32], radius: float) -> tuple[NDArray, NDArray]:
         """Rows of those that are found again less than `radius` [px] away among features (N,), and the features."""
-        none = np.zeros(0, np.intp)
         if not len(self.z) or not len(z):
-            return none, none
-        distance, nearest = cKDTree(self.z[:, :2]).query(z[:, :2], distance_upper_bound=radius)
-        rows = np.flatnonzero(np.isfinite(distance))
-        places = nearest[rows]
+            return np.zeros(0, np.intp), np.zeros(0, np.intp)
+        from slam.tracks.follow_kernels import nearest
+
         # 0.5: largest distance of descriptors of one feature in unchanged light
-        alike = np.linalg.norm(self.descriptors[places] - descriptors[rows], axis=1) < 0.5
-        rows, places = rows[alike], places[alike]
-        order = np.argsort(distance[rows], kind="stable")
-        _, first = np.unique(places[order], return_index=True)
-        kept = order[first]
-        return places[kept], rows[kept]
+        found = nearest(z, np.argsort(self.z[:, 0], kind="stable"), self.z, radius, descriptors, self.descriptors, 0.5)
+        places = np.flatnonzero(found >= 0)
+        return places, found[places]
 
     def after(self, places: NDArray, rows: NDArray, z: Array, descriptors: NDArray[np.float32]) -> Places:
         """The places after a frame with features (N,), of which `rows` were found at `places` again."""

@@ -223,9 +223,7 @@ class LoopCloser:
         likely = np.unique(np.concatenate([likely, _nearest(poses, here, new.depth, possible)]))
         return self._ranked(atlas, self._not_measured(atlas, likely, known), step.features)
 
-    def _anywhere(
-        self, atlas: Atlas, new: Keyframe, known: IdArray, features: StereoFeatures
-    ) -> NDArray[np.intp]:
+    def _anywhere(self, atlas: Atlas, new: Keyframe, known: IdArray, features: StereoFeatures) -> NDArray[np.intp]:
         """Number of the keyframe that looks most like a new one, unless the path says that it shows the same view.
 
         Of the same view most features agree on a pose, so that a third of them at least match by descriptor alone.

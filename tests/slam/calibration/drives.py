@@ -41,7 +41,7 @@ class Street:
         self.descriptors = (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
 
     def features(self, stamp, T_world_left, parameters=None, noise=0.15, outliers=0.0, most=400, residual=None):
-        """What a rig sees, in rectified pixels, that `parameters` (n,) would make ideal; `residual` fields (m,) come on top."""
+        """What a rig sees, rectified, that `parameters` (n,) would make ideal; `residual` fields (m,) come on top."""
         rng, rig, model = self.rng, self.rig, self.model
         local = self.scale * se3.transform(se3.inverse(T_world_left), self.points)
         left, right = rig.project(local)
@@ -65,9 +65,7 @@ class Street:
         right[wrong] += rng.normal(0, 3, (wrong.sum(), 2))
         left[wrong] += rng.normal(0, 5, (wrong.sum(), 2))
         ones = np.ones(n)
-        return StereoFeatures(
-            stamp, left, right, ones, ones, ones, np.ones(n, np.int8), self.descriptors[ids]
-        )
+        return StereoFeatures(stamp, left, right, ones, ones, ones, np.ones(n, np.int8), self.descriptors[ids])
 
 
 def pose(k, step=1.2):

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
+
+import backends
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.input.rectification import Rectification
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
-
-import backends
 from tests.slam.scene import Cloud
 
 
