@@ -173,22 +173,9 @@ def _collect(space, pixels, stride, filters, layer, row, out, found):
 
 
 def detect_octave(
-    integral: NDArray[np.int32],
-    filters: Filters,
-    octave: int,
-    threshold: float,
-    first_row: int,
-    last_row: int,
+    integral: NDArray[np.int32], filters: Filters, octave: int, threshold: float, first_row: int, last_row: int
 ) -> NDArray[np.float64]:
-    """Maxima of the Hessian determinant in one octave and a range of grid rows.
-
-    Args:
-        integral: see `integral_image`.
-        filters: of the octave, see `make_filters`.
-        octave: 0-based.
-        threshold: D_threshold; only responses above it count.
-        first_row: first grid row to search.
-        last_row: the row after the last one.
+    """Maxima of the Hessian determinant above a threshold in an octave, from a grid row to before another.
 
     Returns:
         Candidates (N, COLUMNS) in raster order of the grid.

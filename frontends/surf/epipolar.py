@@ -31,20 +31,12 @@ class _Space(NamedTuple):
 
 
 class HalfImage(NamedTuple):
-    """An image at half resolution, ready for correlation: arrays by rows, and a vector register of zeros behind them.
+    """An image at half resolution, ready for correlation: flat arrays, with a vector register of zeros behind."""
 
-    Attributes:
-        shape: rows and columns.
-        pixels: grey values, float32 on the scale of 8-bit images.
-        weight: one over the root of the sum of squared deviations of the patch about each pixel; 0 where it is flat
-            or leaves the image.
-        between: grey values half a column further to the right.
-    """
-
-    shape: tuple[int, int]
-    pixels: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    between: NDArray[np.float32]
+    shape: tuple[int, int]  # rows and columns
+    pixels: NDArray[np.float32]  # grey values on the scale of 8-bit images
+    weight: NDArray[np.float32]  # 1 / √(Σ squared deviations of the patch about it); 0 where flat or beyond the image
+    between: NDArray[np.float32]  # grey values half a column further to the right
 
 
 def half_image(image: NDArray, full_scale: float) -> HalfImage:

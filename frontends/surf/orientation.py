@@ -18,17 +18,11 @@ _WINDOW = 23  # fixed: bins in 60 degrees, the ends left out
 
 
 class Disc(NamedTuple):
-    """Samples of the disc, and the bins of whole degrees.
+    """Samples of the disc, and the bins of whole degrees."""
 
-    Attributes:
-        places: numbers of the samples' columns and rows (113, 2), from 0.
-        weights: their Gaussian weights (113,).
-        bins: bin of each degree 0..360 (361,), counted from the first window's first one.
-    """
-
-    places: NDArray[np.uint64]
-    weights: NDArray[np.float32]
-    bins: NDArray[np.uint64]
+    places: NDArray[np.uint64]  # numbers of the samples' columns and rows (113, 2), from 0
+    weights: NDArray[np.float32]  # their Gaussian weights (113,)
+    bins: NDArray[np.uint64]  # bin of each degree 0..360 (361,), counted from the first window's first one
 
 
 def _disc() -> Disc:

@@ -24,7 +24,7 @@ def adapted_threshold(threshold: float, count: int, target: int, least: float, m
     return float(np.clip(threshold, least, most))
 
 
-def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], width: int, height: int) -> NDArray[np.int64]:
+def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], size: tuple[int, int]) -> NDArray[np.intp]:
     """Rows of at most `limit` features, spread over the image.
 
     Args:
@@ -32,15 +32,14 @@ def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], width: in
         limit: number to keep.
         grid: columns and rows of cells; each has an equal share of `limit`. What some cells leave over goes to the
             strongest of the others.
-        width: of the image [px].
-        height: of the image [px].
+        size: width and height of the image [px].
 
     Returns:
         Indices (K,), ascending, so still strongest first.
     """
     if len(uv) <= limit:
         return np.arange(len(uv))
-    return np.flatnonzero(_served(uv, limit, grid, (width, height)))
+    return np.flatnonzero(_served(uv, limit, grid, size))
 
 
 @kernel

@@ -52,15 +52,16 @@ class Surf:
         upright: bool = True,
         threads: int = 1,
     ) -> None:
-        self.setHessianThreshold(threshold)
-        self.setNOctaves(octaves)
-        self.setNOctaveLayers(layers)
-        if descriptor not in (16, 64):
-            raise ConfigurationError(f"descriptor: must be 16 or 64, not {descriptor}")
+        if not (np.isfinite(threshold) and threshold >= 0):
+            raise ConfigurationError(f"threshold: must be a number of at least 0, not {threshold}")
+        given = ("octaves", octaves, (1, 2, 3, 4)), ("layers", layers, (2, 3)), ("descriptor", descriptor, (16, 64))
+        for name, value, possible in given:
+            if value not in possible:
+                raise ConfigurationError(f"{name}: must be one of {possible}, not {value}")
         if not isinstance(threads, int) or threads < 1:
             raise ConfigurationError(f"threads: must be a whole number of at least 1, not {threads}")
-        self.descriptor = descriptor
-        self.setUpright(upright)
+        self.threshold, self.octaves, self.layers = float(threshold), int(octaves), int(layers)
+        self.descriptor, self.upright = int(descriptor), bool(upright)
         self.workers = Workers(threads)
         self._weights = gaussian_weights(4 if descriptor == 64 else 2)
 
@@ -86,12 +87,12 @@ class Surf:
             ConfigurationError: a value is out of its range.
 
         Examples:
-            >>> Surf.create(400).getNOctaves()
+            >>> Surf.create(400).octaves
             4
         """
-        surf = cls(hessianThreshold, nOctaves, nOctaveLayers, 64, upright)
-        surf.setExtended(extended)
-        return surf
+        if extended:
+            raise ConfigurationError("extended: there are no descriptors of 128 numbers; extended=False gives 64")
+        return cls(hessianThreshold, nOctaves, nOctaveLayers, 64, upright)
 
     def detect(self, image: NDArray, mask: NDArray | None = None, threshold: float | None = None) -> Keypoints:
         """Features of an image (H, W) or (H, W, 3|4), uint8 or uint16, by falling response; no angle yet.
@@ -137,8 +138,6 @@ class Surf:
         mask = None if mask is None else binary_mask(mask, image.shape)
         return self.describe_in(integral, self.detect_in(integral, FULL_SCALE[image.dtype], mask))
 
-    # What people know from OpenCV's Feature2D; `detect` is above, and gives what serves as a list of cv2.KeyPoint.
-
     def compute(
         self, image: NDArray, keypoints: Iterable[cv2.KeyPoint]
     ) -> tuple[tuple[cv2.KeyPoint, ...], NDArray[np.float32]]:
@@ -164,77 +163,6 @@ class Surf:
         """The same as OpenCV's method of this name: ``cv2.KeyPoint`` objects and descriptors (N, 16 or 64)."""
         keypoints, descriptors = self.detect_and_describe(image, mask)
         return keypoints.to_cv2(), descriptors
-
-    def getHessianThreshold(self) -> float:
-        """Least determinant of the Hessian."""
-        return self.threshold
-
-    def setHessianThreshold(self, hessianThreshold: float) -> None:
-        """Set it; raises ConfigurationError below 0."""
-        if not (np.isfinite(hessianThreshold) and hessianThreshold >= 0):
-            raise ConfigurationError(f"threshold: must be a number of at least 0, not {hessianThreshold}")
-        self.threshold = float(hessianThreshold)
-
-    def getNOctaves(self) -> int:
-        """Number of octaves."""
-        return self.octaves
-
-    def setNOctaves(self, nOctaves: int) -> None:
-        """Set it; raises ConfigurationError outside 1 to 4."""
-        if nOctaves not in (1, 2, 3, 4):
-            raise ConfigurationError(f"octaves: must be 1 to 4, not {nOctaves}")
-        self.octaves = int(nOctaves)
-
-    def getNOctaveLayers(self) -> int:
-        """Layers searched for maxima in each octave."""
-        return self.layers
-
-    def setNOctaveLayers(self, nOctaveLayers: int) -> None:
-        """Set it; raises ConfigurationError outside 2 to 3."""
-        if nOctaveLayers not in (2, 3):
-            raise ConfigurationError(f"layers: must be 2 or 3, not {nOctaveLayers}")
-        self.layers = int(nOctaveLayers)
-
-    def getExtended(self) -> bool:
-        """Whether descriptors have 128 numbers: never."""
-        return False
-
-    def setExtended(self, extended: bool) -> None:
-        """Raises ConfigurationError for True."""
-        if extended:
-            raise ConfigurationError("extended: there are no descriptors of 128 numbers; extended=False gives 64")
-
-    def getUpright(self) -> bool:
-        """Whether the orientation is left out."""
-        return self.upright
-
-    def setUpright(self, upright: bool) -> None:
-        """Set it."""
-        self.upright = bool(upright)
-
-    def descriptorSize(self) -> int:
-        """Numbers in a descriptor."""
-        return self.descriptor
-
-    def descriptorType(self) -> int:
-        """OpenCV's name for 32-bit floats."""
-        import cv2
-
-        return int(cv2.CV_32F)
-
-    def defaultNorm(self) -> int:
-        """OpenCV's name for the distance of descriptors: Euclidean."""
-        import cv2
-
-        return int(cv2.NORM_L2)
-
-    def empty(self) -> bool:
-        """As of OpenCV's own: true, nothing is learnt or loaded."""
-        return True
-
-    def getDefaultName(self) -> str:
-        """Name as OpenCV gives one."""
-        return "Feature2D.SURF"
 
     def detect_in(
         self,

@@ -149,7 +149,7 @@ def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _field(points: Array, focal: float) -> Array:
-    """Change (N, 3, n + 3) [px] of points ``(x, y, d)`` (N, 3) [px] by the parameters, and by a turn of the rig [rad]."""
+    """Change (N, 3, n + 3) [px] of points ``(x, y, d)`` (N, 3) [px] by the parameters, and by a turn of the rig."""
     from slam.calibration.model_kernels import field
 
     return np.asarray(field(np.ascontiguousarray(points), focal))

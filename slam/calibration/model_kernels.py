@@ -29,7 +29,7 @@ def polynomials(x, y, centre, half, beyond, scales, first, second, out):
 
 @helper
 def _field_at(x, y, d, focal, out):
-    """Change [px] of a point ``(x, y, d)`` [focal lengths] by the parameters and by a turn of the rig: `out` (3, n + 3).
+    """Change [px] of a point ``(x, y, d)`` [focal lengths] by the parameters and a turn of the rig: `out` (3, n + 3).
 
     What is zero for all points is not written.
     """
