@@ -87,12 +87,15 @@ class SelfCalibration:
         return self._motion.count
 
     @property
+    def covariance(self) -> Array:
+        """Of the present posterior (n, n)."""
+        covariance = self._solution.covariance
+        return covariance if self._kept else covariance + np.diag(self._systematic)  # else it is in the evidence
+
+    @property
     def posterior(self) -> RigPosterior:
         """The present posterior of the rig's error."""
-        covariance = self._solution.covariance
-        if not self._kept:  # else it is in the evidence
-            covariance = covariance + np.diag(self._systematic)
-        return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), covariance)
+        return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), self.covariance)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.

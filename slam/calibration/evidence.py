@@ -124,7 +124,7 @@ class Accumulator:
             covariance: of the parameters, residual fields left out (n, n).
         """
         count = len(self._blocks)
-        if count < 2:
+        if count < 2 or self._in_last < self._length:  # it changes slowly: once a block is enough
             return
         total_S, total_e = (sum(block[i] for block in self._blocks) for i in (0, 1))
         # 1e-12: least eigenvalue of an information that counts, as a share of the largest

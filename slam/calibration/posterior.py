@@ -117,7 +117,9 @@ def solve(
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     whole = given if known is None else sum(known[1:], known[0])
-    covariances = np.linalg.inv(prior.information + whole.S)
+    likely = weights > 1e-12  # numerics: of a scale, beside the likeliest
+    prior_information, weights = prior.information[likely], weights[likely]
+    covariances = np.linalg.inv(prior_information + whole.S)
     steps = covariances @ (whole.e - whole.S @ prior.mean)
     step = weights @ steps
     off = steps - step

@@ -61,7 +61,7 @@ class RemainingRigError:
         """The back end's estimate with the rig's uncertainty added."""
         if not self._calibration.config.enabled:
             return estimate
-        return self.uncertainty.added_to(estimate, self._calibration.posterior.covariance)
+        return self.uncertainty.added_to(estimate, self._calibration.covariance)
 
     def common(self, as_reported: bool) -> CommonError:
         """The part of the pose's error that it shares with those of other frames.
@@ -73,4 +73,4 @@ class RemainingRigError:
         if not self._calibration.config.enabled:
             return CommonError()
         made_with = self._calibration.applied.parameters if as_reported else self.uncertainty.kept
-        return CommonError(*self.uncertainty.shared(self._calibration.posterior.covariance, made_with))
+        return CommonError(*self.uncertainty.shared(self._calibration.covariance, made_with))
