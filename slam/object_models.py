@@ -10,7 +10,7 @@ import numpy as np
 from slam.bounds import require_not_negative
 from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array
-from slam.object_data import ObjectObservations
+from slam.object_data import ObjectEstimate, ObjectObservations
 
 #: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
 FORBID_UNKNOWN = {"extra": "forbid"}
@@ -96,18 +96,15 @@ class ObjectModels:
             and change <= self.max_acceleration * dt + noise
         )
 
-    def known(self, covariance: Array, velocity_covariance: Array) -> bool:
+    def known(self, estimate: ObjectEstimate) -> bool:
         """Whether an estimate of a body is more certain than these limits alone.
 
         Standard deviations are compared: of the position with the largest distance covered in a second, of the
         orientation with π, of the velocities with the largest ones.
-
-        Args:
-            covariance: of the pose (6, 6), [rotation, translation].
-            velocity_covariance: of [ω, v] (6, 6).
         """
-        rotation, position = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
-        turning, speed = np.trace(velocity_covariance[:3, :3]), np.trace(velocity_covariance[3:, 3:])
+        P, V = estimate.covariance, estimate.velocity_covariance
+        rotation, position = np.trace(P[:3, :3]), np.trace(P[3:, 3:])
+        turning, speed = np.trace(V[:3, :3]), np.trace(V[3:, 3:])
         return bool(
             rotation <= math.pi**2
             and position <= self.max_speed**2

@@ -10,7 +10,6 @@ from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateRepor
 from slam.geometry.arrays import Array, isin
 from slam.interfaces import Frontend, RestingBackend
 from slam.mapping.step import Step
-from slam.object_data import MotionLabels
 from slam.objects.modes import ObjectDetector
 from slam.rig_error import Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
@@ -127,9 +126,11 @@ class Tracker:
     def sort(self, state: State, step: Step) -> Step:
         """Which features move, and the moving bodies."""
         landmark, standing = step.matches.landmark_of(len(step.features)), step.standing
-        labels: MotionLabels = self.objects.classify(step.features, step.estimate, landmark, standing.witnesses)
+        labels, objects = self.objects.step(
+            state.backend, step.features, step.estimate, landmark, standing.witnesses
+        )  # fmt: skip
         labels = labels.with_undecided(standing.leaving(len(step.features)))
-        return replace(step, labels=labels, objects=self.objects.update(state.backend, step.features))
+        return replace(step, labels=labels, objects=objects)
 
     def manage(self, state: State, step: Step, frontend: Frontend | None) -> Step:
         """Change the map, and remember the image patches of new landmarks."""

@@ -79,18 +79,17 @@ def compile_objects(backend: str) -> None:
         estimator.predict(features.stamp)
         estimator.update(measured)
         landmark = np.where(np.isin(np.arange(len(features)), still[old]), ids, -1)
-        detector.classify(features, estimator.estimate(landmarks=False), landmark)
-        detector.update(estimator, features)
+        detector.step(estimator, features, estimator.estimate(landmarks=False), landmark)
         estimator.add(new)
         known = np.union1d(known, new.ids)
 
 
 def _cold() -> bool:
     """Whether Numba's cache lacks the kernel of moving objects that takes longest to compile."""
-    from slam.objects.scene_kernels import window_tests
+    from slam.objects.scene_kernels import groups_apart
 
-    folder = window_tests.stats.cache_path
-    return folder is not None and not any(Path(folder).glob("scene_kernels.window_tests-*.nbi"))
+    folder = groups_apart.stats.cache_path
+    return folder is not None and not any(Path(folder).glob("scene_kernels.groups_apart-*.nbi"))
 
 
 def _end_with_parent() -> None:

@@ -18,7 +18,7 @@ from slam.objects.existence import EVEN, when_measured, when_missed
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
-_CONVERGED = 4  # frames after which the estimated velocity is better than that with which the body was found
+_YOUNG = 4  # frames in which a body moves as it did when it was found
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
@@ -37,8 +37,6 @@ class Body:
         history: poses at the window's slots (W, 4, 4).
         known: at which slots there is a measured one (W,).
         T_before: pose at the previous frame.
-        T_found, T_reported: its estimated poses when the estimate began, and at the previous frame.
-        T_body_estimate: takes coordinates of the estimate's body frame to those of this one (4, 4).
         lower, upper: extent of its points (3,), body coordinates.
         size: what it measures across at least [m].
         reach: its points lie no farther from its origin [m].
@@ -55,7 +53,6 @@ class Body:
         alike: number of frames in which it moved as an older body did, as a part of that would.
         age: number of frames since it was found.
         existence: probability that it exists, see `slam.objects.existence`.
-        refused: number of successive frames in which the estimate rejected all its measurements.
         reported: number of frames in which it was reported as measured.
         reported_unmeasured: number of frames in which it was reported though it was not measured.
         apart_from: id of the body of which it is a part with a motion of its own; None for none.
@@ -70,9 +67,6 @@ class Body:
     history: Array
     known: BoolArray
     T_before: Array
-    T_found: Array
-    T_reported: Array
-    T_body_estimate: Array
     lower: Array
     upper: Array
     size: float
@@ -90,7 +84,6 @@ class Body:
     alike: int = 0
     age: int = 0
     existence: float = EVEN
-    refused: int = 0
     measured_at: float = float("nan")
     reported: int = 0
     reported_unmeasured: int = 0
@@ -136,7 +129,7 @@ def new_body(
     T[:3, 3] = centre
     none = np.zeros(3)
     return Body(
-        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, T, T, np.eye(4), none, none,
+        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, none, none,
         size, np.inf, stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
     )  # fmt: skip
 
@@ -159,56 +152,40 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     )  # fmt: skip
 
 
-def from_estimate(body: Body, belief: BodyBelief, min_speed: float) -> Body:
-    """The body with its estimate.
-
-    A measured body keeps the pose that was fitted to its points here, as the estimate has a body frame and points of
-    its own. A body that was not measured moves as is predicted, once its velocity is well known.
-    """
-    estimate, new = belief.estimate, belief.since == belief.estimate.stamp
-    before = estimate if new or body.belief is None else body.belief.estimate
+def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_speed: float) -> Body:
+    """The body as it is estimated in the present frame."""
+    estimate = belief.estimate
     size = 0.5 * float(np.linalg.norm(body.upper - body.lower))
-    speed = float(np.linalg.norm(estimate.velocity[3:]) + size * np.linalg.norm(estimate.velocity[:3]))
     v, P = estimate.velocity, estimate.velocity_covariance
-    converged = body.seen > _CONVERGED
+    speed = float(np.linalg.norm(v[3:]) + size * np.linalg.norm(v[:3]))
     certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
-    T_estimate = estimate.T_world_object
-    stays = body.measured or not converged
-    T_body_estimate = inverse(body.T) @ T_estimate if stays else body.T_body_estimate
-    T = body.T if stays else np.asarray(T_estimate @ inverse(T_body_estimate), np.float64)
-    change = adjoint(T_body_estimate)
-    at_origin = np.concatenate([v[:3], v[3:] + np.cross(v[:3], T[:3, 3] - T_estimate[:3, 3])])
-    return replace(
-        body,
-        T=T,
-        T_body_estimate=T_body_estimate,
-        velocity=at_origin if converged else body.velocity,
-        velocity_covariance=estimate.velocity_covariance if converged else body.velocity_covariance,
-        covariance=change @ estimate.covariance @ change.T,
-        moving=not converged or (certain and speed > min_speed),
-        belief=belief,
-        moved=body.moved or belief.moved,
-        measured_at=estimate.stamp if estimate.measured else body.measured_at,
-        refused=body.refused + 1 if body.measured and not estimate.measured else 0,
-        T_found=estimate.T_world_object if new else body.T_found,
-        T_reported=before.T_world_object,
-    )
+    changes: dict[str, Any] = {}
+    if estimate.measured:
+        changes = {"seen_at": stamp, "measured_at": stamp, "seen": body.seen + 1, "missed": 0}
+    return body.placed(
+        estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
+        velocity_covariance=P, belief=belief, moved=body.moved or belief.moved,
+        moving=body.seen <= _YOUNG or (certain and speed > min_speed), **changes,
+    )  # fmt: skip
 
 
 def continued(body: Body, known: Body) -> Body:
-    """A new body that turns out to be a known one: it takes over that one's id and probability of existence.
+    """A new body that turns out to be a known one: it takes over that one's id, frame and probability of existence.
 
-    The estimate of it begins anew, and so does the evidence that it moves. Its body frame stays as predicted, but for a
+    The estimate of it begins anew, and so does the evidence that it moves. Its frame stays as predicted, but for a
     shift from the part seen before to the part seen now.
     """
-    shift = np.eye(4)
-    shift[:3, 3] = body.middle - known.middle
-    T_body_estimate = inverse(body.T) @ shift @ known.T @ known.T_body_estimate
+    frame = known.T.copy()
+    frame[:3, 3] += body.middle - known.middle
+    change = inverse(body.T) @ frame
+    turn = adjoint(inverse(change))
+    corners = transform(inverse(change), np.stack([body.lower, body.upper]))
     return replace(
-        body, id=known.id, T_body_estimate=T_body_estimate,
+        body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
+        covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
         proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
         reported=known.reported, reported_unmeasured=known.reported_unmeasured,
-        measured_at=known.measured_at, belief=None, refused=0,
+        measured_at=known.measured_at, belief=None,
     )  # fmt: skip
 
 

@@ -1,16 +1,10 @@
-"""The detector of moving objects: tracks all features, classifies which move, and keeps the bodies that they form.
-
-A step has two parts, called after the back end's update: `classify` says which features move, before any of them
-becomes a landmark; `update` estimates the bodies and reports them.
-"""
+"""The detector of moving objects: tracks all features, says which move, and estimates the bodies that they form."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import IndexArray, among, median
@@ -26,6 +20,7 @@ from slam.objects.bodies import (
     advanced,
     continued,
     hidden,
+    with_belief,
     with_evidence,
     with_extent,
 )
@@ -33,23 +28,22 @@ from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.candidates import Candidate, MovingTracks, follow_candidates
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import LAG, displacements, known_well
-from slam.objects.estimates import estimated
+from slam.objects.estimates import reported
 from slam.objects.estimator import FRAMES, BodyEstimator
 from slam.objects.first_frames import FirstSights, Places, moving_landmarks
 from slam.objects.following import follow
 from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
+from slam.objects.merging import merge
 from slam.objects.parts import moving_parts
 from slam.objects.proof import Way, with_frame
-from slam.objects.recovery import locate
+from slam.objects.recovery import located, observed
 from slam.objects.regions import Scene, classify_scene
 from slam.objects.revision import CorrectRows, revise_tracks
 from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_velocities, make_room, record
 
 NONE = np.zeros(0, np.intp)
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
-_MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
-_DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 _ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
 
 
@@ -67,32 +61,28 @@ class MovingObjectDetector:
         self.config = config
         self.sigma = models.pixel_sigma
         self.models = models.objects
-        self.bodies: dict[int, Body] = {}
-        self.tracks: Tracks | None = None
-        self._stamps = np.full(config.window, np.nan)
-        self._poses = np.tile(np.eye(4), (config.window, 1, 1))  # of the left camera in the window's frames
-        self._frame = -1
-        self._first = FirstSights.none()
+        self.slide = (models.objects.drift / rig.left.fu) ** 2  # [rad² / rad]
+        self._estimator = BodyEstimator(rig, models)
         self._next_track = 0
         self._next_body = 1
-        self._estimator = BodyEstimator(rig, models)
-        self._path: RecentPoses | None = None
-        self._estimate: Estimate | None = None
-        self._measuring: Array = np.zeros((0, 3))  # what measured the pose, in camera coordinates
-        self._candidates: list[Candidate] = []
-        self._pose_covariance: Array = np.zeros((6, 6))
-        self.suspects = np.zeros(0, np.int64)
+        self.restart()
 
     def restart(self) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
-        self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
-        self._stamps[:], self._frame = np.nan, -1
-        self._candidates, self._first, self._path = [], FirstSights.none(), None
+        self.bodies: dict[int, Body] = {}
+        self.tracks = Tracks.empty(0, self.config.window)
+        self.suspects = np.zeros(0, np.int64)
+        self._stamps = np.full(self.config.window, np.nan)
+        self._poses = np.tile(np.eye(4), (self.config.window, 1, 1))  # of the left camera in the window's frames
+        self._frame = -1
+        self._first = FirstSights.none()
+        self._path: RecentPoses | None = None
+        self._candidates: list[Candidate] = []
+        self._pose_covariance: Array = np.zeros((6, 6))
 
     def revise(self, correct: CorrectRows) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
-        if self.tracks is not None:
-            revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, correct)
+        revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, correct)
 
     def newly_moving(
         self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
@@ -105,25 +95,25 @@ class MovingObjectDetector:
         self._first = self._first.after(ids, places, np.maximum(now - ages, 0))
         return ids[moving_landmarks(self.rig, T_world_left, self._first.of(ids), pixels, now, self.sigma, self.config)]
 
-    # ------------------------------------------------------------------------------------------- a step, first part
-
-    def classify(
-        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, still: IndexArray = NONE
-    ) -> MotionLabels:
+    def step(
+        self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,
+        still: IndexArray = NONE,
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Follow all tracks into this frame, test them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
         self._poses[self.slot], self._pose_covariance = T_world_left, estimate.covariance
-        self._estimate, self._measuring = estimate, local[(landmark >= 0) & np.isfinite(local[:, 0])]
+        measuring = local[(landmark >= 0) & np.isfinite(local[:, 0])]
+        self._path = with_estimate(self._path, estimate, self.rig, self.sigma, measuring, FRAMES + 1)
+        cameras = recent_poses(backend, FRAMES + 1, self._path, estimate.covariance)
         self._advance_bodies(times)
         tracks = self.tracks
-        assert tracks is not None
         follow(
             tracks, self.bodies, self._candidates, T_world_left, features, local, self._dt(times), self.rig, self.sigma,
             self.config,
         )  # fmt: skip
-        self._measure(tracks, features, local, T_world_left)
+        self._measure(tracks, features, local, cameras)
         tracks.assign_landmarks(landmark)
         tracks.still[:] = tracks.seen & among(max(len(features), 1), still)[tracks.row]
         self._fit(tracks, times)
@@ -132,15 +122,17 @@ class MovingObjectDetector:
         )
         self._change_members(initializer)
         scene = self._find_bodies(initializer, T_world_left)
-        self._follow_candidates(initializer, T_world_left)
+        if self.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.objects.candidates`
+            self._follow_candidates(initializer, T_world_left)
         self._prove(scene)
+        self._begin_estimates(features, cameras)
         self._begin_tracks(features, local, T_world_left, landmark)
-        return self._motion_labels(features)
+        return self._motion_labels(features), reported(self.bodies, tracks, self.config)
 
     def _begin(self, features: StereoFeatures) -> Array:
         """Move on by a frame; times of the window's slots less the present (W,) [s], zero where there is none yet."""
         dimensions = features.descriptors.shape[1]
-        if self.tracks is None or self.tracks.descriptors.shape[1] != dimensions:  # of frames without features
+        if self.tracks.descriptors.shape[1] != dimensions:  # of frames without features
             self.tracks = Tracks.empty(dimensions, self.config.window)
         self._frame += 1
         self._stamps[self.slot] = features.stamp
@@ -165,29 +157,28 @@ class MovingObjectDetector:
         for body in list(self.bodies.values()):
             fresh = (body.seen + 0.5) * dt < _ESTABLISHED  # to the nearest frame
             if now - body.seen_at > self.config.forget_after or (fresh and body.missed >= _PATIENCE + body.seen):
-                self._forget(body.id)
+                del self.bodies[body.id]
+                self.tracks.give_up(np.flatnonzero(self.tracks.body == body.id))
             else:
                 self.bodies[body.id] = advanced(body, dt, self.slot, self.models)
 
-    def _forget(self, id: int) -> None:
-        assert self.tracks is not None
-        del self.bodies[id]
-        self.tracks.give_up(np.flatnonzero(self.tracks.body == id))
-
     # ------------------------------------------------------------------------------------------- measuring
 
-    def _measure(self, tracks: Tracks, features: StereoFeatures, local: Array, T_world_left: Array) -> None:
-        """Locate the bodies by their members, and add this frame's measurements to the tracks, in world coordinates."""
-        c = self.config
+    def _measure(self, tracks: Tracks, features: StereoFeatures, local: Array, cameras: RecentPoses) -> None:
+        """Estimate the bodies, and add this frame's measurements to the tracks, in world coordinates."""
+        c, T_world_left = self.config, cameras.poses[-1]
         for body in list(self.bodies.values()):
             mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
             front = (other for other in self.bodies.values() if other.proven and other.id != body.id)
             tracks.row[mine[hidden(front, T_world_left[:3, 3], tracks.position[mine])]] = -1
-            located = locate(body, tracks, features, local, T_world_left, self.rig, self.sigma, c, self._frame)
-            if located is not None:
-                times_seen = body.seen + 1
-                body = body.placed(located, self.slot, True, seen_at=features.stamp, seen=times_seen, missed=0)
-                self.bodies[body.id] = body
+            belief = located(
+                body, tracks, features, local, cameras, self._estimator, self.rig, self.sigma, c, self._frame
+            )
+            if belief is None or not self.models.known(belief.estimate):  # it begins anew once it is measured again
+                body = replace(body, belief=None)
+            else:
+                body = with_belief(body, belief, self.slot, features.stamp, c.min_speed)
+            self.bodies[body.id] = body
             mine = tracks.body == body.id
             tracks.position[mine] = transform(body.T, tracks.local[mine])
         make_room(tracks, self.slot)
@@ -208,14 +199,13 @@ class MovingObjectDetector:
     def _prove(self, scene: Scene) -> None:
         """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
         c, tracks = self.config, self.tracks
-        assert tracks is not None
         ages = (self.slot - np.arange(c.window)) % c.window
         for body in list(self.bodies.values()):
             if not body.measured:
                 continue
             members = np.flatnonzero((tracks.body == body.id) & tracks.seen)
             members = members[tracks.count(members) >= c.min_frames - 1]
-            moved = displacements(tracks, members, ages, self._poses[self.slot, :3, 3])
+            moved = displacements(tracks, members, ages, self._poses[:, :3, 3], self.slide)
             way = Way.of(body, self._stamps, self._poses, self.rig, self.sigma)
             evidence, proven = with_frame(body.evidence, moved, scene, way, body.far)
             body = replace(body, evidence=evidence, proven=body.proven or proven)
@@ -225,7 +215,6 @@ class MovingObjectDetector:
 
     def _drop(self, body: Body) -> None:
         """Let a body's tracks go; they need proof to become members of another one."""
-        assert self.tracks is not None
         membership.remove_members(self.tracks, np.flatnonzero(self.tracks.body == body.id), body)
         del self.bodies[body.id]
 
@@ -235,11 +224,10 @@ class MovingObjectDetector:
         Returns the still scene.
         """
         c, tracks, times = self.config, self.tracks, initializer.times
-        assert tracks is not None
         free = np.flatnonzero(tracks.seen & (tracks.body < 0))
         rows, place = known_well(tracks, free, T_world_left, c.min_frames)
         ages = (self.slot - np.arange(c.window)) % c.window
-        moved = displacements(tracks, rows, ages, T_world_left[:3, 3])
+        moved = displacements(tracks, rows, ages, self._poses[:, :3, 3], self.slide)
         scene = classify_scene(moved, place, c.suspect, c.min_support)
         parts = moving_parts(self.bodies, tracks, ages, T_world_left, self._dt(times), c)
         tracks.doubtful[:] = False
@@ -282,12 +270,12 @@ class MovingObjectDetector:
             far: whether they were followed for farther than they are wide already.
         """
         tracks, members = self.tracks, group.members
-        assert tracks is not None
         body = replace(initializer.body(self._next_body, tracks, group), far=far)
         body = replace(self._again(body, whole), apart_from=whole)
         self.bodies[body.id] = body
         self._next_body = max(self._next_body, body.id + 1)
         membership.add_members(body, tracks, members, sure=True)
+        self.bodies[body.id] = with_extent(body, tracks.local[members])
 
     def _again(self, body: Body, whole: int | None) -> Body:
         """A new body, or a known one that was out of view and reappears: that keeps its id, but not its points.
@@ -295,7 +283,6 @@ class MovingObjectDetector:
         A part of the body `whole` is compared with earlier parts of that body only.
         """
         tracks, known = self.tracks, None
-        assert tracks is not None
         parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
         known = membership.reappeared(parts, body)
         if known is None:
@@ -303,19 +290,9 @@ class MovingObjectDetector:
         tracks.give_up(np.flatnonzero(tracks.body == known.id))
         return continued(body, known)
 
-    def _in_place_of(self, known: Body, body: Body, mine: NDArray[np.intp]) -> Body:
-        """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
-        tracks = self.tracks
-        assert tracks is not None
-        tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
-        grown = continued(body, known)
-        membership.add_members(grown, tracks, mine, sure=True)
-        return grown
-
     def _follow_candidates(self, initializer: BodyInitializer, T_world_left: Array) -> None:
         """Follow the regions that may move; one that has moved for certain becomes a body."""
         c, tracks, times = self.config, self.tracks, initializer.times
-        assert tracks is not None
         rows = np.flatnonzero(tracks.seen & (tracks.body < 0) & ~tracks.still)
         rows = rows[tracks.count(rows) >= c.min_frames - 1]
         motion = constant_velocity(tracks, rows, times, c.max_speed)
@@ -343,7 +320,6 @@ class MovingObjectDetector:
     def _change_members(self, initializer: BodyInitializer) -> None:
         """Update the bodies' members; bodies that do not move are dropped."""
         tracks = self.tracks
-        assert tracks is not None
         measured = {body.id: body for body in self.bodies.values() if body.measured}
         resolved = {body.id for body in self.bodies.values() if initializer.resolves(body.T[:3, 3])}
         gains = membership.update_members(measured, resolved, tracks, self.slot, self.config)
@@ -355,56 +331,11 @@ class MovingObjectDetector:
             elif id in gains:
                 mine = np.flatnonzero((tracks.body == id) & tracks.sure)
                 self.bodies[id] = with_extent(body, tracks.local[mine])
-        self._merge()
-
-    def _merge(self) -> None:
-        """Merge bodies that move as an older one does: young ones at once, others only if that lasts.
-
-        It has to last because the parts of an articulated body move alike now and then. If fewer members of the older
-        body are seen, that one is merged into the younger.
-        """
-        tracks = self.tracks
-        assert tracks is not None
-        for id in sorted(self.bodies, reverse=True):
-            body = self.bodies.get(id)  # it may have taken the place of another
-            if body is not None and body.measured:
-                mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
-                older = {id: b for id, b in self.bodies.items() if id < body.id and id not in body.distinct}
-                whole = membership.body_around(older, tracks, mine, body)
-                alike = body.alike + 1 if whole is not None else 0
-                if alike != body.alike:
-                    self.bodies[body.id] = replace(body, alike=alike)
-                young = body.seen < _MERGES and (whole is None or whole.id != body.apart_from)
-                if whole is not None and (young or alike > _MERGES):
-                    whole = self.bodies[whole.id] = membership.with_reach(whole, tracks, mine)
-                    membership.add_members(whole, tracks, mine, sure=True)
-                    self._forget(body.id)
-                elif whole is None and body.seen < _MERGES:
-                    self._outgrow(body, len(mine), older)
-
-    def _outgrow(self, body: Body, count: int, older: Mapping[int, Body]) -> None:
-        """Let a young body, of which `count` members are seen, replace an older one with the same motion."""
-        tracks = self.tracks
-        assert tracks is not None
-        for known in older.values():
-            theirs = np.flatnonzero((tracks.body == known.id) & tracks.seen)
-            fewer = known.measured and len(theirs) < count and known.id != body.apart_from
-            if not fewer or not membership.moves_with(body, tracks, theirs):
-                continue
-            mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
-            distinctness = membership.distinctness(body, mine, known, theirs, tracks)
-            if distinctness > _DISTINCT:
-                body = self.bodies[body.id] = replace(body, distinct=body.distinct | {known.id})
-            elif distinctness < 1.0:
-                self.bodies[known.id] = self._in_place_of(known, body, theirs)
-                tracks.body[tracks.body == body.id] = known.id
-                del self.bodies[body.id]
-                return
+        merge(self.bodies, tracks)
 
     def _begin_tracks(self, features: StereoFeatures, local: Array, T_world_left: Array, landmark: IdArray) -> None:
         """New tracks at stereo features that continue none; give up tracks not seen for long."""
         tracks = self.tracks
-        assert tracks is not None
         tracks.give_up(np.flatnonzero((tracks.missed > self.config.patience) & (tracks.body < 0)))
         taken = among(len(features), tracks.row[tracks.seen])
         rows = np.flatnonzero(~taken & np.isfinite(local[:, 0]))
@@ -419,7 +350,6 @@ class MovingObjectDetector:
 
     def _motion_labels(self, features: StereoFeatures) -> MotionLabels:
         tracks = self.tracks
-        assert tracks is not None
         on, near = membership.tracks_on_bodies(self.bodies, tracks, self.config.margin)
         doubtful = np.flatnonzero(tracks.seen & tracks.doubtful)
         proven = np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
@@ -430,11 +360,12 @@ class MovingObjectDetector:
         undecided[tracks.row[near]] = undecided[tracks.row[doubtful]] = True
         return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks[landmarks >= 0])
 
-    # ------------------------------------------------------------------------------------------- a step, second part
-
-    def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
-        """Estimate the bodies, and report them."""
-        assert self.tracks is not None and self._estimate is not None
-        self._path = with_estimate(self._path, self._estimate, self.rig, self.sigma, self._measuring, FRAMES + 1)
-        cameras = recent_poses(backend, FRAMES + 1, self._path, self._estimate.covariance)
-        return estimated(self.bodies, self.tracks, self._estimator, features, cameras, self.config)
+    def _begin_estimates(self, features: StereoFeatures, cameras: RecentPoses) -> None:
+        """Begin the estimates of bodies that have none."""
+        tracks = self.tracks
+        for id, body in list(self.bodies.items()):
+            if body.belief is None and body.measured:
+                mine = np.flatnonzero((tracks.body == id) & tracks.seen)
+                seen = observed(body, tracks, mine, tracks.row[mine], features, body.T)
+                belief = self._estimator.updated(None, id, seen, cameras)
+                self.bodies[id] = replace(body, belief=belief, measured_at=features.stamp)

@@ -34,7 +34,9 @@ class Displacements:
     lag: Array
 
 
-def displacements(tracks: Tracks, rows: NDArray[np.intp], ages: NDArray[np.intp], camera: Array) -> Displacements:
+def displacements(
+    tracks: Tracks, rows: NDArray[np.intp], ages: NDArray[np.intp], centres: Array, slide: float
+) -> Displacements:  # fmt: skip
     """Displacements of tracks from older to recent frames.
 
     The recent frames are the last five, of short tracks the later half.
@@ -43,11 +45,15 @@ def displacements(tracks: Tracks, rows: NDArray[np.intp], ages: NDArray[np.intp]
         tracks: all tracks.
         rows: which of them.
         ages: of the window's slots in frames (W,).
-        camera: position (3,) of the left camera.
+        centres: positions of the left camera by slot (W, 3).
+        slide: variance of a feature's direction with the angle from which it is seen [rad].
     """
     t = tracks
-    d, W, lag = displaced(t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, rows, ages, RECENT)
-    return Displacements(t.position[rows] - camera, d, W, lag)
+    rays = t.position[rows] - centres[int(np.argmin(ages))]
+    d, W, lag = displaced(
+        t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, rows, ages, RECENT, rays, centres, slide
+    )  # fmt: skip
+    return Displacements(rays, d, W, lag)
 
 
 def known_well(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
-from slam.data import BoolArray, IdArray
+from slam.data import BoolArray
 from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
@@ -31,7 +31,7 @@ from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, times_vectors
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
-_PART, _PART_EXPLAINED = 2.0, 0.05  # the same for what was found before of a body: margin, and share of χ² left
+_PART_EXPLAINED = 0.05  # share of χ² that the motion of a body leaves of what was found of it before
 _FREEDOM = 6.0  # fixed: of a body's pose in every frame
 PROBATION = 12  #: frames in which a body must have moved for certain, and is not told from another one
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join, and
@@ -199,10 +199,11 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
 
 
-def count_rejections(tracks: Tracks | None, ids: IdArray) -> None:
-    """Count members whose observations the back end rejected as misfits."""
-    if tracks is not None and len(ids):
-        tracks.misfit[np.isin(tracks.ids, ids)] += 1
+def take_to(tracks: Tracks, rows: NDArray[np.intp], change: Array) -> None:
+    """Take the points of members to another frame of their body, by `change` (4, 4), in place."""
+    R = change[:3, :3]
+    tracks.local[rows] = transform(change, tracks.local[rows])
+    tracks.local_information[rows] = R @ tracks.local_information[rows] @ R.T
 
 
 def tracks_on_bodies(
@@ -308,13 +309,12 @@ def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
 
 
 def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
-    """Whether the members `rows` of another body, near this one, have moved with it all the time.
+    """Whether the members `rows` of another body have moved with this one all the time.
 
     The test is much stricter than that of `body_around`: nearly all that the still world leaves unexplained must be
     explained.
     """
-    near = _distances(replace(whole, reach=np.inf), tracks, rows, _PART) < _NEAR
-    if not len(rows) or 2 * near.sum() <= len(rows):
+    if not len(rows):
         return False
     points, A, known = in_body_axes(whole, tracks, rows)
     still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())

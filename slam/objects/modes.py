@@ -21,7 +21,7 @@ from slam.objects.revision import CorrectRows
 class ObjectDetector(Protocol):
     """What the system asks of a detector of moving objects, in every step.
 
-    `newly_moving` and `suspects` are asked before the back end's update, `classify` and `update` after it.
+    `newly_moving` and `suspects` are asked before the back end's update, `step` comes after it.
     """
 
     @property
@@ -57,21 +57,19 @@ class ObjectDetector(Protocol):
         """
         ...
 
-    def classify(
-        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, still: IndexArray = ...
-    ) -> MotionLabels:
-        """Say which features move, before any of them becomes a landmark.
+    def step(
+        self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,
+        still: IndexArray = ...,
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
+        """Say which features move, before any of them becomes a landmark, and report the bodies.
 
         Args:
+            backend: gives the camera's last poses with their joint covariance.
             features: of the frame.
             estimate: the camera's pose after the update.
             landmark: id of the landmark that each feature was matched to (N,), -1 for none.
             still: rows of features that stay at their pixels while the camera stands.
         """
-        ...
-
-    def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
-        """Estimate the bodies, given the last poses of the back end with their joint covariance, and report them."""
         ...
 
 
@@ -93,14 +91,10 @@ class NoDetector:
     def revise(self, correct: CorrectRows) -> None:
         """There is nothing to revise."""
 
-    def classify(self, *_: object) -> MotionLabels:
+    def step(self, *_: object) -> tuple[MotionLabels, tuple[MovingObject, ...]]:
         """Nothing moves, nothing is undecided."""
         none = np.zeros(0, np.intp)
-        return MotionLabels(none, none, np.zeros(0, np.int64))
-
-    def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
-        """No objects."""
-        return ()
+        return MotionLabels(none, none, np.zeros(0, np.int64)), ()
 
 
 def detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> ObjectDetector:

@@ -69,6 +69,7 @@ def parts_of(
     d, W, lag = displaced(
         A, np.where(known[..., None], points, 0.0), np.where(known, tracks.dof[rows], 0).astype(np.int8),
         np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.arange(n), ages, RECENT,
+        np.ones((n, 3)), np.zeros((len(ages), 3)), 0.0,
     )  # fmt: skip
     middle = (tracks.position[rows] - body.T[:3, 3]) @ body.T[:3, :3]
     return classify_scene(Displacements(middle, d, W, lag), place, test, support).groups

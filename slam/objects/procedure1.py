@@ -271,8 +271,13 @@ class Procedure1Detector:
     def revise(self, correct: CorrectRows) -> None:
         """Nothing measured is kept."""
 
-    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, *_: object) -> MotionLabels:
-        """Recognise the object's features and find its motion; no other feature is classified."""
+    def step(
+        self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray, *_: object
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
+        """Recognise the object's features and find its motion; no other feature is classified.
+
+        The object is reported where it was measured in this frame; the back end is not asked.
+        """
         c, d = self.config, self.database
         if d.descriptors.shape[1] != features.descriptors.shape[1]:
             raise ConfigurationError(
@@ -292,10 +297,9 @@ class Procedure1Detector:
             noise = R @ self.rig.triangulation_covariance(local[at], self.sigma) @ R.T
             self._covariance = motion_covariance(points[at], d.points[self.motion.database], d.origin, noise)
         moved = np.unique(landmark[rows][landmark[rows] >= 0])
-        return MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved)
+        return MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved), self._reported(features)
 
-    def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
-        """The object, where it was measured in this frame; the back end is not asked."""
+    def _reported(self, features: StereoFeatures) -> tuple[MovingObject, ...]:
         if self.motion.reason:
             return ()
         d = self.database

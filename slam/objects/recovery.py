@@ -1,64 +1,68 @@
-"""Where a body is in this frame: a robust rigid fit of its points, and the search for it where it was lost."""
+"""Where a body is in this frame: by its estimate, and by the search for it where it was lost."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, StereoFeatures
+from slam.data import BoolArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among
 from slam.geometry.pnp import find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, inverse, transform
+from slam.geometry.se3 import Array, inverse, transform
+from slam.object_data import ObjectObservations
+from slam.objects.belief import BodyBelief
 from slam.objects.bodies import Body
-from slam.objects.body_kernels import agreed_correction
 from slam.objects.config import ObjectsConfig
+from slam.objects.estimator import BodyEstimator
 from slam.objects.matching import match_far
 from slam.objects.points import MIN_POINTS
-from slam.objects.tracks import AGREES, LEAST_INFORMATION, Tracks
+from slam.objects.tracks import AGREES, Tracks
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # cost: poses tried for a body that is found again
-_LEAST_PREDICTED = 2  # points that must agree with the predicted motion
 _DEPTHS = 0.2  # share of the depth by which stereo may be off
 
 
-def locate(
-    body: Body, tracks: Tracks, features: StereoFeatures, measured: Array, T_world_left: Array, rig: StereoRig,
-    sigma: float, config: ObjectsConfig, seed: int,
-) -> Array | None:  # fmt: skip
-    """The body's pose T_world_object (4, 4) by a fit to its tracks that are seen, or found again.
+def located(
+    body: Body, tracks: Tracks, features: StereoFeatures, measured: Array, cameras: RecentPoses,
+    estimator: BodyEstimator, rig: StereoRig, sigma: float, config: ObjectsConfig, seed: int,
+) -> BodyBelief | None:  # fmt: skip
+    """What is believed of a body after this frame, by its tracks that are seen, or found again; None for nothing.
 
     Tracks that disagree are counted as misfits, in place; they are followed on, as they may lie on a part that moves
-    otherwise.
-
-    Reprojection errors weigh the points by the noise of the stereo pair. None where too few points agree. `measured`
-    are the features' points in camera coordinates (N, 3), NaN where there is no depth.
+    otherwise. `measured` are the features' points in camera coordinates (N, 3), NaN where there is no depth.
     """
     members = np.flatnonzero(tracks.body == body.id)
     mine = members[tracks.seen[members]]
     rows = tracks.row[mine]
-    found = _predicted(body, tracks, mine, rows, measured, T_world_left, rig, sigma)
-    if found is None:
-        found = _fit(body, tracks, mine, rows, features, T_world_left, rig, sigma, seed)
-    if found is None or 2 * found[1].sum() < len(mine):
-        wide, wide_rows = _by_descriptors(body, tracks, members, features, measured, T_world_left, config)
-        again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed)
-        if (
-            again is not None
-            and (found is None or again[1].sum() > found[1].sum())
-            and _is_within_reach(body, T_world_left @ inverse(again[0]), T_world_left, rig, sigma)
-        ):
-            found, mine, rows = again, wide, wide_rows
+    T_world_left = cameras.poses[-1]
+
+    def estimated(mine: NDArray[np.intp], rows: NDArray[np.intp], T: Array | None = None) -> BodyBelief | None:
+        return estimator.updated(body.belief, body.id, observed(body, tracks, mine, rows, features, T), cameras)
+
+    def agreeing(belief: BodyBelief | None) -> int:
+        return len(belief.estimate.used) if belief is not None and belief.estimate.measured else 0
+
+    asked = slice(None) if _is_expected(body) else slice(0)  # else any two points agree with one of its poses
+    belief = estimated(mine[asked], rows[asked])
+    if 2 * agreeing(belief) < len(mine) or not len(mine):
+        alike = _by_descriptors(body, tracks, members, features, measured, T_world_left, config)
+        for some, theirs in ((mine, rows), alike):
+            fit = _fit(body, tracks, some, theirs, features, T_world_left, rig, sigma, seed)
+            if fit is None or fit[1].sum() <= agreeing(belief):
+                continue
+            T = np.asarray(T_world_left @ inverse(fit[0]))
+            if not _is_within_reach(body, T, T_world_left, rig, sigma):
+                continue
+            again = estimated(some[fit[1]], theirs[fit[1]], T)
+            if agreeing(again) > agreeing(belief):
+                belief, mine, rows = again, some, theirs
     followed = tracks.row[members]
     tracks.row[members] = -1
-    if found is None:
-        return None
-    T_body_left, agrees = found
-    T = np.asarray(T_world_left @ inverse(T_body_left))
-    depth = float(np.linalg.norm(T[:3, 3] - T_world_left[:3, 3]))
-    if np.linalg.norm(T[:3, 3] - body.T[:3, 3]) > _reach(body, features.stamp, config) + _DEPTHS * depth:
-        return None
+    if belief is None or not belief.estimate.measured:
+        return belief
+    agrees = np.isin(tracks.ids[mine], belief.estimate.used)
     taken = among(len(features), tracks.row[tracks.seen])
     tracks.row[members] = np.where(taken[followed], -1, followed)  # those that were not seen stay at −1
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
@@ -69,7 +73,20 @@ def locate(
     tracks.give_up(free[measured_now[tracks.row[free]]])
     tracks.row[good], tracks.missed[good] = matched, 0
     tracks.descriptors[good] = features.descriptors[matched]
-    return T
+    return belief
+
+
+def observed(
+    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], features: StereoFeatures,
+    T: Array | None = None,
+) -> ObjectObservations:  # fmt: skip
+    """A body's tracks (K,) as the features of these rows, with a guess of its pose (4, 4) where there is one."""
+    order = np.argsort(tracks.ids[mine])
+    rows = rows[order]
+    return ObjectObservations(
+        body.id, tracks.ids[mine[order]], features.uv_left[rows], features.uv_right[rows], T, body.velocity,
+        np.sqrt(body.velocity_covariance.diagonal()),
+    )  # fmt: skip
 
 
 def _is_within_reach(body: Body, T: Array, T_world_left: Array, rig: StereoRig, sigma: float) -> bool:
@@ -101,33 +118,6 @@ def _fit(
     fit = find_consensus(rig, tracks.local[mine], z, guess, _SIGMAS * sigma, _HYPOTHESES, seed)
     stereo = np.isfinite(z[fit.inliers, 2])
     return None if stereo.sum() < MIN_POINTS else (fit.T_world_left, fit.inliers)
-
-
-def _predicted(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], measured: Array, T_world_left: Array,
-    rig: StereoRig, sigma: float,
-) -> tuple[Array, BoolArray] | None:  # fmt: skip
-    """The same by the body's predicted pose and its points: what these do not say of it stays as predicted.
-
-    See `slam.objects.body_kernels.agreed_correction`. At least two points must agree, and the body must be expected
-    to within what it measures across: else any two agree with one of its poses.
-    """
-    local = measured[rows]
-    deep = np.flatnonzero(np.isfinite(local).all(axis=1))
-    if len(deep) < _LEAST_PREDICTED or not _is_expected(body):
-        return None
-    local, known = local[deep], mine[deep]
-    T_body_left = inverse(body.T) @ T_world_left
-    _, J = rig.project_stereo(local)
-    change, agrees, enough = agreed_correction(
-        tracks.local[known], tracks.local_information[known], local, J, T_body_left[:3, :3], T_body_left[:3, 3],
-        body.covariance, np.linalg.inv(body.covariance), sigma, LEAST_INFORMATION, AGREES, _LEAST_PREDICTED,
-    )  # fmt: skip
-    if not enough:
-        return None
-    which = np.zeros(len(rows), bool)
-    which[deep[agrees]] = True
-    return inverse(body.T @ exp(change)) @ T_world_left, which
 
 
 def _by_descriptors(

@@ -8,39 +8,27 @@ says and the one that the rest says are compared with the covariance of both,
 
     (ξ_w − ξ_r)ᵀ (Λ_w⁻¹ + Λ_r⁻¹)⁻¹ (ξ_w − ξ_r)  ~  χ²(6),
 
-Λ being sums of ``Jᵀ W J`` over the tracks. It matters if a body fills most of the near view: then the camera's
+Λ being sums of ``Jᵀ W J`` over the tracks. The χ² of a track is ``dᵀ W d − 2 ηᵀ ξ + ξᵀ Λ ξ`` with ``η = Jᵀ W d``; J
+grows with the lag, so that ξ is a motion by frame. It matters if a body fills most of the near view: then the camera's
 estimated pose follows the body, and the still world seems to move.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.chi_square import chi_square_limit
-from slam.data import BoolArray
-from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, hat
 from slam.objects import scene_kernels as kernels
 from slam.objects.displacements import Displacements
 from slam.objects.tracks import times_vectors
 
-_PULL = 16.0  # no track brings more χ² than this: single false ones find no company
-_ROUNDS = (3, 2)  # numerics: of reweighting: Huber's first, which has one minimum, then a sharper one
-_LARGEST = 0.4  # share of all tracks that a body may have: the still world has most
-_PRIOR = np.array([1e-4] * 3 + [1e-6] * 3)  # keeps Λ of nearly collinear tracks invertible [1/rad², 1/m²]
-_FITS = 14.2  # derived: χ²(3) at 99.7 % of a member and its group's motion
-_BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
-_BETTER_AROUND = 6.0  # where it lies outside the window
-_EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
 _TAIL = 3.0  # tracks; see `limit`
-_MEDIAN = chi_square_limit(3, 0.5)  # of χ²(3), and
-_UPPER_QUARTILE = chi_square_limit(3, 0.75)  # its upper quartile
+_UPPER_QUARTILE = chi_square_limit(3, 0.75)  # of χ²(3)
 _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
-_AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
-_MOST = 20  # cost: windows looked into for the next group
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,25 +85,32 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
     """
     n = len(moved.d)
     if n < 3 * support:
-        return Scene([], np.zeros(n), np.zeros(6), np.diag(1.0 / _PRIOR))
-    problem = _Problem.of(moved)
-    windows = _Windows.over(place, support)
-    rest: BoolArray = np.ones(n, bool)
-    groups: list[Group] = []
-    while True:
-        alone = problem.squares(problem.common_motion(rest))
-        scale = max(least_scale, median(alone[rest]) / _MEDIAN)
-        alone = alone / scale
-        group = _next_group(problem, windows, place, alone, scale, rest, test, support)
-        if group is not None:
-            groups.append(group)
-            rest[group.members] = False
-        if group is None or rest.sum() < n / 3:
-            break
+        return Scene([], np.zeros(n), np.zeros(6), np.diag(1.0 / kernels.PRIOR))
+    L, eta, dWd = kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag)
+    windows = kernels.full_windows(place, _SIZES, support)
+    asked = limit(test, np.arange(n + 1, dtype=np.intp))
+    group, values, alone, common, scale = kernels.groups_apart(
+        L, eta, dWd, place, *windows, asked, support, least_scale
+    )  # fmt: skip
+    rest = group < 0
     heavier = tail(alone[rest])  # of what is in no group: before, other groups would be part of it
-    groups = [replace(group, test=group.test / heavier) for group in groups]
-    groups = [group for group in groups if group.test > limit(test, len(group.members))]
-    return Scene(groups, alone, problem.common_motion(rest), scale * heavier * problem.covariance(rest))
+    found = [(np.flatnonzero(group == k), value / heavier) for k, value in enumerate(values.tolist())]
+    groups = [
+        Group(members, value, _mean_gap(moved, members, common))
+        for members, value in found
+        if value > limit(test, len(members))
+    ]
+    information = np.zeros((6, 6))
+    information[np.tril_indices(6)] = L[rest].sum(axis=0)
+    information += np.tril(information, -1).T + np.diag(kernels.PRIOR)
+    return Scene(groups, alone, common, scale * heavier * np.linalg.inv(information))
+
+
+def _mean_gap(moved: Displacements, rows: NDArray[np.intp], common: Array) -> float:
+    """How far tracks went against a common motion, in the weighted mean [m]."""
+    W = moved.W[rows]
+    gap = moved.d[rows] - moved.lag[rows, None] * (moved.points[rows] @ hat(common[:3]).T + common[3:])
+    return float(np.linalg.norm(np.linalg.solve(W.sum(axis=0), times_vectors(W, gap).sum(axis=0))))
 
 
 def tail(alone: Array) -> float:
@@ -125,125 +120,3 @@ def tail(alone: Array) -> float:
     of any size. Where that is so in the whole scene, small groups of such tracks agree by chance.
     """
     return max(1.0, float(np.quantile(alone, 0.75)) / _UPPER_QUARTILE) if len(alone) else 1.0
-
-
-def _next_group(
-    problem: _Problem, windows: _Windows, place: Array, alone: Array, scale: float, rest: BoolArray, test: float,
-    support: int,
-) -> Group | None:  # fmt: skip
-    """The group in the clearest window whose tracks hold together; None where there is none."""
-    doubted = ~rest
-    for window, value in _clearest(windows, problem, alone, scale, rest, test, support):
-        seeds = windows.inside(window, len(rest)) & ~doubted
-        if seeds.sum() < support:
-            continue
-        common = problem.common_motion(rest & ~seeds)
-        near = rest & windows.around(window, place)
-        members = _members(problem, seeds, near, problem.squares(common) / scale, scale, support)
-        if len(members) >= support:
-            return Group(members, value, problem.mean_gap(members, common))
-        doubted |= seeds
-    return None
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Displacements as a linear problem in a common motion ξ = [θ, ρ] (6,): each track's normal equations.
-
-    The χ² of a track is ``dᵀ W d − 2 ηᵀ ξ + ξᵀ Λ ξ``, with ``Λ = Jᵀ W J`` (N, 21: the lower triangle), ``η = Jᵀ W d``
-    (N, 6). The motion is by frame, so that J grows with the lag.
-    """
-
-    moved: Displacements
-    L: Array
-    eta: Array
-    dWd: Array
-
-    @classmethod
-    def of(cls, moved: Displacements) -> _Problem:
-        """Of displacements."""
-        return cls(moved, *kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag))
-
-    def common_motion(self, rows: BoolArray) -> Array:
-        """The motion (6,) on which tracks agree, by robust least squares."""
-        return np.asarray(kernels.common_motion(self.L, self.eta, self.dWd, rows, _PRIOR, _PULL, *_ROUNDS))
-
-    def covariance(self, rows: BoolArray) -> Array:
-        """Covariance (6, 6) of the common motion of some tracks."""
-        information = np.zeros((6, 6))
-        information[np.tril_indices(6)] = self.L[rows].sum(axis=0)
-        information += np.tril(information, -1).T + np.diag(_PRIOR)
-        return np.linalg.inv(information)
-
-    def squares(self, common: Array) -> Array:
-        """χ²(3) of every displacement (N,) against a common motion."""
-        return np.asarray(kernels.squares_against(self.L, self.eta, self.dWd, common))
-
-    def mean_gap(self, rows: NDArray[np.intp], common: Array) -> float:
-        """How far tracks went against a common motion, in the weighted mean [m]."""
-        moved, W = self.moved, self.moved.W[rows]
-        shift = moved.points[rows] @ hat(common[:3]).T + common[3:]
-        gap = moved.d[rows] - moved.lag[rows, None] * shift
-        mean = np.linalg.solve(W.sum(axis=0), times_vectors(W, gap).sum(axis=0))
-        return float(np.linalg.norm(mean))
-
-
-@dataclass(frozen=True, eq=False)
-class _Windows:
-    """Windows of directions and depths with enough tracks.
-
-    Attributes:
-        starts: where the tracks of each window begin in `tracks` (M + 1,).
-        tracks: those of the first window, of the second, and so on.
-        centres, widths: of the windows (M, 3).
-    """
-
-    starts: NDArray[np.int64]
-    tracks: NDArray[np.int64]
-    centres: Array
-    widths: Array
-
-    @classmethod
-    def over(cls, place: Array, support: int) -> _Windows:
-        """Windows of every size, each half a width from the next, along every axis."""
-        return cls(*kernels.full_windows(place, _SIZES, support))
-
-    def inside(self, window: int, count: int) -> BoolArray:
-        """Which of `count` tracks are inside a window."""
-        inside = np.zeros(count, bool)
-        inside[self.tracks[self.starts[window] : self.starts[window + 1]]] = True
-        return inside
-
-    def around(self, window: int, place: Array) -> BoolArray:
-        """Which tracks are inside a window or near it (N,)."""
-        near = np.abs(place - self.centres[window]) < (0.5 + _AROUND) * self.widths[window]
-        return np.asarray(near[:, 0] & near[:, 1] & near[:, 2])
-
-
-def _clearest(
-    windows: _Windows, problem: _Problem, alone: Array, scale: float, rest: BoolArray, test: float, support: int
-) -> list[tuple[int, float]]:
-    """Windows that differ enough from the rest of the scene, and their χ²(6), the clearest first."""
-    weight = np.minimum(1.0, _PULL / np.maximum(alone, 1e-9))
-    asked = limit(test, np.arange(len(rest) + 1, dtype=np.intp))
-    values, clear = kernels.window_tests(
-        windows.starts, windows.tracks, problem.L, problem.eta, weight / scale, weight * alone, rest, asked, support,
-        _LARGEST * rest.sum(), _PRIOR,
-    )  # fmt: skip
-    order = np.argsort(-clear, kind="stable")[:_MOST]
-    return [(int(i), float(values[i])) for i in order if clear[i] > 0]
-
-
-def _members(
-    problem: _Problem, seeds: BoolArray, near: BoolArray, alone: Array, scale: float, support: int
-) -> NDArray[np.intp]:
-    """Tracks that fit the motion of a window's tracks (`seeds`), and better than the rest's, in it or `near` it."""
-    members: BoolArray = seeds
-    asked = np.where(seeds, _BETTER, _BETTER_AROUND)
-    for _ in range(2):
-        if members.sum() < support:
-            break
-        fits = problem.squares(problem.common_motion(members)) / scale
-        fit = (fits < np.maximum(_FITS, _EXPLAINED * alone)) & (alone - fits > asked)
-        members = np.logical_and(near, fit)
-    return np.flatnonzero(members)

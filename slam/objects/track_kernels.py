@@ -140,7 +140,7 @@ def constant_velocities(A, p, rows, times, prior):
 
 
 @kernel
-def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent):
+def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, rays, centres, slide):
     """How far tracks went from the older to the recent frames of their windows: see `slam.objects.displacements`.
 
     Args:
@@ -153,6 +153,9 @@ def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent):
         rows: of the tracks.
         ages: of the slots (W,) in frames.
         most_recent: so many frames are recent, at most.
+        rays: from the camera to the tracks (M, 3).
+        centres: of the camera by slot (W, 3), in the same axes.
+        slide: variance of a feature's direction that comes with each angle by which it is seen otherwise [rad].
 
     Returns:
         displacements (M, 3), their information (M, 3, 3), and the lag (M,) in frames.
@@ -171,23 +174,48 @@ def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent):
         for i in range(3):
             b_before[i] = older_b[n, i]
         late, early = 0.0, older_age[n]
+        late_slot, early_slot = -1, -1
         for w in range(A.shape[1]):
+            if dof[n, w] == 0:
+                continue
             if ages[w] < recent:
                 _add(now, A[n, w], 1.0)
                 _add_times(b_now, A[n, w], p[n, w], 1.0)
                 late += ages[w] * trace(A[n, w])
+                if late_slot < 0 or ages[w] < ages[late_slot]:
+                    late_slot = w
             else:
                 _add(before, A[n, w], 1.0)
                 _add_times(b_before, A[n, w], p[n, w], 1.0)
                 early += ages[w] * trace(A[n, w])
+                if early_slot < 0 or ages[w] > ages[early_slot]:
+                    early_slot = w
         lag[m] = max(early / max(trace(before), _LEAST) - late / max(trace(now), _LEAST), 1.0)
         invert_symmetric(now, _PART * trace(now) + 1e3 * _LEAST, P_now)
         invert_symmetric(before, _PART * trace(before) + 1e3 * _LEAST, P_before)
         for i in range(3):
             d[m, i] = row_times(P_now, i, b_now) - row_times(P_before, i, b_before)
         _add(P_now, P_before, 1.0)
+        if late_slot >= 0 and early_slot >= 0:
+            _add_slide(P_now, rays[m], centres[late_slot], centres[early_slot], slide)
         invert_symmetric(P_now, 0.0, W[m])
     return d, W, lag
+
+
+@helper
+def _add_slide(P, ray, late, early, slide):
+    """Add to P (3, 3) the slide of a feature that was seen along `ray` (3,) from two places of the camera."""
+    far, along, way = 0.0, 0.0, 0.0
+    for i in range(3):
+        far += ray[i] * ray[i]
+        along += ray[i] * (late[i] - early[i])
+        way += (late[i] - early[i]) ** 2
+    across = np.sqrt(max(way - along * along / far, 0.0))
+    variance = slide * np.sqrt(far) * across  # of the angle across / depth, at the depth
+    for i in range(3):
+        P[i, i] += variance
+        for j in range(3):
+            P[i, j] -= variance * ray[i] * ray[j] / far
 
 
 # ---------------------------------------------------------------------------------------------- windows and bodies

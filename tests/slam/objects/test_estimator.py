@@ -15,6 +15,7 @@ from slam.errors import ConfigurationError, MeasurementError
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
 from slam.interfaces import RecentBackend
+from slam.object_data import ObjectEstimate
 from slam.object_models import ObjectModels
 from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.estimator import FRAMES, BodyEstimator
@@ -317,9 +318,14 @@ def test_what_a_body_can_do():
     assert not models.possible(fast, known, still, known, 0.1)
     assert models.possible(fast, known, still, known, 0.2)
     assert models.possible(fast, known, still, 0.1 * np.eye(6), 0.1)  # it may have been that fast before
-    assert models.known(known, known)
-    assert not models.known(np.diag([1, 1, 1, 4, 4, 4.0]), known)
-    assert not models.known(known, np.full((6, 6), np.nan))
+    none = np.zeros(0, np.int64)
+
+    def estimate(P, V):
+        return ObjectEstimate(1, 0.0, np.eye(4), P, np.zeros(6), V, True, none, none)
+
+    assert models.known(estimate(known, known))
+    assert not models.known(estimate(np.diag([1, 1, 1, 4, 4, 4.0]), known))
+    assert not models.known(estimate(known, np.full((6, 6), np.nan)))
 
 
 @pytest.mark.parametrize("still", [False, True])

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.geometry.gauss_kernels import near_pairs
-from slam.geometry.se3 import exp, points_by_pose
-from slam.objects import body_kernels, scene_kernels, track_kernels
+from slam.geometry.se3 import exp
+from slam.objects import scene_kernels, track_kernels
 
 RNG = np.random.default_rng(5)
 TRACKS, SLOTS = 7, 6
@@ -64,10 +64,12 @@ def test_the_common_motion_solves_the_normal_equations_where_no_track_pulls():
     motion = np.array([0.01, -0.02, 0.005, 0.01, 0.02, -0.01])
     d = lag[:, None] * (np.cross(motion[:3], points) + motion[3:])
     problem = scene_kernels.normal_equations(points, d, np.repeat(1e4 * np.eye(3)[None], n, axis=0), lag)
-    found = scene_kernels.common_motion(*problem, np.ones(n, bool), np.full(6, 1e-9), 16.0, 3, 2)
-    np.testing.assert_allclose(found, motion, atol=1e-9)
-    np.testing.assert_allclose(scene_kernels.squares_against(*problem, found), 0.0, atol=1e-6)
-    np.testing.assert_allclose(scene_kernels.squares_against(*problem, np.zeros(6)), 1e4 * (d**2).sum(axis=1))
+    windows = scene_kernels.full_windows(np.ones((n, 3)), np.ones((1, 3)), n + 1)
+    asked = np.full(n + 1, 30.0)
+    group, values, alone, found, scale = scene_kernels.groups_apart(*problem, points, *windows, asked, 4, 1.0)
+    np.testing.assert_allclose(found, motion, atol=1e-6)  # a weak prior draws it to zero
+    np.testing.assert_allclose(alone, 0.0, atol=1e-4)
+    assert scale == 1.0 and not len(values) and (group == -1).all()
 
 
 def test_windows_hold_all_tracks_of_their_cells():
@@ -88,30 +90,6 @@ def test_windows_hold_all_tracks_of_their_cells():
         assert tracks[starts[m] : starts[m + 1]].tolist() == inside
         np.testing.assert_allclose(centres[m], centre, atol=1e-12)
         np.testing.assert_allclose(widths[m], width)
-
-
-def test_a_body_is_corrected_by_the_points_that_agree():
-    """Points displaced alike and one that is far off: the correction is the Kalman update without that one."""
-    rng = np.random.default_rng(6)
-    y, sigma, count = rng.uniform(-0.3, 0.3, (7, 3)), 0.5, 7
-    change = np.array([0.02, -0.01, 0.03, 0.05, -0.02, 0.01])
-    J_body = -points_by_pose(y)
-    T = exp(np.array([0.3, -0.2, 0.1, 0.5, 1.0, -4.0]))  # T_body_left
-    gaps = J_body @ change + rng.normal(0, 1e-3, (count, 3))
-    gaps[4] += 1.0
-    seen = (y + gaps - T[:3, 3]) @ T[:3, :3]
-    J, information = rng.normal(0, 1, (count, 3, 3)) + 40 * np.eye(3), np.tile(1e4 * np.eye(3), (count, 1, 1))
-    P = np.diag([0.01] * 3 + [0.04] * 3)
-    found, agrees, enough = body_kernels.agreed_correction(
-        y, information, seen, J, T[:3, :3], T[:3, 3], P, np.linalg.inv(P), sigma, 1e-6, 11.3, 2
-    )
-    assert enough and agrees.tolist() == [m != 4 for m in range(count)]
-    B = sigma * T[:3, :3] @ np.linalg.inv(J)
-    W = np.linalg.inv(B @ np.swapaxes(B, 1, 2) + 1e-4 * np.eye(3))[agrees]
-    D = J_body[agrees]
-    normal = np.linalg.inv(P) + (np.swapaxes(D, 1, 2) @ W @ D).sum(axis=0)
-    right = (np.swapaxes(D, 1, 2) @ W @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0]
-    np.testing.assert_allclose(found, np.linalg.solve(normal, right), rtol=1e-6)
 
 
 def test_pairs_of_near_gaussians():

@@ -77,7 +77,7 @@ def test_what_jumps_instead_of_going_on_is_no_body():
 def test_what_goes_farther_than_the_camera_does_not_slide_with_it():
     """So less is asked of it; the camera's way is the only difference."""
     rng = np.random.default_rng(1)
-    moved, jumpy = group(10, 0.05, 0.01, rng), way(0.05, 0.05, rng)
+    moved, jumpy = group(10, 0.05, 0.01, rng), way(0.05, 0.03, rng)
     proven = [with_frame(0.0, moved, scene(), replace(jumpy, of_camera=far), False)[1] for far in (0.1, 3.0)]
     assert proven == [True, False]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from slam.data import Estimate, StereoFeatures
@@ -16,6 +18,7 @@ RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
 CHANGE = 0.4  # of all disparities [px]
 FRAMES, AT = 8, 5  # the correction changes before this frame
 DT = 0.1
+NO_BACKEND = SimpleNamespace()  # the camera's last poses are then the online ones
 NO_LANDMARKS = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
 
 
@@ -46,7 +49,7 @@ def velocities(revised):
             detector.revise(mend)
         features = features_at(T, points, k)
         estimate = Estimate(features.stamp, T, 1e-6 * np.eye(6), *NO_LANDMARKS)
-        detector.classify(features, estimate, np.full(len(points), -1))
+        detector.step(NO_BACKEND, features, estimate, np.full(len(points), -1))
     rows = np.flatnonzero(detector.tracks.seen)
     times = detector._times(features)
     return constant_velocity(detector.tracks, rows, times, 25.0).velocity[:, 2]
