@@ -113,7 +113,7 @@ class StereoSlam:
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
         self._rectification = inside = Rectification(rig)
-        inner = inside.config(c)
+        inner = replace(c, models=inside.models(c.models))
         first: Backend = (
             registry.create("backends", backend, inside.rig, models=inner.models, **c.backend)
             if isinstance(backend, str)

@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import adjoint, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
+from slam.models import EstimatorModels
 
 
 class Rectification:
@@ -40,14 +40,12 @@ class Rectification:
         if isinstance(rig, StereoRig) and not rig.is_rectified:
             raise ConfigurationError("the back end works behind rectification: make it with rig.rectified.rig")
 
-    def config(self, config: SystemConfig) -> SystemConfig:
-        """Settings for the rectified pair: the noise of its pixels, and the first pose of its left camera."""
+    def models(self, models: EstimatorModels) -> EstimatorModels:
+        """Models for the rectified pair: the noise of its pixels, and the first pose of its left camera."""
         if self._none:
-            return config
-        models = config.models
+            return models
         T = models.initial_pose @ self._ways.T_left_rectified
-        sigma = models.pixel_sigma * self._ways.scale
-        return replace(config, models=replace(models, pixel_sigma=sigma, T_world_left=T.tolist()))
+        return replace(models, pixel_sigma=models.pixel_sigma * self._ways.scale, T_world_left=T.tolist())
 
     def features_in(self, features: StereoFeatures) -> StereoFeatures:
         """Features in pixels of the rectified pair; those outside of its left image are left out."""

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,8 @@ def test_a_rig_with_lenses_gives_what_its_rectified_pair_gives():
     """In pixels of its own images and with poses of its own left camera."""
     ways = GENERAL_RIG.rectified
     X, config = ways.T_left_rectified, SystemConfig()
-    inside = StereoSlam(ways.rig, None, "window", config=Rectification(GENERAL_RIG).config(config))
+    models = Rectification(GENERAL_RIG).models(config.models)
+    inside = StereoSlam(ways.rig, None, "window", config=replace(config, models=models))
     system = StereoSlam(GENERAL_RIG, None, "window", config=config)
     cloud = Cloud(200, rig=GENERAL_RIG)
     for k in range(8):
