@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.checks import FARTHEST_PIXEL
 from slam.errors import MeasurementError
-from slam.geometry.arrays import Array
+from slam.geometry.arrays import Array, ascending
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
 from slam.geometry.arrays import IndexArray as IndexArray
@@ -212,7 +212,7 @@ class Observations:
             raise MeasurementError(
                 f"observations: {n} ids, but uv_left is {self.uv_left.shape} and uv_right {self.uv_right.shape}"
             )
-        if len(np.unique(self.ids)) != n:
+        if not ascending(self.ids) and len(np.unique(self.ids)) != n:
             raise MeasurementError("observations: a landmark id stands twice")
         if not np.isfinite(self.uv_left).all():
             raise MeasurementError("observations: a left pixel is not finite")

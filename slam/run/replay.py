@@ -98,11 +98,12 @@ def _agreement(
     """The pose on which most observations agree; None without any."""
     if not len(observed):
         return None
-    measured = measurement_rows(observed.uv_left, observed.uv_right)
+    ways = recording.rig.rectified
+    measured = measurement_rows(ways.rectify_left(observed.uv_left), ways.rectify_right(observed.uv_right))
     threshold = config.consistency_sigmas * recording.models.pixel_sigma
-    points, expected = backend.positions(observed.ids), prediction.T_world_left
-    found = find_consensus(recording.rig, points, measured, expected, threshold, config.hypotheses, seed)
-    return found.T_world_left
+    points, expected = backend.positions(observed.ids), prediction.T_world_left @ ways.T_left_rectified
+    found = find_consensus(ways.rig, points, measured, expected, threshold, config.hypotheses, seed)
+    return found.T_world_left @ ways.T_left_rectified.T
 
 
 def _keep_map(backend: Backend, frame: RecordedFrame) -> None:
