@@ -51,39 +51,23 @@ NEW_MAP = "the place is not in the map: a new map begins"
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end.
+    """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end."""
 
-    Attributes:
-        backend: holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`.
-        landmarks: the map's bookkeeping; None before the first frame.
-        atlas: keyframes and loops.
-        index: of the last frame.
-        stamp: its time [s].
-        tracking: how localization has gone.
-        standing: whether the camera stands.
-        dimensions: length of the descriptors; None before the first feature.
-        mapped: whether there ever was a landmark.
-        measured_at: time of the last frame whose pose was measured, or in which a new map began [s].
-        checksum: of the images; None without images, or of images that show nothing.
-        prior_map: in which the camera has not been found yet; None without one, or once it is found.
-        past: the paths of all back ends before the present one.
-        restarted: indices of the frames in which another back end took over.
-    """
-
-    backend: Backend
-    landmarks: LandmarkTable | None = None
-    atlas: Atlas = field(default_factory=Atlas)
-    index: int = -1
-    stamp: float = -np.inf
-    tracking: TrackingState = field(default_factory=TrackingState)
-    standing: Standing = field(default_factory=Standing)
-    dimensions: int | None = None
-    mapped: bool = False
-    measured_at: float = -np.inf
-    checksum: tuple[int, int] | None = None
+    backend: Backend  # holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`
+    landmarks: LandmarkTable | None = None  # the map's bookkeeping; None before the first frame
+    atlas: Atlas = field(default_factory=Atlas)  # keyframes and loops
+    index: int = -1  # of the last frame
+    stamp: float = -np.inf  # its time [s]
+    tracking: TrackingState = field(default_factory=TrackingState)  # how localization has gone
+    standing: Standing = field(default_factory=Standing)  # whether the camera stands
+    dimensions: int | None = None  # length of the descriptors; None before the first feature
+    mapped: bool = False  # whether there ever was a landmark
+    measured_at: float = -np.inf  # time of the last frame whose pose was measured, or in which a new map began [s]
+    checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
+    # in which the camera has not been found yet; None without one, or once it is found
     prior_map: SavedMap | None = None
-    past: tuple[Trajectory, ...] = ()
-    restarted: tuple[int, ...] = ()
+    past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
+    restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
 
     @classmethod
     def in_map(cls, backend: Backend, known: SavedMap) -> State:
@@ -114,14 +98,11 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Elsewhere:
-    """Why a step ended early: the camera is not where the back end has it, so that another one must take over.
+    """Why a step ended early: the camera is not where the back end has it, so that another one must take over."""
 
-    Attributes:
-        T_world_left: the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins.
-        found: the place of the atlas by which it was found; None if it was found by the map's landmarks.
-    """
-
+    # the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins
     T_world_left: Array | None
+    # the place of the atlas by which it was found; None if it was found by the map's landmarks
     found: Found | None = None
 
 

@@ -35,23 +35,14 @@ BASELINE = 0.002
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """How the pose and N landmarks depend on m errors of the rig, and what is known of them beside these.
+    """How the pose and N landmarks depend on m errors of the rig, and what is known of them beside these."""
 
-    Attributes:
-        T_world: the estimated pose of the rectified left camera (4, 4).
-        pose: J (6, m).
-        covariance: of the pose where the landmarks are known (6, 6).
-        ids: of the landmarks (N,), ascending.
-        landmarks: L (N, 3, m).
-        own: P (N, 3, 3), in world axes [m²].
-    """
-
-    T_world: Array
-    pose: Array
-    covariance: Array
-    ids: IdArray
-    landmarks: Array
-    own: Array
+    T_world: Array  # the estimated pose of the rectified left camera (4, 4)
+    pose: Array  # J (6, m)
+    covariance: Array  # of the pose where the landmarks are known (6, 6)
+    ids: IdArray  # of the landmarks (N,), ascending
+    landmarks: Array  # L (N, 3, m)
+    own: Array  # P (N, 3, 3), in world axes [m²]
 
     @classmethod
     def start(cls, T_world: Array, m: int) -> Sensitivities:

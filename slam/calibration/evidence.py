@@ -12,17 +12,11 @@ _PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts f
 
 
 class Evidence(NamedTuple):
-    """A Gaussian likelihood in information form: ``log p = eᵀ θ - θᵀ S θ / 2``.
+    """A Gaussian likelihood in information form: ``log p = eᵀ θ - θᵀ S θ / 2``."""
 
-    Attributes:
-        S: information (n, n).
-        e: information times mean (n,).
-        cross: information that the parameters share with the residual fields (n, m).
-    """
-
-    S: Array
-    e: Array
-    cross: Array
+    S: Array  # information (n, n)
+    e: Array  # information times mean (n,)
+    cross: Array  # information that the parameters share with the residual fields (n, m)
 
     def scaled(self, factor: float) -> Evidence:
         """The same with `factor` times the information."""
@@ -43,18 +37,12 @@ class Evidence(NamedTuple):
 
 
 class RecordingEvidence(NamedTuple):
-    """The evidence of one recording, without any prior.
+    """The evidence of one recording, without any prior."""
 
-    Attributes:
-        whole: of its rows and its motion.
-        motion: of its motion alone, from which the scale of the calibration's errors follows: rows have errors of their
-            own.
-        residual: scale of the residual fields by its rows, from 0 to 1.
-    """
-
-    whole: Evidence
+    whole: Evidence  # of its rows and its motion
+    # of its motion alone, from which the scale of the calibration's errors follows: rows have errors of their own
     motion: Evidence
-    residual: float = 1.0
+    residual: float = 1.0  # scale of the residual fields by its rows, from 0 to 1
 
     def scaled(self, factor: float) -> RecordingEvidence:
         """The same with `factor` times the information."""

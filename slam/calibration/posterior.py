@@ -81,19 +81,12 @@ class RigPosterior:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Posterior of the parameters.
+    """Posterior of the parameters."""
 
-    Attributes:
-        mean: (n,).
-        inner: covariance (n, n) without residual fields.
-        covariance: including the effect of unknown residual fields on the mean (n, n).
-        residual: scale of the residual fields, from 0 to 1.
-    """
-
-    mean: Array
-    inner: Array
-    covariance: Array
-    residual: float
+    mean: Array  # (n,)
+    inner: Array  # covariance (n, n) without residual fields
+    covariance: Array  # including the effect of unknown residual fields on the mean (n, n)
+    residual: float  # scale of the residual fields, from 0 to 1
 
 
 def solve(

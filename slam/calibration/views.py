@@ -28,21 +28,13 @@ NO_MATCHES: Rows = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The stereo features of one frame, as measured.
+    """The stereo features of one frame, as measured."""
 
-    Attributes:
-        points: ``(x, y, d)`` (N, 3), rectified pixel from the principal point and disparity [px].
-        vertical: right row less left row (N,) [px].
-        descriptors: (N, D).
-        laplacian: (N,).
-        T_world_left: pose of the rectified left camera (4, 4) as the system has it.
-    """
-
-    points: Array
-    vertical: Array
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    T_world_left: Array
+    points: Array  # ``(x, y, d)`` (N, 3), rectified pixel from the principal point and disparity [px]
+    vertical: Array  # right row less left row (N,) [px]
+    descriptors: NDArray[np.float32]  # (N, D)
+    laplacian: NDArray[np.int8]  # (N,)
+    T_world_left: Array  # pose of the rectified left camera (4, 4) as the system has it
 
     def __len__(self) -> int:
         return len(self.points)

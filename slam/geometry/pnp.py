@@ -26,15 +26,10 @@ _CONVERGED = 1e-4  # numerics: step [rad], [m] after which the pose has converge
 
 @dataclass(frozen=True, eq=False)
 class PoseConsensus:
-    """A pose and the matches that agree with it.
+    """A pose and the matches that agree with it."""
 
-    Attributes:
-        T_world_left: pose (4, 4).
-        inliers: which matches agree (M,).
-    """
-
-    T_world_left: Array
-    inliers: BoolArray
+    T_world_left: Array  # pose (4, 4)
+    inliers: BoolArray  # which matches agree (M,)
 
 
 def measurement_rows(uv_left: Array, uv_right: Array) -> Array:

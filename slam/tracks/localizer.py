@@ -28,22 +28,15 @@ from slam.tracks.visibility import similar_view
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMatches:
-    """Landmarks found in a frame.
+    """Landmarks found in a frame."""
 
-    Attributes:
-        ids: landmark ids (K,), ascending.
-        rows: rows of their features (K,).
-        T_world_left: the pose (4, 4) on which they agree, if there is one.
-        kidnapped: the prediction's uncertainty does not allow that pose, but several frames agree on it: the camera was
-            moved while it saw nothing.
-        doubted: number of landmarks that agree on a pose which is too far from the prediction to be believed yet.
-    """
-
-    ids: IdArray
-    rows: NDArray[np.intp]
-    T_world_left: Array | None = None
+    ids: IdArray  # landmark ids (K,), ascending
+    rows: NDArray[np.intp]  # rows of their features (K,)
+    T_world_left: Array | None = None  # the pose (4, 4) on which they agree, if there is one
+    # the prediction's uncertainty does not allow that pose, but several frames agree on it: the camera was moved while
+    # it saw nothing
     kidnapped: bool = False
-    doubted: int = 0
+    doubted: int = 0  # number of landmarks that agree on a pose which is too far from the prediction to be believed yet
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -32,19 +32,12 @@ _BLIND = (
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Features that may stay at their pixels, a row each.
+    """Features that may stay at their pixels, a row each."""
 
-    Attributes:
-        z: mean (uL, vL, uR) of their first sights (K, 3) [px].
-        descriptors: at first sight (K, D).
-        sights: number of frames in which each was there (K,).
-        missed: frames since (K,).
-    """
-
-    z: Array
-    descriptors: NDArray[np.float32]
-    sights: NDArray[np.int64]
-    missed: NDArray[np.int64]
+    z: Array  # mean (uL, vL, uR) of their first sights (K, 3) [px]
+    descriptors: NDArray[np.float32]  # at first sight (K, D)
+    sights: NDArray[np.int64]  # number of frames in which each was there (K,)
+    missed: NDArray[np.int64]  # frames since (K,)
 
     @classmethod
     def of(cls, z: Array, descriptors: NDArray[np.float32]) -> Places:
@@ -82,23 +75,15 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """What is known of a camera at rest.
+    """What is known of a camera at rest."""
 
-    Attributes:
-        places: features that may stay; None before the first frame.
-        frames: number of frames in which most features stayed where they were in the first of them.
-        witnesses: rows of the present features that stay (M,); meaningful if the camera stands.
-        variance: of a pixel of a feature that stays [px²], as seen so far; infinite before anything was.
-        T_world_left: the camera's last pose (4, 4).
-        blind: number of frames in which too little of what stays was seen to tell, as something hides it.
-    """
-
-    places: Places | None = None
-    frames: int = 0
+    places: Places | None = None  # features that may stay; None before the first frame
+    frames: int = 0  # number of frames in which most features stayed where they were in the first of them
+    # rows of the present features that stay (M,); meaningful if the camera stands
     witnesses: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
-    variance: float = np.inf
-    T_world_left: Array = field(default_factory=lambda: np.eye(4))
-    blind: int = 0
+    variance: float = np.inf  # of a pixel of a feature that stays [px²], as seen so far; infinite before anything was
+    T_world_left: Array = field(default_factory=lambda: np.eye(4))  # the camera's last pose (4, 4)
+    blind: int = 0  # number of frames in which too little of what stays was seen to tell, as something hides it
 
     @property
     def stands(self) -> bool:
