@@ -8,7 +8,7 @@ seconds. Pose covariances are (6, 6), order [rotation, translation], of a pertur
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from slam.checks import FARTHEST_PIXEL
 from slam.errors import MeasurementError
-from slam.geometry.arrays import Array
+from slam.geometry.arrays import Array, ascending
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
 from slam.geometry.arrays import IndexArray as IndexArray
@@ -92,6 +92,10 @@ class Patches:
         return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Patches)))
 
 
+#: Columns of `StereoFeatures`.
+_COLUMNS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+
+
 @dataclass(frozen=True, eq=False)
 class StereoFeatures:
     """Features of one stereo frame, a row each.
@@ -120,7 +124,7 @@ class StereoFeatures:
     images: ImagePair | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name in ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors"):
+        for name in _COLUMNS:
             value = getattr(self, name)
             if not isinstance(value, (np.ndarray, list, tuple)) or (isinstance(value, np.ndarray) and not value.ndim):
                 kind = type(value).__name__
@@ -139,6 +143,10 @@ class StereoFeatures:
     def has_stereo(self) -> BoolArray:
         """Which features have a right pixel (N,)."""
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
+
+    def select(self, rows: NDArray) -> StereoFeatures:
+        """The features of these rows (a mask or indices)."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
     @classmethod
     def empty(cls, stamp: float, dimensions: int = 64, threshold: float = float("nan")) -> StereoFeatures:
@@ -169,7 +177,7 @@ class Observations:
         n, shapes = len(self.ids), (self.uv_left.shape, self.uv_right.shape)
         if shapes != ((n, 2), (n, 2)):
             raise MeasurementError(f"observations: {n} ids, but uv_left is {shapes[0]} and uv_right {shapes[1]}")
-        if len(np.unique(self.ids)) != n:
+        if not ascending(self.ids) and len(np.unique(self.ids)) != n:
             raise MeasurementError("observations: a landmark id stands twice")
         if not np.isfinite(self.uv_left).all():
             raise MeasurementError("observations: a left pixel is not finite")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from slam import registry
-from slam.calibration import RemainingRigError, SavedCalibration, SelfCalibration
+from slam.calibration import RemainingRigError, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import (
     Estimate,
@@ -111,27 +111,26 @@ class Session:
     """Makes the parts of a system, and replaces its back end between frames.
 
     Args:
-        rig: the cameras.
-        config: settings.
+        rig: the rectified pair.
+        config: settings for it.
         backend: name of the back ends; None if the first one was given as an object, so that no other can be made.
         first: the first back end.
-        rig_prior: errors of the rig from earlier recordings.
+        calibration: of the rig's error.
 
     Attributes:
-        rig, config: as given.
-        calibration: of the rig's error; rig_error: what it adds to the estimate.
+        rig, config, calibration: as given.
+        rig_error: what it adds to the estimate.
         localizer: finds landmarks; mapper: adds and erases them; loop_closer: finds places.
     """
 
     def __init__(
-        self, rig: StereoRig, config: SystemConfig, backend: str | None, first: Backend,
-        rig_prior: SavedCalibration | None,
-    ) -> None:  # fmt: skip
+        self, rig: StereoRig, config: SystemConfig, backend: str | None, first: Backend, calibration: SelfCalibration
+    ) -> None:
         c = config
         self.rig, self.config, self._models = rig, c, c.models
         self._backend: str | None = backend
         self._options: Mapping[str, Any] = c.backend
-        self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
+        self.calibration = calibration
         self.rig_error = RemainingRigError(self.calibration, c.models)
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self.mapper = Mapper(rig, c.map, self.localizer, first)

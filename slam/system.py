@@ -18,6 +18,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.input.extraction import Extracted, Extractor, as_frame
 from slam.input.features import documented, following
+from slam.input.rectification import Rectification
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
 from slam.mapping.atlas.atlas import Atlas
@@ -50,7 +51,8 @@ class StereoSlam:
         rig: the two cameras.
         frontend: a name (see ``frontends.names()``), an object with `Frontend`'s method, or None where features are
             given directly to `process_features`.
-        backend: a name (see ``backends.names()``) or an object with `Backend`'s methods.
+        backend: a name (see ``backends.names()``) or an object with `Backend`'s methods, which must have been made with
+            ``rig.rectified.rig``: it is given pixels of the rectified pair, and its poses are of that left camera.
         kind: kind of motion, ``"handheld"`` or ``"driving"``, which chooses the default settings.
         config: all settings; overrides `kind`.
         prior_map: a map to start in (see `slam.load_map`). World coordinates are then the map's. Frames have the status
@@ -95,14 +97,17 @@ class StereoSlam:
         self.config = c
         if isinstance(frontend, str):
             frontend = registry.create("frontends", frontend, rig, **c.frontend)
+        self._rectification = inside = Rectification(rig)
+        inner = replace(c, models=inside.models(c.models))
         if isinstance(backend, str):
-            backend = registry.create("backends", backend, rig, models=c.models, **c.backend)
+            backend = registry.create("backends", backend, inside.rig, models=inner.models, **c.backend)
         self.frontend: Frontend | None = registry.require_methods("frontends", frontend)
         first: Backend = registry.require_methods("backends", backend)
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
-        self._session = Session(rig, c, names[1], first, rig_prior)
-        self._tracker = Tracker(self._session, detector_for(rig, c.objects, c.models))
+        inside.require_fits(first)
+        self._session = Session(inside.rig, inner, names[1], first, SelfCalibration(rig, c.self_calibration, rig_prior))
+        self._tracker = Tracker(self._session, detector_for(inside.rig, c.objects, inner.models))
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
@@ -253,6 +258,7 @@ class StereoSlam:
     def _process(self, features: StereoFeatures, checksum: tuple[int, int] | None) -> FrameResult:
         """A step, made again as a whole where another back end takes over; its state then replaces the last one's."""
         features = following(features, self._state.dimensions, self._tracker.advanced)
+        features, out = self._rectification.features_in(features), self._rectification.result_out
         self._roll_back()
         state, session, tracker = self._state, self._session, self._tracker
         if state.prior_map is not None:
@@ -260,7 +266,7 @@ class StereoSlam:
             if located is None:
                 self._state, result = session.not_found(state, features)
                 tracker.advanced = features.stamp
-                return result
+                return out(result)
             state = located
         # Images that come again, byte for byte, show nothing that was not measured before.
         repeated = len(features) > 0 and checksum is not None and checksum == state.checksum
@@ -278,7 +284,7 @@ class StereoSlam:
         common = session.rig_error.common(as_reported=True)
         result = frame_result(step, state.mapped, revision, self._stages.milliseconds, common)
         self._state, self._stages = state.after(step, checksum), Stages()
-        return result
+        return out(result)
 
     def _roll_back(self) -> None:
         """After a step that an exception ended: what it did to the back end's map is undone."""
@@ -289,13 +295,13 @@ class StereoSlam:
     def trajectory(self) -> Trajectory:
         """The left camera's path: the latest estimate of each frame's pose; in a prior map, since it was found."""
         with self._stepping, self._named("the path"):
-            return self.atlas.path(self._state.path())
+            return self._rectification.path_out(self.atlas.path(self._state.path()))
 
     @one_blas_thread
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
         with self._stepping, self._named("the estimate"):
-            return self._estimate()
+            return self._rectification.estimate_out(self._estimate())
 
     def _estimate(self, of_map: bool = False) -> Estimate:
         """`estimate`, in the only thread; with `of_map`, landmarks' covariances are relative to each other."""
@@ -319,7 +325,7 @@ class StereoSlam:
             if estimate is None or self.landmarks is None:
                 raise SlamError("there is no map yet: no frame was processed")
             rows = self.landmarks.moved(self.atlas.T_map_odom)
-            keyframes = (k.corrected(self.calibration.applied, self.rig.rectified.rig) for k in self.atlas.keyframes)
+            keyframes = (k.corrected(self.calibration.applied, self._session.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
             return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas)
 

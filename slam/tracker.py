@@ -93,7 +93,7 @@ class Tracker:
         places = state.backend.positions
         aligned, landmarks = self._aligner.align(frontend, features, matches, landmarks, places)
         if aligned is not features:
-            corrected = self._session.calibration.correct_again(corrected, features, aligned)
+            corrected = _moved_as(corrected, features, aligned)
         step = Step(
             index, aligned, replace(corrected, images=None), prediction, landmarks, matches, standing, tracking,
             state.atlas,
@@ -182,6 +182,14 @@ class Tracker:
     def whole_estimate(self, state: State) -> Estimate:
         """Pose and map of the back end, with the rig's uncertainty."""
         return self._session.rig_error.added_to(checked(state.backend, "estimate", state.backend.estimate()))
+
+
+def _moved_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:
+    """Corrected features that move as the measured ones did: the correction is the same over so small a shift."""
+    if corrected is before:
+        return now
+    left, right = now.uv_left - before.uv_left, now.uv_right - before.uv_right
+    return replace(corrected, uv_left=corrected.uv_left + left, uv_right=corrected.uv_right + right)
 
 
 def _positions(state: State, ids: IdArray) -> Array:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
-from slam.bounds import from_options, require_not_negative
+from slam.bounds import require_not_negative
 from slam.errors import ConfigurationError
 
 _RANGES = {  # least and largest values
@@ -60,13 +59,3 @@ class SurfConfig:
             raise ConfigurationError(f"surf: descriptor must be 16 or 64, got {self.descriptor}")
         if self.min_depth > self.max_depth:
             raise ConfigurationError(f"surf: min_depth {self.min_depth} lies above max_depth {self.max_depth}")
-
-    @classmethod
-    def with_options(cls, config: SurfConfig | None = None, **options: Any) -> SurfConfig:
-        """A configuration (by default the default one) with some of its values replaced.
-
-        Raises:
-            ConfigurationError: an option is not known or out of its range.
-        """
-        base = {} if config is None else {f.name: getattr(config, f.name) for f in fields(cls)}
-        return from_options(cls, "surf", {**base, **options})

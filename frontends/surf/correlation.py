@@ -27,9 +27,14 @@ def patch_windows(spread: float) -> NDArray[np.float32]:
     return out
 
 
-def _work_space() -> tuple[NDArray[np.float32], ...]:
+@helper
+def _work_space():
     """Samples; the patch and its gradients; the other image's patch; the weighted patch and gradients."""
-    return np.empty(25 * 26, np.float32), *np.empty((7, _LARGEST), np.float32)
+    n, kind = _LARGEST, np.float32
+    return (
+        np.empty(25 * 26, kind), np.empty(n, kind), np.empty(n, kind), np.empty(n, kind), np.empty(n, kind),
+        np.empty(n, kind), np.empty(n, kind), np.empty(n, kind),
+    )  # fmt: skip
 
 
 @helper
@@ -118,24 +123,14 @@ def _compare(space, window, k, n):
     return s, np.sqrt(max(ss - s * s, zero)), both, px, py
 
 
-def refine(
-    left: NDArray,
-    right: NDArray,
-    uv: NDArray[np.float64],
-    size: NDArray[np.float64],
-    start: NDArray[np.float64],
-    min_correlation: float,
-    reaches: tuple[tuple[float, float], ...],
-    windows: NDArray[np.float32],
-) -> NDArray[np.float64]:
-    """Right pixels (N, 2) to sub-pixel accuracy by image correlation.
+@kernel
+def refine(left, right, uv, size, start, min_correlation, reaches, windows):
+    """Right pixels (N, 2) to sub-pixel accuracy by image correlation; NaN where the first pass fails.
 
     The right patch moves in both directions until its difference from the left patch is least; brightness offset
     and contrast are removed from both. This fails where a patch leaves the image, has no texture, moves further than
     its reach from the start, does not converge, or correlates below `min_correlation`. A second pass, with other
     windows, starts where the first one ended; where it fails the first one's result stands.
-
-    NaN where the first pass fails.
 
     Args:
         left: grey image (H, W) float32.
@@ -144,20 +139,11 @@ def refine(
         size: of the features (N,) [px]; large ones are compared in large patches.
         start: first guess of the right pixels (N, 2), NaN where there is none.
         min_correlation: least normalised correlation.
-        reaches: largest shift along the row and across [px], in each pass.
+        reaches: largest shift along the row and across (P, 2) [px], in each pass.
         windows: of each pass (P, 2, 552), see `patch_windows`.
     """
-    out = np.full((len(uv), 2), np.nan)
-    _refine(
-        left.reshape(-1), right.reshape(-1), left.shape, uv, size, start, min_correlation, np.array(reaches),
-        windows, _work_space(), out,
-    )  # fmt: skip
-    return out
-
-
-@kernel
-def _refine(left, right, shape, uv, size, start, min_correlation, reaches, windows, space, out):
-    """The same into `out`, on flat images."""
+    out, space, shape = np.full((len(uv), 2), np.nan), _work_space(), left.shape
+    left, right = left.reshape(-1), right.reshape(-1)
     for i in range(len(uv)):
         x0, y0 = start[i, 0], start[i, 1]
         if np.isnan(x0):
@@ -174,6 +160,7 @@ def _refine(left, right, shape, uv, size, start, min_correlation, reaches, windo
             if np.isnan(x0):
                 break
             out[i, 0], out[i, 1] = x0, y0
+    return out
 
 
 @helper
@@ -222,17 +209,8 @@ def cut_patches(image: NDArray[np.float32], uv: NDArray[np.float64]) -> tuple[ND
     return patches, _MARGIN + uv - whole
 
 
-def align_patches(
-    image: NDArray[np.float32],
-    patches: NDArray[np.float32],
-    centres: NDArray[np.floating],
-    warps: NDArray[np.floating],
-    size: NDArray[np.floating],
-    start: NDArray[np.floating],
-    min_correlation: float,
-    reach: float,
-    windows: NDArray[np.float32],
-) -> NDArray[np.float64]:
+@kernel
+def align_patches(image, patches, centres, warps, size, start, min_correlation, reach, windows):
     """Pixels (N, 2) at which an image looks as the warped patches do, to sub-pixel accuracy; see `refine`.
 
     Args:
@@ -246,19 +224,8 @@ def align_patches(
         reach: largest shift along and across the rows [px].
         windows: see `patch_windows`.
     """
-    out = np.full((len(start), 2), np.nan)
-    _align_patches(
-        image.reshape(-1), image.shape, patches, centres, warps, size, start, min_correlation, reach, windows,
-        _work_space(), out,
-    )  # fmt: skip
-    return out
-
-
-@kernel
-def _align_patches(
-    image, shape, patches, centres, warps, size, start, min_correlation, reach, windows, space, out
-):  # fmt: skip
-    """The same into `out`, on a flat image."""
+    out, space, shape = np.full((len(start), 2), np.nan), _work_space(), image.shape
+    pixels = image.reshape(-1)
     for i in range(len(start)):
         if not (0.0 <= start[i, 0] < shape[1] and 0.0 <= start[i, 1] < shape[0]):
             continue
@@ -268,8 +235,9 @@ def _align_patches(
             continue
         _gradients(space, rows, lanes)
         out[i, 0], out[i, 1] = _best_place(
-            image, shape, start[i, 0], start[i, 1], reach, reach, min_correlation, windows, k, half, space
+            pixels, shape, start[i, 0], start[i, 1], reach, reach, min_correlation, windows, k, half, space
         )
+    return out
 
 
 @helper

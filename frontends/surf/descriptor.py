@@ -102,38 +102,27 @@ def _sum_areas(space, weights, descriptors, row):
             descriptors[row, k] *= scale
 
 
-def describe(
-    integral: NDArray[np.int32],
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    size: NDArray[np.float64],
-    angle: NDArray[np.float64],
-    box: float,
-    weights: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Descriptors (N, 16 or 64) of features.
+@kernel
+def describe(integral, uv, size, angle, box, weights):
+    """Descriptors (N, 16 or 64) float32 of features.
 
     Args:
         integral: see `integral_image`.
-        x: columns of the features (N,) [px].
-        y: their rows (N,) [px].
+        uv: pixels of the features (N, 2).
         size: their sizes (N,) [px].
         angle: their orientations (N,) [rad], y down.
         box: side of the boxes that are averaged, in cells: `TURNED_BOX` or `UPRIGHT_BOX`.
         weights: see `gaussian_weights`.
     """
-    out = np.zeros((len(x), 4 * (len(weights) // _SUB) ** 2), np.float32)
-    rows, lanes = weights.shape  # of wavelets; work space is for boxes, cells, and sums of sub-areas
-    cells, sums = np.zeros((rows + 1, lanes + _LANES), np.float32), np.zeros((4, lanes), np.float32)
-    space = np.zeros((3, lanes), np.int32), np.zeros(lanes, np.float32), cells, sums
-    _describe(integral.reshape(-1), integral.shape, x, y, size, angle, box, weights, space, out)
-    return out
-
-
-@kernel
-def _describe(pixels, shape, x, y, size, angle, box, weights, space, out):
-    """The same into `out`, on the flat integral image."""
-    for k in range(x.size):
+    rows, lanes = weights.shape
+    out = np.zeros((len(uv), 4 * (rows // _SUB) ** 2), np.float32)
+    space = (  # boxes, cells, and sums of sub-areas
+        np.zeros((3, lanes), np.int32), np.zeros(lanes, np.float32), np.zeros((rows + 1, lanes + _LANES), np.float32),
+        np.zeros((4, lanes), np.float32),
+    )  # fmt: skip
+    pixels = integral.reshape(-1)
+    for k in range(len(uv)):
         width = size[k] * (1.2 / 9.0)
-        _average_cells(pixels, shape, x[k], y[k], width, angle[k], box * width, space)
+        _average_cells(pixels, integral.shape, uv[k, 0], uv[k, 1], width, angle[k], box * width, space)
         _sum_areas(space, weights, out, k)
+    return out

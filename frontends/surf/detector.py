@@ -173,51 +173,33 @@ def _collect(space, pixels, stride, filters, layer, row, out, found):
 
 
 def detect_octave(
-    integral: NDArray[np.int32],
-    filters: Filters,
-    octave: int,
-    threshold: float,
-    first_row: int,
-    last_row: int,
+    integral: NDArray[np.int32], filters: Filters, octave: int, threshold: float, first_row: int, last_row: int
 ) -> NDArray[np.float64]:
-    """Maxima of the Hessian determinant in one octave and a range of grid rows.
-
-    Args:
-        integral: see `integral_image`.
-        filters: of the octave, see `make_filters`.
-        octave: 0-based.
-        threshold: D_threshold; only responses above it count.
-        first_row: first grid row to search.
-        last_row: the row after the last one.
+    """Maxima of the Hessian determinant above a threshold in an octave, from a grid row to before another.
 
     Returns:
         Candidates (N, COLUMNS) in raster order of the grid.
     """
-    columns, inner = (integral.shape[1] - 1) // filters.step, len(filters.sizes) - 2
     top, bottom = first_row - 1 - filters.centre[-2], last_row + 1 + filters.centre[-2]  # that inner layers read
     phases = column_phases(integral, filters.step, max(top, 0) * filters.step, (bottom + 1) * filters.step)
-    ring = np.zeros((inner, 3, columns + 1), np.float32)  # three rows of each layer; row i lies in slot i % 3
-    words = np.zeros((columns + 7) // 8, np.uint64)
-    space = (
-        np.empty(3 * filters.step * phases.shape[2], np.int32), ring, ring.reshape(-1), words, words.view(np.uint8),
-        np.empty(3, np.int64), np.empty((3, 3, 3)), np.empty(3),
-    )  # fmt: skip
-    # At most one strict maximum in each 2x2 block of a layer.
-    out = np.empty((max(16, (last_row - first_row + 2) * (columns + 1) // 4 * inner), COLUMNS))
-    found = _scan(
-        integral.reshape(-1), integral.shape, phases.reshape(-1), phases.shape, filters, np.float32(threshold),
-        first_row, last_row, space, out,
-    )  # fmt: skip
-    out[:found, 5] = octave
-    return out[:found].copy()
+    found = _scan(integral, phases, filters, np.float32(threshold), first_row, last_row)
+    found[:, 5] = octave
+    return found
 
 
 @kernel
-def _scan(pixels, shape, phases, phases_shape, filters, threshold, first_row, last_row, space, out):
-    """The search itself, on flat arrays; returns the number of candidates written to `out`."""
-    buffer, ring, responses, _, mask, slots, _, _ = space
-    step, height, width, stride = filters.step, shape[0] - 1, shape[1] - 1, shape[1]
-    rows, columns, inner = height // step, width // step, ring.shape[0]
+def _scan(integral, phases, filters, threshold, first_row, last_row):
+    """The search itself; the octave is not filled in."""
+    step, height, width, stride = filters.step, integral.shape[0] - 1, integral.shape[1] - 1, integral.shape[1]
+    rows, columns, inner = height // step, width // step, len(filters.sizes) - 2
+    ring = np.zeros((inner, 3, columns + 1), np.float32)  # three rows of each layer; row i lies in slot i % 3
+    words = np.zeros((columns + 7) // 8, np.uint64)
+    buffer, responses, mask = np.empty(3 * step * phases.shape[2], np.int32), ring.reshape(-1), words.view(np.uint8)
+    slots = np.empty(3, np.int64)
+    space = buffer, ring, responses, words, mask, slots, np.empty((3, 3, 3)), np.empty(3)
+    # At most one strict maximum in each 2x2 block of a layer.
+    out = np.empty((max(16, (last_row - first_row + 2) * (columns + 1) // 4 * inner), COLUMNS))
+    pixels, phases_shape, phases = integral.reshape(-1), phases.shape, phases.reshape(-1)
     found = np.int64(0)
     for i in range(max(0, first_row - 1), min(rows, last_row + 1)):
         for layer in range(1, inner + 1):
@@ -244,4 +226,4 @@ def _scan(pixels, shape, phases, phases_shape, filters, threshold, first_row, la
                 rival, threshold, mask[a:b],
             )  # fmt: skip
             found = _collect(space, pixels, stride, filters, layer, row, out, found)
-    return found
+    return out[:found].copy()

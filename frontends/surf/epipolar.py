@@ -19,73 +19,63 @@ _NEIGHBOURS = 2  # columns about the best place that are no rivals of it
 
 
 class _Space(NamedTuple):
-    """Work space of the search: for patches by rows, padded with zeros, and the places along a row.
+    """Work space of the search: for patches by rows, padded with zeros, and the places along a row."""
 
-    Attributes:
-        patch: what is looked for, its mean removed.
-        pixels, between: the patches at a place and half a column beside it.
-        side: of a patch; no constant here, or its loops would be unrolled instead of running on vector registers.
-        scores: correlations with the places.
-        marks: which of these may be rivals of the best one.
-        words: eight marks each.
-    """
-
-    patch: NDArray[np.float32]
-    pixels: NDArray[np.float32]
-    between: NDArray[np.float32]
-    side: int
-    scores: NDArray[np.float32]
-    marks: NDArray[np.bool_]
-    words: NDArray[np.uint64]
-
-    @classmethod
-    def of(cls, width: int) -> _Space:
-        """For rows of so many places."""
-        words = np.zeros(width // 8 + 1, np.uint64)
-        patch, pixels, between = np.zeros((3, _PADDED), np.float32)
-        return cls(patch, pixels, between, _SIDE, np.empty(width + _LANES, np.float32), words.view(np.bool_), words)
+    patch: NDArray[np.float32]  # what is looked for, its mean removed
+    pixels: NDArray[np.float32]  # the patch at a place
+    between: NDArray[np.float32]  # and half a column beside it
+    side: int  # of a patch; no constant here, or its loops would be unrolled instead of running on vector registers
+    scores: NDArray[np.float32]  # correlations with the places
+    marks: NDArray[np.bool_]  # which of these may be rivals of the best one
+    words: NDArray[np.uint64]  # eight marks each
 
 
 class HalfImage(NamedTuple):
-    """An image at half resolution, ready for correlation: arrays by rows, and a vector register of zeros behind them.
+    """An image at half resolution, ready for correlation: flat arrays, with a vector register of zeros behind."""
 
-    Attributes:
-        shape: rows and columns.
-        pixels: grey values, float32 on the scale of 8-bit images.
-        weight: one over the root of the sum of squared deviations of the patch about each pixel; 0 where it is flat
-            or leaves the image.
-        between: grey values half a column further to the right.
-    """
-
-    shape: tuple[int, int]
-    pixels: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    between: NDArray[np.float32]
+    shape: tuple[int, int]  # rows and columns
+    pixels: NDArray[np.float32]  # grey values on the scale of 8-bit images
+    weight: NDArray[np.float32]  # 1 / √(Σ squared deviations of the patch about it); 0 where flat or beyond the image
+    between: NDArray[np.float32]  # grey values half a column further to the right
 
 
 def half_image(image: NDArray, full_scale: float) -> HalfImage:
-    """Halve a grey image (H, W) of pixels 0..full_scale for `search_rows`."""
-    import cv2
-
-    rows, columns = (max(n // 2, 1) for n in image.shape)
-    small, beside = (
-        cv2.resize(view, (columns, rows), interpolation=cv2.INTER_AREA) for view in (image, np.roll(image, -1, axis=1))
-    )
-    flat = np.zeros((3, small.size + _LANES), np.float32)
-    pixels, weight, between = (plane[: small.size].reshape(rows, columns) for plane in flat)
-    scale = np.float32(255.0 / full_scale)
-    np.multiply(small, scale, out=pixels)
-    np.multiply(beside, scale, out=between)
-    _weigh(pixels, weight, np.empty(columns, np.float32), np.empty(columns, np.float32))
-    return HalfImage((rows, columns), flat[0], flat[1], flat[2])
+    """Halve a grey image (H, W) of pixels 0..full_scale for `search_rows`; an odd last row or column is left out."""
+    shape = max(image.shape[0] // 2, 1), max(image.shape[1] // 2, 1)
+    return HalfImage(shape, *_halved(np.ascontiguousarray(image), shape, np.float32(0.25 * 255.0 / full_scale)))
 
 
 @kernel
-def _weigh(pixels, weight, sums, squares):
-    """Weights of the patches about all pixels of an image, with work space for a row."""
-    for y in range(_HALF, pixels.shape[0] - _HALF):
+def _halved(image, shape, scale):
+    """The planes of a `HalfImage`."""
+    rows, columns = shape
+    flat = np.zeros((3, rows * columns + _LANES), np.float32)
+    pixels, weight, between = (
+        flat[0, : rows * columns].reshape(shape), flat[1, : rows * columns].reshape(shape),
+        flat[2, : rows * columns].reshape(shape),
+    )  # fmt: skip
+    column = np.zeros(image.shape[1] + 1, np.uint32)
+    for y in range(image.shape[0] // 2):
+        _halve_row(image[2 * y], image[2 * y + 1], column, scale, pixels[y], between[y])
+    sums, squares = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    for y in range(_HALF, rows - _HALF):
         _column_sums(pixels, y, sums, squares)
         _row_weights(sums, squares, weight, y)
+    return flat[0], flat[1], flat[2]
+
+
+@vector_helper
+def _halve_row(upper, lower, column, scale, pixels, between):
+    """Means of blocks of four pixels, and of those a column further to the right; `column` takes sums of two rows."""
+    two, one = np.uint64(2), np.uint64(1)
+    for x in range(len(upper)):
+        column[x] = np.uint32(upper[x]) + np.uint32(lower[x])
+    column[len(upper)] = column[len(upper) - 1]
+    for x in range(len(upper) // 2):
+        k = two * np.uint64(x)
+        middle = column[k + one]
+        pixels[x] = scale * np.float32(np.int32(column[k] + middle))
+        between[x] = scale * np.float32(np.int32(middle + column[k + two]))
 
 
 @vector_helper
@@ -301,16 +291,8 @@ def _search(image, shape, band, y, first, last, own, limits, space):
     return found, row
 
 
-def search_rows(
-    left: HalfImage,
-    right: HalfImage,
-    uv: NDArray[np.float64],
-    low: float,
-    high: float,
-    band: int,
-    min_correlation: float,
-    uniqueness: float,
-) -> NDArray[np.float64]:
+@kernel
+def search_rows(left, right, uv, low, high, band, min_correlation, uniqueness):
     """Right positions (N, 2) of left features to a pixel or two, by correlation along rows; NaN where there is none.
 
     A place counts where it correlates with at least `min_correlation`, clearly better than any rival, and where
@@ -327,16 +309,13 @@ def search_rows(
         uniqueness: largest ratio ``(1 - best) / (1 - rival)``.
     """
     out = np.full((len(uv), 2), np.nan)
-    space = _Space.of(left.shape[1])
-    _search_rows(left, right, uv, 0.5 * low, 0.5 * high, band, min_correlation, uniqueness, space, out)
-    return out
-
-
-@kernel
-def _search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, space, out):
-    """The same into `out`, at half resolution."""
+    low, high = 0.5 * low, 0.5 * high
     height, width = left.shape
     least, most = np.float32(min_correlation), np.float32(uniqueness)
+    words = np.zeros(width // 8 + 1, np.uint64)
+    patch, pixels, between = np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32)
+    scores = np.empty(width + _LANES, np.float32)
+    space = _Space(patch, pixels, between, _SIDE, scores, words.view(np.bool_), words)
     for i in range(len(uv)):
         px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
         x, y = int(np.rint(px)), int(np.rint(py))
@@ -363,3 +342,4 @@ def _search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, 
                 found, row = place, line
             elif abs(place - x) <= 1:
                 out[i, 0], out[i, 1] = 2.0 * (found + px - x) + 0.5, 2.0 * (row + py - y) + 0.5
+    return out

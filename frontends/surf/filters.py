@@ -10,28 +10,16 @@ from numpy.typing import NDArray
 
 
 class Filters(NamedTuple):
-    """The filters of one octave, a row per layer; the first and the last layer are searched for no maxima.
+    """The filters of one octave, a row per layer (L); the first and the last layer are searched for no maxima."""
 
-    Attributes:
-        step: distance of the octave's samples [px].
-        sizes: of the filters (L,) [px].
-        centre: grid steps from a filter's first pixel to its nominal centre (L,).
-        corners: offsets of the box corners along each axis (L, 10) [px], k/9 of the size, rounded half to even.
-        weights: of ``Dxx Dyy`` and of ``Dxy²`` (L, 2): each box sum divided by its own area, pixels on 0..255.
-        offsets: of the 32 box corners in the flat integral image, from the filter's top left (L, 32).
-        parts: which column phases of the three vertical parts a layer reads (L, step, 3).
-        columns: offsets (L, 10) of the ten columns it reads in the flat buffer (3, step, n) of vertical parts:
-            Dxx at corners 0, 3, 6, 9; Dyy at 2, 7; Dxy at 1, 4, 5, 8.
-    """
-
-    step: int
-    sizes: NDArray[np.int64]
-    centre: NDArray[np.int64]
-    corners: NDArray[np.uint64]
-    weights: NDArray[np.float32]
-    offsets: NDArray[np.uint64]
-    parts: NDArray[np.bool_]
-    columns: NDArray[np.uint64]
+    step: int  # distance of the octave's samples [px]
+    sizes: NDArray[np.int64]  # of the filters (L,) [px]
+    centre: NDArray[np.int64]  # grid steps from a filter's first pixel to its nominal centre (L,)
+    corners: NDArray[np.uint64]  # of the boxes along each axis (L, 10) [px], k/9 of the size, rounded half to even
+    weights: NDArray[np.float32]  # of DxxDyy and Dxy² (L, 2): box sums divided by their areas, pixels on 0..255
+    offsets: NDArray[np.uint64]  # of the 32 box corners in the flat integral image, from the top left (L, 32)
+    parts: NDArray[np.bool_]  # which column phases of the three vertical parts a layer reads (L, step, 3)
+    columns: NDArray[np.uint64]  # ten columns (L, 10) read in the buffer (3, step, n) of these: see `_read_columns`
 
 
 @lru_cache(maxsize=64)
@@ -75,7 +63,7 @@ def _corner_offsets(corners: NDArray[np.int64], stride: int) -> NDArray[np.uint6
 
 
 def _read_columns(corners: NDArray[np.int64], step: int, n: int) -> tuple[NDArray[np.bool_], NDArray[np.uint64]]:
-    """`Filters.parts` and `Filters.columns`, for `n` columns in each phase."""
+    """`Filters.parts` and `Filters.columns`: corners 0, 3, 6, 9 of Dxx, 2, 7 of Dyy, 1, 4, 5, 8 of Dxy."""
     part = np.array([0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
     read = corners[:, [0, 3, 6, 9, 2, 7, 1, 4, 5, 8]]
     parts = np.zeros((len(corners), step, 3), np.bool_)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,8 +16,9 @@ from frontends.surf.integral import integral_image
 from frontends.surf.keypoints import Keypoints
 from frontends.surf.selection import adapted_threshold, spread
 from frontends.surf.surf import Surf
+from slam.bounds import from_options
 from slam.data import ImagePair, Patches, StereoFeatures, StereoFrame
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 
 _SURPLUS = 1.35  # cost: features detected for each one needed, to have a choice when spreading them
@@ -48,44 +48,34 @@ class SurfFrontend:
 
     Args:
         rig: the stereo rig; images that are not rectified are rectified inside, results are in the rig's own pixels.
-        config: settings.
-        mask: (H, W) in the left image of the rig; features lie where it is not zero.
-        **options: single settings, see `SurfConfig`.
+        **options: see `SurfConfig`.
 
     Raises:
         ConfigurationError: an option is unknown or out of its range.
     """
 
-    def __init__(
-        self, rig: StereoRig, config: SurfConfig | None = None, mask: NDArray | None = None, **options: Any
-    ) -> None:
+    def __init__(self, rig: StereoRig, **options: Any) -> None:
         self.rig = rig
-        self.config = config = SurfConfig.with_options(config, **options)
+        self.config = config = from_options(SurfConfig, "surf", options)
         self._surf = Surf(
             config.threshold, config.octaves, config.layers, config.descriptor, config.upright, config.threads
         )
         self._threshold = float(np.clip(config.threshold, *_THRESHOLDS))
         self._white = FullScale()
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
-        self._mask = None if mask is None else self._rectified_mask(np.asarray(mask))
-        self._own_mask = self._mask
-        self._last_mask: NDArray | None = None  # of a frame, rectified in `_mask`
+        self._masks: tuple[NDArray | None, NDArray | None] = None, None  # of the last frame: as given, and rectified
 
     @property
     def threshold(self) -> float:
         """D_threshold for the next frame."""
         return self._threshold
 
-    @property
-    def surf(self) -> Surf:
-        """Detector and descriptor, with the methods of OpenCV's Feature2D."""
-        return self._surf
-
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         """Features of one stereo frame, see `slam.interfaces.Frontend`."""
         if not isinstance(frame, StereoFrame):
             raise SequenceError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
-        self._take_mask(frame.left_mask)
+        if frame.left_mask is not self._masks[0]:  # it is the same array in all frames of a sequence
+            self._masks = frame.left_mask, self._rectified_mask(frame.left_mask)
         given = [frame.left] if frame.right is None else [frame.left, frame.right]
         given = [self._checked(frame, image, side) for side, image in enumerate(given)]
         white, paired = self._white.of(given[0]), len(given) > 1
@@ -102,7 +92,15 @@ class SurfFrontend:
             return *describe(first, last), right
 
         angles, descriptors, uv_right = map(np.concatenate, zip(*self._surf.workers.over(len(keypoints), finish)))
-        return self._features(frame.stamp, replace(keypoints, angle=angles), uv_right, descriptors, threshold, images)
+        good = np.isfinite(angles)
+        uv, uv_right = keypoints.uv[good], uv_right[good]
+        if not self.rig.is_rectified:
+            uv, uv_right = self.rig.rectified.unrectify_left(uv), self.rig.rectified.unrectify_right(uv_right)
+        angles = np.zeros(len(uv)) if self.config.upright else angles[good]
+        return StereoFeatures(
+            frame.stamp, uv, uv_right, keypoints.size[good], angles, keypoints.response[good],
+            keypoints.laplacian[good], descriptors[good], threshold, images,
+        )  # fmt: skip
 
     def patches(self, images: ImagePair, uv_left: NDArray, size: NDArray) -> Patches:
         """The left image around pixels, see `slam.interfaces.AligningFrontend`."""
@@ -145,21 +143,14 @@ class SurfFrontend:
 
         return cv2.remap(image, self.rig.rectified.maps[side], None, cv2.INTER_LINEAR)
 
-    def _rectified_mask(self, mask: NDArray) -> NDArray[np.uint8]:
-        """The mask, 0 and 1, in the rectified left image."""
+    def _rectified_mask(self, mask: NDArray | None) -> NDArray[np.uint8] | None:
+        """The mask of a frame, 0 and 1, in the rectified left image."""
+        if mask is None:
+            return None
         if mask.shape != (self.rig.height, self.rig.width):
             size = "x".join(str(n) for n in mask.shape[::-1])
-            raise ConfigurationError(f"mask: {size}, but the images are {self.rig.width}x{self.rig.height}")
+            raise SequenceError(f"mask: {size}, but the images are {self.rig.width}x{self.rig.height}")
         return (self._rectify((mask != 0).astype(np.uint8), 0) != 0).astype(np.uint8)
-
-    def _take_mask(self, mask: NDArray | None) -> None:
-        """Use the mask of a frame, beside the front end's own one; it is the same array in all frames of a sequence."""
-        if mask is self._last_mask:
-            return
-        self._last_mask = mask
-        rectified = None if mask is None else self._rectified_mask(mask)
-        masks = [m for m in (self._own_mask, rectified) if m is not None]
-        self._mask = np.minimum.reduce(masks) if masks else None
 
     def _detect(self, white: float, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
         """Features, and the D_threshold that found them (paper A, III.A).
@@ -171,7 +162,7 @@ class SurfFrontend:
         target = int((_CHOICE if c.localise else 1.0) * _SURPLUS * c.features)
         for _ in range(_TRIES):
             threshold = self._threshold
-            keypoints = self._surf.detect_in(integral, white, self._mask, threshold)
+            keypoints = self._surf.detect_in(integral, white, self._masks[1], threshold)
             if c.adaptive:
                 self._threshold = adapted_threshold(threshold, len(keypoints), target, *_THRESHOLDS)
             if 2 * len(keypoints) >= target or self._threshold >= threshold:
@@ -188,7 +179,7 @@ class SurfFrontend:
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:
         """At most `limit` features, spread over the image."""
-        return keypoints.select(spread(keypoints.uv, limit, _GRID, self.rig.width, self.rig.height))
+        return keypoints.select(spread(keypoints.uv, limit, _GRID, (self.rig.width, self.rig.height)))
 
     def _match(self, views: list[_View], images: ImagePair, uv: NDArray, size: NDArray) -> NDArray[np.float64]:
         """Right pixels (N, 2) of left features in the rectified images, NaN where unmatched."""
@@ -209,7 +200,7 @@ class SurfFrontend:
         c = self.config
         assert images.right is not None
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
-        reaches = (_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)
+        reaches = np.array([(_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)])
         return refine(images.left, images.right, uv, size, start, _CORRELATION, reaches, self._windows)
 
     def _disparities(self) -> tuple[float, float]:
@@ -218,26 +209,3 @@ class SurfFrontend:
         shift = rectified_rig.left.u0 - rectified_rig.right.u0
         product = rectified_rig.left.fu * rectified_rig.baseline
         return product / self.config.max_depth + shift, product / self.config.min_depth + shift
-
-    def _features(
-        self,
-        stamp: float,
-        keypoints: Keypoints,
-        uv_right: NDArray,
-        descriptors: NDArray[np.float32],
-        threshold: float,
-        images: ImagePair,
-    ) -> StereoFeatures:
-        """Those features that have an angle, in pixels of the rig's own images."""
-        good = np.isfinite(keypoints.angle)
-        if not good.all():
-            keypoints, uv_right, descriptors = keypoints.select(good), uv_right[good], descriptors[good]
-        uv_left: NDArray = keypoints.uv
-        if not self.rig.is_rectified:
-            uv_left = self.rig.rectified.unrectify_left(uv_left)
-            uv_right = self.rig.rectified.unrectify_right(uv_right)
-        angle = np.zeros(len(keypoints)) if self.config.upright else keypoints.angle
-        return StereoFeatures(
-            stamp, uv_left, uv_right, keypoints.size, angle, keypoints.response, keypoints.laplacian, descriptors,
-            threshold, images,
-        )  # fmt: skip

@@ -8,7 +8,6 @@ response a continuous function of position and size; its maximum is found by New
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.kernels.linear import invert
 from slam.runtime.compilation import disjoint_vector_helper, helper, kernel, vector_helper
@@ -116,19 +115,13 @@ def _inverse_curvature(space):
     return invert(hessian, inverse) < 0.0 and xx < 0.0 and xx * yy - xy * xy > 0.0
 
 
-def localise(
-    integral: NDArray[np.float64],
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    size: NDArray[np.float64],
-    reach: float,
-) -> NDArray[np.float64]:
+@kernel
+def localise(integral, uv, size, reach):
     """Maximum of the response next to each feature, in continuous position and size.
 
     Args:
         integral: see `float_integral_image`.
-        x: columns of the features (N,) [px].
-        y: their rows (N,) [px].
+        uv: pixels of the features (N, 2).
         size: their sizes (N,) [px].
         reach: furthest that a feature may move, in units of its size.
 
@@ -136,23 +129,19 @@ def localise(
         (N, 4): x, y, size [px] and the response (for the image's own pixel values) of each; NaN where there is no
         maximum in reach, or where the filter would leave the image.
     """
-    out = np.full((len(x), 4), np.nan)
-    lanes = int(_WIDEST * size.max(initial=0.0)) + 2 * _LANES
+    out, largest = np.full((len(uv), 4), np.nan), 0.0
+    for i in range(len(size)):
+        largest = max(largest, size[i])
+    lanes = int(_WIDEST * largest) + 2 * _LANES
     space = (  # corners of a filter, vertical parts, responses, their Hessian and its inverse, and a step
         np.empty(10, np.uint64), np.empty(10), np.empty(3 * lanes), np.empty((3, 3, 3)), np.empty((3, 3)),
         np.empty((3, 3)), np.empty(3),
     )  # fmt: skip
-    _localise(integral.reshape(-1), integral.shape, x, y, size, reach, space, out)
-    return out
-
-
-@kernel
-def _localise(pixels, shape, x, y, size, reach, space, out):
-    """The same into `out`, on the flat integral image."""
-    rows, stride = shape
+    pixels = integral.reshape(-1)
+    rows, stride = integral.shape
     cube, _, inverse, step = space[3:]
-    for i in range(x.size):
-        u, v, s = x[i], y[i], size[i]
+    for i in range(len(uv)):
+        u, v, s = uv[i, 0], uv[i, 1], size[i]
         for k in range(_ITERATIONS):
             room = (0.5 * (1.0 + _SIZE_STEP) + _STEP) * s + 1.0
             if not (room < u < stride - 2 - room and room < v < rows - 2 - room):
@@ -172,26 +161,27 @@ def _localise(pixels, shape, x, y, size, reach, space, out):
             u += shrink * step[0] * _STEP * s
             v += shrink * step[1] * _STEP * s
             s *= 1.0 + shrink * step[2] * _SIZE_STEP
-            if (u - x[i]) ** 2 + (v - y[i]) ** 2 > (reach * size[i]) ** 2 or not 0.6 < s / size[i] < 1.7:
+            if (u - uv[i, 0]) ** 2 + (v - uv[i, 1]) ** 2 > (reach * size[i]) ** 2 or not 0.6 < s / size[i] < 1.7:
                 break
             if largest < _CONVERGED:
                 out[i, 0], out[i, 1], out[i, 2], out[i, 3] = u, v, s, cube[1, 1, 1]
                 break
+    return out
 
 
-def first_of_each(x: NDArray, y: NDArray, size: NDArray) -> NDArray[np.bool_]:
-    """Mark features (N,) that no earlier one equals: closer than a twentieth of the size, size within a tenth.
+@kernel
+def first_of_each(order, uv, size):
+    """Mark features (N,), strongest first, that no stronger one equals.
 
-    Features are compared with those that follow them closely by x, where their equals are.
+    Equal ones lie closer than a twentieth of the size, with sizes within a tenth; `order` is that of their columns.
     """
-    keep = np.ones(len(x), bool)
-    order = np.argsort(x, kind="stable")
-    padded = np.full((3, len(x) + _FOLLOWERS), np.inf)
-    padded[:, : len(x)] = x[order], y[order], size[order]
-    first = padded[:, : len(x)]
-    later = np.stack([padded[:, lag : lag + len(x)] for lag in range(1, _FOLLOWERS + 1)], axis=1)  # (3, lags, N)
-    near = 0.05 * np.maximum(first[2], later[2])
-    dx, dy, ds = later - first[:, None]
-    lag, i = np.nonzero((dx * dx + dy * dy < near * near) & (np.abs(ds) < 2.0 * near))
-    keep[np.maximum(order[i], order[i + 1 + lag])] = False
+    keep = np.ones(len(order), np.bool_)
+    for i in range(len(order)):
+        a = order[i]
+        for j in range(i + 1, min(i + 1 + _FOLLOWERS, len(order))):
+            b = order[j]
+            near = 0.05 * max(size[a], size[b])
+            dx, dy = uv[b, 0] - uv[a, 0], uv[b, 1] - uv[a, 1]
+            if dx * dx + dy * dy < near * near and abs(size[b] - size[a]) < 2.0 * near:
+                keep[max(a, b)] = False
     return keep

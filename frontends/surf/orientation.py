@@ -18,17 +18,11 @@ _WINDOW = 23  # fixed: bins in 60 degrees, the ends left out
 
 
 class Disc(NamedTuple):
-    """Samples of the disc, and the bins of whole degrees.
+    """Samples of the disc, and the bins of whole degrees."""
 
-    Attributes:
-        places: numbers of the samples' columns and rows (113, 2), from 0.
-        weights: their Gaussian weights (113,).
-        bins: bin of each degree 0..360 (361,), counted from the first window's first one.
-    """
-
-    places: NDArray[np.uint64]
-    weights: NDArray[np.float32]
-    bins: NDArray[np.uint64]
+    places: NDArray[np.uint64]  # numbers of the samples' columns and rows (113, 2), from 0
+    weights: NDArray[np.float32]  # their Gaussian weights (113,)
+    bins: NDArray[np.uint64]  # bin of each degree 0..360 (361,), counted from the first window's first one
 
 
 def _disc() -> Disc:
@@ -123,31 +117,25 @@ def _strongest_window(space, n, bins):
     return angle if angle >= 0 else angle + 2 * np.pi
 
 
-def orientations(
-    integral: NDArray[np.int32], x: NDArray[np.float64], y: NDArray[np.float64], size: NDArray[np.float64]
-) -> NDArray[np.float64]:
+@kernel
+def orientations(integral, uv, size, disc):
     """Angles (N,) [rad], y down, in 0..2π, of features; NaN where no wavelet fits into the image.
 
     Args:
         integral: see `integral_image`.
-        x: columns of the features (N,) [px].
-        y: their rows (N,) [px].
+        uv: pixels of the features (N, 2).
         size: their sizes (N,) [px].
+        disc: `DISC`.
     """
-    out = np.full(len(x), np.nan)
-    (lefts, tops), n = np.empty((2, 2 * RADIUS + 1), np.int64), len(DISC.weights)
-    gx, gy = np.empty((2, n), np.float32)
-    space = lefts, tops, gx, gy, np.empty(n, np.int32), np.empty((2, _BINS + _WINDOW + 1))
-    _orientations(integral.reshape(-1), integral.shape, x, y, size, DISC, space, out)
-    return out
-
-
-@kernel
-def _orientations(pixels, shape, x, y, size, disc, space, out):
-    """The same into `out`, on the flat integral image."""
-    for i in range(x.size):
-        s = size[i] * (1.2 / 9.0)
-        count = _sample_gradients(pixels, shape[0], shape[1], x[i], y[i], s, disc, space)
+    out, n = np.full(len(uv), np.nan), len(disc.weights)
+    space = (  # columns and rows of the samples, gradients, their angles, and sums
+        np.empty(2 * RADIUS + 1, np.int64), np.empty(2 * RADIUS + 1, np.int64), np.empty(n, np.float32),
+        np.empty(n, np.float32), np.empty(n, np.int32), np.empty((2, _BINS + _WINDOW + 1)),
+    )  # fmt: skip
+    pixels, rows, columns = integral.reshape(-1), integral.shape[0], integral.shape[1]
+    for i in range(len(uv)):
+        count = _sample_gradients(pixels, rows, columns, uv[i, 0], uv[i, 1], size[i] * (1.2 / 9.0), disc, space)
         _degrees(space[2], space[3], space[4], count)
         if count > 0:
             out[i] = _strongest_window(space, count, disc.bins)
+    return out

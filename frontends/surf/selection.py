@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.runtime.compilation import kernel
+
 _DEAD_BAND = 0.15  # relative error of the count that is left alone
 _LARGEST_STEP = 4.0  # the threshold changes by at most this factor
 _GAIN = 0.8  # the count falls more slowly than the threshold rises, so that this damps
@@ -22,7 +24,7 @@ def adapted_threshold(threshold: float, count: int, target: int, least: float, m
     return float(np.clip(threshold, least, most))
 
 
-def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], width: int, height: int) -> NDArray[np.int64]:
+def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], size: tuple[int, int]) -> NDArray[np.intp]:
     """Rows of at most `limit` features, spread over the image.
 
     Args:
@@ -30,21 +32,30 @@ def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], width: in
         limit: number to keep.
         grid: columns and rows of cells; each has an equal share of `limit`. What some cells leave over goes to the
             strongest of the others.
-        width: of the image [px].
-        height: of the image [px].
+        size: width and height of the image [px].
 
     Returns:
         Indices (K,), ascending, so still strongest first.
     """
     if len(uv) <= limit:
         return np.arange(len(uv))
-    column = np.clip((uv[:, 0] * (grid[0] / width)).astype(np.int64), 0, grid[0] - 1)
-    row = np.clip((uv[:, 1] * (grid[1] / height)).astype(np.int64), 0, grid[1] - 1)
-    cell = row * grid[0] + column
-    order = np.argsort(cell, kind="stable")
-    starts = np.searchsorted(cell[order], np.arange(grid[0] * grid[1]))
-    rank = np.empty(len(uv), np.int64)
-    rank[order] = np.arange(len(uv)) - starts[cell[order]]
+    return np.flatnonzero(_served(uv, limit, grid, size))
+
+
+@kernel
+def _served(uv, limit, grid, size):
+    """Which features (N,) are kept: the share of each cell first, then the strongest of the others."""
+    kept, count = np.zeros(len(uv), np.bool_), np.zeros((grid[1], grid[0]), np.int64)
     share = -(-limit // (grid[0] * grid[1]))
-    first_served = np.argsort(np.minimum(rank // share, 1), kind="stable")
-    return np.sort(first_served[:limit])
+    for k in range(len(uv)):
+        column = min(max(int(uv[k, 0] * (grid[0] / size[0])), 0), grid[0] - 1)
+        row = min(max(int(uv[k, 1] * (grid[1] / size[1])), 0), grid[1] - 1)
+        if limit > 0 and count[row, column] < share:
+            kept[k] = True
+            limit -= 1
+        count[row, column] += 1
+    for k in range(len(uv)):
+        if limit > 0 and not kept[k]:
+            kept[k] = True
+            limit -= 1
+    return kept

@@ -17,7 +17,7 @@ from frontends.surf.images import FULL_SCALE, binary_mask, grey
 from frontends.surf.integral import float_integral_image, integral_image
 from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
 from frontends.surf.localisation import first_of_each, localise
-from frontends.surf.orientation import orientations
+from frontends.surf.orientation import DISC, orientations
 from frontends.surf.workers import Workers
 from slam.errors import ConfigurationError
 
@@ -86,7 +86,7 @@ class Surf:
             ConfigurationError: a value is out of its range.
 
         Examples:
-            >>> Surf.create(400).getNOctaves()
+            >>> Surf.create(400).octaves
             4
         """
         surf = cls(hessianThreshold, nOctaves, nOctaveLayers, 64, upright)
@@ -136,8 +136,6 @@ class Surf:
         integral = integral_image(image)
         mask = None if mask is None else binary_mask(mask, image.shape)
         return self.describe_in(integral, self.detect_in(integral, FULL_SCALE[image.dtype], mask))
-
-    # What people know from OpenCV's Feature2D; `detect` is above, and gives what serves as a list of cv2.KeyPoint.
 
     def compute(
         self, image: NDArray, keypoints: Iterable[cv2.KeyPoint]
@@ -266,21 +264,17 @@ class Surf:
         if not len(keypoints):
             return keypoints
         integral = float_integral_image(image)
-        x, y = np.ascontiguousarray(keypoints.uv.T)
-        size = np.ascontiguousarray(keypoints.size)
-        place = np.concatenate(
-            self.workers.over(len(x), lambda a, b: localise(integral, x[a:b], y[a:b], size[a:b], _REACH))
-        )
+        uv, size = keypoints.uv, keypoints.size
+        place = np.concatenate(self.workers.over(len(uv), lambda a, b: localise(integral, uv[a:b], size[a:b], _REACH)))
         rows = np.flatnonzero(np.isfinite(place[:, 0]))
-        place = place[rows]
-        response = place[:, 3] * (255.0 / full_scale) ** 2
+        response = place[rows, 3] * (255.0 / full_scale) ** 2
         order = np.argsort(-response, kind="stable")
-        place, rows, response = place[order], rows[order], response[order]
-        x, y, size = np.ascontiguousarray(place[:, :3].T)
-        first = first_of_each(x, y, size)
+        rows, response = rows[order], response[order]
+        uv, size = place[rows, :2], place[rows, 2]
+        first = first_of_each(np.argsort(uv[:, 0], kind="stable"), uv, size)
         rows = rows[first]
         return Keypoints(
-            place[first, :2], size[first], keypoints.angle[rows], response[first], keypoints.laplacian[rows],
+            uv[first], size[first], keypoints.angle[rows], response[first], keypoints.laplacian[rows],
             keypoints.octave[rows],
         )  # fmt: skip
 
@@ -295,16 +289,12 @@ class Surf:
         self, integral: NDArray[np.int32], keypoints: Keypoints
     ) -> Callable[[int, int], tuple[NDArray[np.float64], NDArray[np.float32]]]:
         """What returns the angles [rad], NaN where there is none, and the descriptors of features number a to b."""
-        x, y = np.ascontiguousarray(keypoints.uv.T)
-        size = np.ascontiguousarray(keypoints.size)
         box = UPRIGHT_BOX if self.upright else TURNED_BOX
 
         def orient_and_describe(a: int, b: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-            upright = np.full(b - a, UPRIGHT_ANGLE)
-            angle = upright if self.upright else orientations(integral, x[a:b], y[a:b], size[a:b])
-            return angle, describe(
-                integral, x[a:b], y[a:b], size[a:b], np.where(np.isfinite(angle), angle, 0.0), box, self._weights
-            )
+            uv, size = keypoints.uv[a:b], keypoints.size[a:b]
+            angle = np.full(b - a, UPRIGHT_ANGLE) if self.upright else orientations(integral, uv, size, DISC)
+            return angle, describe(integral, uv, size, np.nan_to_num(angle), box, self._weights)
 
         return orient_and_describe
 

@@ -140,7 +140,7 @@ class SchmidtFilter:
             ids: landmarks that measured it (M,).
             positions: their estimated positions (M, 3) [m] in world coordinates.
         """
-        T, now = T_world_left @ self._model.rig.rectified.T_left_rectified, self._now
+        T, now = T_world_left, self._now
         if self._stamp is None:
             now = Sensitivities.start(T, self._columns)
         else:
@@ -191,7 +191,7 @@ class SchmidtFilter:
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
         factor, marks, positions = self._factor(covariance), self._now.landmarks, estimate.covariances
-        J, known = self._by_left_camera() @ factor, isin(estimate.ids, marks.ids)
+        J, known = self.pose @ factor, isin(estimate.ids, marks.ids)
         if known.any():
             L = marks.by_rig[marks.rows_of(estimate.ids[known])] @ factor
             positions = positions.copy()
@@ -208,7 +208,7 @@ class SchmidtFilter:
             covariance: of the parameters (n, n).
             kept: the correction (n,) that the path was made with, after all changes told to `path_keeps`.
         """
-        J = self._by_left_camera()
+        J = self.pose.copy()
         J[:, -1] -= J[:, :-2] @ kept
         known = np.concatenate([kept, [0.0, 1.0]])
         return CommonError(J, np.column_stack([self._factor(covariance)[:, :-1], known]))
@@ -222,10 +222,6 @@ class SchmidtFilter:
     def landmarks(self) -> LandmarkSensitivities:
         """Those of landmarks."""
         return self._now.landmarks
-
-    def _by_left_camera(self) -> Array:
-        """Derivative of the pose (6, n + 2) in the axes of the left camera."""
-        return adjoint(self._model.rig.rectified.T_left_rectified) @ self.pose
 
     def _factor(self, covariance: Array) -> Array:
         """Square root (n + 2, n + 2) of the covariance of parameters (n, n), baseline and unit column.
@@ -309,7 +305,7 @@ class RemainingRigError:
         """The back end's estimate with the rig's uncertainty added."""
         if not self._calibration.config.enabled:
             return estimate
-        return self.uncertainty.added_to(estimate, self._calibration.posterior.covariance)
+        return self.uncertainty.added_to(estimate, self._calibration.covariance)
 
     def common(self, as_reported: bool) -> CommonError:
         """The part of the pose's error that it shares with those of other frames.
@@ -321,4 +317,4 @@ class RemainingRigError:
         if not self._calibration.config.enabled:
             return CommonError()
         made_with = self._calibration.applied.parameters if as_reported else self.uncertainty.kept
-        return self.uncertainty.shared(self._calibration.posterior.covariance, made_with)
+        return self.uncertainty.shared(self._calibration.covariance, made_with)

@@ -36,14 +36,11 @@ class RigCorrection:
         return replace(features, uv_left=uv_left, uv_right=uv_right)
 
     def pixels(self, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
-        """Corrected pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
-        rectified_rig = self.model.rig.rectified
-        left, right = rectified_rig.rectify_left(uv_left), rectified_rig.rectify_right(uv_right)
-        z = np.column_stack([left, right[:, 0]])
-        vertical = right[:, 1] - left[:, 1] + self.model.vertical(self.model.points(z)) @ self.parameters
-        z = self.rows(z)
-        new_right = np.column_stack([z[:, 2], z[:, 1] + vertical])
-        return rectified_rig.unrectify_left(z[:, :2]), rectified_rig.unrectify_right(new_right)
+        """Corrected rectified pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
+        points = self.model.points(np.column_stack([uv_left, uv_right[:, 0]]))
+        vertical = uv_right[:, 1] - uv_left[:, 1] + self.model.vertical(points) @ self.parameters
+        z = self.model.rows(points + self.model.shift(points, self.parameters))
+        return z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -80,12 +79,15 @@ class SelfCalibration:
         return self._motion.count
 
     @property
+    def covariance(self) -> Array:
+        """Of the present posterior (n, n)."""
+        covariance = self._solution.covariance
+        return covariance if self._kept else covariance + np.diag(self._systematic)  # else it is in the evidence
+
+    @property
     def posterior(self) -> RigPosterior:
         """The present posterior of the rig's error."""
-        covariance = self._solution.covariance
-        if not self._kept:  # else it is in the evidence
-            covariance = covariance + np.diag(self._systematic)
-        return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), covariance)
+        return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), self.covariance)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
@@ -127,16 +129,6 @@ class SelfCalibration:
         if not self.config.enabled or not self.applied.parameters.any():
             return features
         return self.applied.features(features)
-
-    def correct_again(self, corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:
-        """`correct` features that have moved since they were corrected: `now`, those of `before` that moved alone."""
-        if corrected is before:
-            return now
-        moved = (now.uv_left != before.uv_left) | (now.uv_right != before.uv_right)
-        rows = np.flatnonzero(moved.any(axis=1))
-        uv_left, uv_right = corrected.uv_left.copy(), corrected.uv_right.copy()
-        uv_left[rows], uv_right[rows] = self.applied.pixels(now.uv_left[rows], now.uv_right[rows])
-        return replace(now, uv_left=uv_left, uv_right=uv_right)
 
     def observe(self, features: StereoFeatures, T_world_left: Array) -> None:
         """Learn from one frame's features as measured, not corrected.

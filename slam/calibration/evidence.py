@@ -108,7 +108,7 @@ class Accumulator:
         `mean` (n,) is near that solution or not; `covariance` (n, n) is without residual fields.
         """
         count = len(self._blocks)
-        if count < 2:
+        if count < 2 or self._in_last < self._length:  # it changes slowly: once a block is enough
             return
         total_S, total_e = (sum(block[i] for block in self._blocks) for i in (0, 1))
         # 1e-12: least eigenvalue of an information that counts, as a share of the largest

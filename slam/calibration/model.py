@@ -79,24 +79,22 @@ class RigModel:
         A shift of both principal points looks almost like a rotation of the whole rig, and neither is known well. Lest
         the pose rotate with each revision, the ideal rig is rotated such that the left image as a whole does not move.
         """
-        by_turn = _turn(points, self.focal).reshape(-1, 3) @ self._gauge
-        return np.asarray(_field(points, self.focal) + by_turn.reshape(len(points), 3, len(self.names)))
+        field, n = _field(points, self.focal), len(self.names)
+        return np.asarray(field[:, :, :n] + field[:, :, n:] @ self._gauge)
 
     def shift(self, points: Array, parameters: Array) -> Array:
         """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,): ``field(points) @ parameters``."""
-        field = _field(points, self.focal)
-        shift = field.reshape(-1, field.shape[2]) @ parameters
-        shift += _turn(points, self.focal).reshape(-1, 3) @ (self._gauge @ parameters)
-        return np.asarray(shift.reshape(-1, 3))
+        from slam.calibration.model_kernels import shift
+
+        both = np.concatenate([parameters, self._gauge @ parameters])
+        return np.asarray(shift(np.ascontiguousarray(points), self.focal, both))
 
     @cached_property
     def _gauge(self) -> Array:
         """Rotation of the ideal rig (3, n) [rad] that cancels the left image's mean displacement by the parameters."""
-        far = self.far()
-        turned, moved = (
-            rows[:, :2].reshape(2 * len(far), -1) for rows in (_turn(far, self.focal), _field(far, self.focal))
-        )
-        return -np.asarray(np.linalg.lstsq(turned, moved, rcond=None)[0])
+        n = len(self.names)
+        rows = _field(self.far(), self.focal)[:, :2].reshape(-1, n + 3)
+        return -np.asarray(np.linalg.lstsq(rows[:, n:], rows[:, :n], rcond=None)[0])
 
     def vertical(self, points: Array) -> Array:
         """Change (N, n) [px] of the vertical disparity, right row less left row, by the parameters.
@@ -151,20 +149,7 @@ def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _field(points: Array, focal: float) -> Array:
-    """Change (N, 3, n) [px] of points ``(x, y, d)`` (N, 3) [px] by the parameters, without the rig's rotation."""
+    """Change (N, 3, n + 3) [px] of points ``(x, y, d)`` (N, 3) [px] by the parameters, and by a turn of the rig."""
     from slam.calibration.model_kernels import field
 
-    out = np.empty((len(points), 3, 2 * len(LENS) + len(POSE)))
-    field(np.ascontiguousarray(points), focal, out)
-    return out
-
-
-def _turn(points: Array, focal: float) -> Array:
-    """Change (N, 3, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by a small rotation of the rig [rad]."""
-    x, y, d = points.T / focal
-    out = np.zeros((len(points), 3, 3))
-    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = -x * y, 1 + x * x, -y
-    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = -1 - y * y, x * y, x
-    out[:, 2, 0], out[:, 2, 1] = -d * y, d * x
-    out *= focal
-    return out
+    return np.asarray(field(np.ascontiguousarray(points), focal))

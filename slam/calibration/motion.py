@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.calibration.evidence import Evidence, student_weights
+from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
-from slam.geometry.se3 import Array, so3_exp
+from slam.geometry.se3 import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,28 +64,14 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
     `R` (3, 3) and `t` (3,) [baselines] a first guess. Of the `noise`, a point's covariance (3, 3) [px²], only the form
     matters.
     """
-    from slam.calibration.motion_kernels import move_points
+    from slam.calibration.motion_kernels import fit
 
     first, second = (np.ascontiguousarray(a, float) for a in (first, second))
-    points, at = first, Linear.empty(len(first))
-    for _ in range(20):  # 20: of Gauss-Newton at most
-        at = linearised(first, second, points, R, t, focal, noise, at)
-        distance = np.einsum("ni,ni->n", at.residual, at.residual)
-        if not np.isfinite(distance).all():
-            return None
-        weights = student_weights(distance, 3, 0.2)  # no less than a fifth of the configured noise
-        J = at.motion.reshape(-1, 6)
-        weighted = np.repeat(weights, 3) * J.T
-        normal = weighted @ J
-        step = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(6), weighted @ at.residual.reshape(-1))
-        if not np.isfinite(step).all():
-            return None
-        R, t = so3_exp(step[:3]) @ R, t + step[3:]
-        points = np.empty_like(first)
-        last = move_points(first, at.J_point, at.J_motion, at.motion, at.white, at.residual, noise, step, points)
-        if last < 1e-3:  # 1e-3: last change of a predicted point [px]; at 0.02 focal lengths were wrong by percents
-            break
-    # 3e-3: the same after the last iteration: in some pairs single points oscillate
+    points, at, weights = first.copy(), Linear.empty(len(first)), np.empty(len(first))
+    R, t = np.array(R, float), np.array(t, float)
+    median_of_chi_square = chi_square_limit(3, 0.5)
+    last = fit(first, second, points, R, t, focal, noise, median_of_chi_square, weights, *at)
+    # 3e-3: change of a predicted point [px] in the last iteration: in some pairs single points oscillate
     return Fit(R, t, points, at, weights) if last < 3e-3 else None
 
 
@@ -166,16 +152,14 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     return at.moved, at.J_point, at.J_motion
 
 
-def linearised(
-    first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array,
-    out: Linear | None = None,
-) -> Linear:  # fmt: skip
-    """A motion linearised at estimates of the first view's points, as `fit_motion` needs it; into `out` if given.
+def linearised(first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
+    """A motion linearised at estimates of the first view's points, as `fit_motion` needs it.
 
     The residuals carry the points' own corrections to first order.
     """
+    first, second, points = (np.ascontiguousarray(a, float) for a in (first, second, points))
     from slam.calibration.motion_kernels import linearise
 
-    out = Linear.empty(len(points)) if out is None else out
-    linearise(*(np.ascontiguousarray(a, float) for a in (first, second, points, R, t)), focal, noise, *out)
+    out = Linear.empty(len(points))
+    linearise(first, second, points, np.ascontiguousarray(R), np.ascontiguousarray(t), focal, noise, *out)
     return out

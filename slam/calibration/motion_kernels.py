@@ -4,12 +4,69 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import whitener
-from slam.runtime.compilation import kernel
+from slam.kernels.linear import factorise, solve_factorised, whitener
+from slam.kernels.se3 import exp
+from slam.runtime.compilation import helper, kernel
 
 
 @kernel
 def linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, motion, white, residual):
+    """`_linearise`, for Python."""
+    _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, motion, white, residual)
+
+
+@kernel
+def fit(
+    first, second, points, R, t, focal, noise, median, weights, moved, J_point, J_motion, motion, white, residual
+):  # fmt: skip
+    """Gauss-Newton of `slam.calibration.motion.fit_motion` on R, t and `points`, all in place.
+
+    Points are weighted as in `slam.calibration.robust.student_weights`, `median` being that of χ². Returns the last
+    change of a predicted point [px], infinite where there is no solution.
+    """
+    H, step, turn, before, last = np.empty((6, 6)), np.empty(6), np.empty((3, 4)), np.empty((3, 3)), np.inf
+    for _ in range(20):  # 20: iterations at most
+        _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, motion, white, residual)
+        for n in range(len(first)):
+            weights[n] = residual[n, 0] ** 2 + residual[n, 1] ** 2 + residual[n, 2] ** 2
+        ordered = np.sort(weights)
+        middle = 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+        if not np.isfinite(ordered[len(ordered) - 1]):  # NaN is sorted to the end
+            return np.inf
+        scale = max(middle / median, 0.2 * 0.2)  # no less than a fifth of the configured noise
+        for i in range(6):
+            step[i] = 0.0
+            for j in range(6):
+                H[i, j] = 0.0
+        for n in range(len(first)):
+            weights[n] = 7.0 / (4.0 + weights[n] / scale) / scale
+            for k in range(3):
+                for i in range(6):
+                    share = weights[n] * motion[n, k, i]
+                    step[i] += share * residual[n, k]
+                    for j in range(i + 1):
+                        H[i, j] += share * motion[n, k, j]
+        ridge = 1e-12 * (H[0, 0] + H[1, 1] + H[2, 2] + H[3, 3] + H[4, 4] + H[5, 5])
+        for i in range(6):
+            H[i, i] += ridge
+        factorise(H, 6)
+        solve_factorised(H, 6, step)
+        exp(step, turn)
+        for i in range(3):
+            t[i] += step[3 + i]
+            for j in range(3):
+                before[i, j] = R[i, j]
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = turn[i, 0] * before[0, j] + turn[i, 1] * before[1, j] + turn[i, 2] * before[2, j]
+        last = _move_points(first, J_point, J_motion, motion, white, residual, noise, step, points)
+        if not last >= 1e-3:  # 1e-3: [px]; at 0.02 focal lengths were wrong by percents
+            break
+    return last if np.isfinite(last) else np.inf
+
+
+@helper
+def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, motion, white, residual):
     """Moved points, their Jacobians, and the second view's residuals whitened by their noise.
 
     NaN where the covariance of a residual is not positive definite. See `slam.calibration.motion.Linear` for the
@@ -60,8 +117,8 @@ def linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motio
                     motion[n, i, k] += white[n, i, j] * J_motion[n, j, k]
 
 
-@kernel
-def move_points(first, J_point, J_motion, motion, white, residual, noise, step, points):
+@helper
+def _move_points(first, J_point, J_motion, motion, white, residual, noise, step, points):
     """The first view's points after a step (6,) of the motion, into `points` (N, 3); returns how far they move [px].
 
     That is the largest change of a coordinate of a point in the second view. For the other arguments see

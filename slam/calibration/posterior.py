@@ -60,29 +60,21 @@ def solve(prior: Prior, residual: float, evidence: Evidence, known: Evidence | N
         evidence: of the data, from which the prior's scales follow.
         known: evidence of which the parameters' posterior is computed; None if it is `evidence`.
     """
-    e, information, covariances, steps = _by_scale(prior, evidence)
-    logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(information)[1] + steps @ e)
+    e, information = evidence.e - evidence.S @ prior.mean, prior.information + evidence.S
+    fits = np.linalg.solve(information, np.broadcast_to(e[:, None], (len(information), len(e), 1)))[..., 0] @ e
+    logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(information)[1] + fits)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    if known is None:
-        known = evidence
-    else:
-        _, _, covariances, steps = _by_scale(prior, known)
+    known = evidence if known is None else known
+    likely = weights > 1e-12  # numerics: of a scale, beside the likeliest
+    prior_information, weights = prior.information[likely], weights[likely]
+    covariances = np.linalg.inv(prior_information + known.S)
+    steps = covariances @ (known.e - known.S @ prior.mean)
     step = weights @ steps
     off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
     moved = residual * np.tensordot(weights, covariances, axes=1) @ known.cross
     return Solution(prior.mean + step, inner, inner + residual_variance() * moved @ moved.T, residual)
-
-
-def _by_scale(prior: Prior, evidence: Evidence) -> tuple[Array, Array, Array, Array]:
-    """Information vector about the prior's mean (n,); for each scale of the prior (K) the posterior's information and
-    covariance (K, n, n), and the change of the mean (K, n).
-    """
-    information = prior.information + evidence.S
-    covariances = np.linalg.inv(information)
-    e = evidence.e - evidence.S @ prior.mean
-    return e, information, covariances, covariances @ e
 
 
 def residual_scale(prior: Prior, rows: Evidence) -> float:

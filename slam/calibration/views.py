@@ -47,15 +47,13 @@ class View:
 
     @classmethod
     def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array, most: int) -> View:
-        """Of the strongest features as measured, `most` at the most, at a pose (4, 4) of the left camera."""
-        rectified, rows = model.rig.rectified, np.flatnonzero(features.has_stereo)
+        """Of the strongest features as measured, in rectified pixels, `most` at the most, at a pose (4, 4)."""
+        rows = np.flatnonzero(features.has_stereo)
         if len(rows) > most:
             rows = np.sort(rows[np.argsort(-features.response[rows], kind="stable")[:most]])
-        left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
-        points, vertical = model.points(np.column_stack([left, right[:, 0]])), right[:, 1] - left[:, 1]
-        good = np.isfinite(points).all(axis=1) & np.isfinite(vertical)
-        rows, T = rows[good], T_world_left @ rectified.T_left_rectified
-        return cls(points[good], vertical[good], features.descriptors[rows], features.laplacian[rows], T)
+        left, right = features.uv_left[rows], features.uv_right[rows]
+        points = model.points(np.column_stack([left, right[:, 0]]))
+        return cls(points, right[:, 1] - left[:, 1], features.descriptors[rows], features.laplacian[rows], T_world_left)
 
 
 def match(first: View, second: View) -> Rows:

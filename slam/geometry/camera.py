@@ -15,6 +15,8 @@ from slam.geometry.se3 import Array
 #: Distortion models and the number of coefficients each accepts.
 DISTORTION_MODELS = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
 
+_NEAREST = 1e-9  # numerics: no depth up to this [m] is projected
+
 _WIDEST = 100_000  # guard: width or height [px]
 
 
@@ -122,7 +124,10 @@ class PinholeCamera:
 
     def project(self, points: Array) -> Array:
         """Pixels (N, 2) of points (N, 3) [m] in camera coordinates; NaN for points not in front of the camera."""
-        return self.project_with_jacobian(points, jacobian=False)[0]
+        if self.has_distortion:
+            return self.project_with_jacobian(points, jacobian=False)[0]
+        z = np.where(points[:, 2:] > _NEAREST, points[:, 2:], np.nan)
+        return np.asarray(points[:, :2] / z * (self.fu, self.fv) + (self.u0, self.v0))
 
     def project_with_jacobian(self, points: Array, jacobian: bool = True) -> tuple[Array, Array]:
         """Pixels (N, 2) and Jacobian (N, 2, 3) [px/m] of the projection by the point.
@@ -130,7 +135,7 @@ class PinholeCamera:
         Rows of points at or behind the camera are NaN (never a mirrored pixel).
         """
         points = np.asarray(points, float).reshape(-1, 3)
-        z = np.where(points[:, 2] > 1e-9, points[:, 2], np.nan)
+        z = np.where(points[:, 2] > _NEAREST, points[:, 2], np.nan)
         a, b = points[:, 0] / z, points[:, 1] / z
         distorted, D = self._distort(np.stack([a, b], axis=1), jacobian)
         uv = distorted * (self.fu, self.fv) + (self.u0, self.v0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.geometry.arrays import BoolArray, median
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, inverse, points_by_pose
+from slam.geometry.se3 import Array, inverse
 
 #: fixed: Stereo points that fix a pose.
 MINIMAL_POINTS = 3
@@ -26,15 +26,10 @@ _CONVERGED = 1e-4  # numerics: step [rad], [m] after which the pose has converge
 
 @dataclass(frozen=True, eq=False)
 class PoseConsensus:
-    """A pose and the matches that agree with it.
+    """A pose and the matches that agree with it."""
 
-    Attributes:
-        T_world_left: pose (4, 4).
-        inliers: which matches agree (M,).
-    """
-
-    T_world_left: Array
-    inliers: BoolArray
+    T_world_left: Array  # pose (4, 4)
+    inliers: BoolArray  # which matches agree (M,)
 
 
 def measurement_rows(uv_left: Array, uv_right: Array) -> Array:
@@ -52,7 +47,7 @@ def find_consensus(
     errors; where most matches have no right pixel, poses from three left pixels (P3P).
 
     Args:
-        rig: the cameras.
+        rig: the rectified pair.
         points: landmark positions (M, 3) in world coordinates [m].
         measured: (M, 3) = (uL, vL, uR), uR NaN for monocular rows.
         guess: expected pose T_world_left (4, 4).
@@ -145,20 +140,13 @@ def _some(mask: BoolArray) -> NDArray[np.intp]:
 
 def _refined(rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.intp], T: Array, steps: int) -> Array:
     """Least-squares poses (H, 4, 4) from poses T, each by the matches `rows` (H, K)."""
-    if rig.is_rectified:
-        from slam.geometry.pose_kernels import gauss_newton
+    from slam.geometry.pose_kernels import gauss_newton
 
-        T, one, nothing = T.copy(), np.eye(3), np.zeros((6, 6))
-        gauss_newton(
-            rig.rectified_parameters, one, points, measured, one[None], rows, nothing, nothing[0], T, np.inf, steps,
-            _CONVERGED,
-        )  # fmt: skip
-        return T
-    for _ in range(steps):
-        delta = _gauss_newton_steps(rig, points[rows], measured[rows], T)
-        T = T @ exp(delta)
-        if np.abs(delta).max() < _CONVERGED:
-            break
+    T, one, nothing = T.copy(), np.eye(3), np.zeros((6, 6))
+    gauss_newton(
+        rig.rectified_parameters, one, points, measured, one[None], rows, nothing, nothing[0], T, np.inf, steps,
+        _CONVERGED,
+    )  # fmt: skip
     return T
 
 
@@ -205,19 +193,6 @@ def rigid_fit(source: Array, target: Array) -> Array:
     return T
 
 
-def _gauss_newton_steps(rig: StereoRig, points: Array, measured: Array, T: Array) -> Array:
-    """Steps (H, 6) that reduce the errors of poses (H, 4, 4), with a set of matches (H, K, 3) each; any rig."""
-    local = (points - T[:, None, :3, 3]) @ T[:, :3, :3]
-    z, by_point = rig.project_stereo(local.reshape(-1, 3))
-    residual = (measured - z.reshape(local.shape)).reshape(len(T), -1, 1)
-    J = (by_point @ points_by_pose(local.reshape(-1, 3))).reshape(len(T), -1, 6)
-    J = np.where(np.isfinite(residual), J, 0.0)
-    right = np.swapaxes(J, 1, 2)
-    normal = right @ J
-    normal += (1e-12 + 1e-9 * np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(6)
-    return np.asarray(np.linalg.solve(normal, right @ np.nan_to_num(residual))[:, :, 0])
-
-
 def _agreement(rig: StereoRig, points: Array, measured: Array, T: Array, threshold: float) -> BoolArray:
     """Which matches (H, M) reproject within `threshold` [px] under each pose."""
     with np.errstate(invalid="ignore"):
@@ -226,13 +201,6 @@ def _agreement(rig: StereoRig, points: Array, measured: Array, T: Array, thresho
 
 def _errors(rig: StereoRig, points: Array, measured: Array, T: Array) -> Array:
     """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
-    if rig.is_rectified:
-        from slam.geometry.pose_kernels import errors
+    from slam.geometry.pose_kernels import errors
 
-        return np.asarray(errors(rig.rectified_parameters, np.eye(3), points, measured, T))
-    local = (points - T[:, None, :3, 3]) @ T[:, :3, :3]
-    z = rig.project_stereo(local.reshape(-1, 3), jacobian=False)[0].reshape(local.shape)
-    error = np.abs(measured - z)
-    right = error[..., 2]
-    right[:, np.isnan(measured[:, 2])] = 0.0
-    return np.asarray(np.maximum(np.maximum(error[..., 0], error[..., 1]), right))
+    return np.asarray(errors(rig.rectified_parameters, np.eye(3), points, measured, T))

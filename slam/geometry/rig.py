@@ -223,7 +223,13 @@ class StereoRig:
 
     @cached_property
     def rectified_parameters(self) -> Array:
-        """What projection by a rectified rig depends on (7,): fu, fv, u0, v0, fu and u0 of the right camera, b_x."""
+        """What projection by a rectified rig depends on (7,): fu, fv, u0, v0, fu and u0 of the right camera, b_x.
+
+        Raises:
+            CalibrationError: the rig is not rectified.
+        """
+        if not self.is_rectified:
+            raise CalibrationError("the cameras are not rectified: take rig.rectified.rig")
         a, c = self.left, self.right
         return np.array([a.fu, a.fv, a.u0, a.v0, c.fu, c.u0, self.b[0]])
 

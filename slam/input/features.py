@@ -52,8 +52,7 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
 def outside_masks(features: StereoFeatures, frame: StereoFrame) -> StereoFeatures:
     """The features where the masks of their frame are True; under the right camera's only the right pixel goes."""
     if frame.left_mask is not None:
-        rows = _at(frame.left_mask, features.uv_left)
-        features = replace(features, **{name: getattr(features, name)[rows] for name in _COLUMNS})
+        features = features.select(_at(frame.left_mask, features.uv_left))
     if frame.right_mask is None:
         return features
     there = _at(frame.right_mask, features.uv_right)[:, None]

@@ -33,8 +33,8 @@ from slam.tracks.table import LandmarkTable
 from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 4  # fixed: of the file format
-_WITHOUT_PLACES = "2"  # also read; version 3 had keyframes without the common errors of their poses, and is not
+_VERSION = 5  # fixed: of the file format
+_WITHOUT_PLACES = "2"  # also read; versions 3 and 4 had keyframes with other poses, and are not
 _TEXTS = ("frontend", "world_frame", "written_by")  # of the header
 _DATE = (1980, 1, 1, 0, 0, 0)  # fixed: of all members, so that the same map gives the same bytes
 

@@ -56,11 +56,12 @@ def _step(
     prediction = checked(backend, "predict", backend.predict(frame.stamp))
     times.append(time.perf_counter())
     if config is not None and len(seen):
-        measured, points = measurement_rows(seen.uv_left, seen.uv_right), backend.positions(seen.ids)
+        ways, points = recording.rig.rectified, backend.positions(seen.ids)
+        measured = measurement_rows(ways.rectify_left(seen.uv_left), ways.rectify_right(seen.uv_right))
         threshold = config.consistency_sigmas * recording.models.pixel_sigma
-        expected = prediction.T_world_left
-        found = find_consensus(recording.rig, points, measured, expected, threshold, config.hypotheses, seed=k)
-        guess = found.T_world_left
+        expected = prediction.T_world_left @ ways.T_left_rectified
+        found = find_consensus(ways.rig, points, measured, expected, threshold, config.hypotheses, seed=k)
+        guess = found.T_world_left @ ways.T_left_rectified.T
     times.append(time.perf_counter())
     report = checked(backend, "update", backend.update(seen, guess))
     times.append(time.perf_counter())

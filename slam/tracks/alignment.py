@@ -16,7 +16,7 @@ import numpy as np
 from slam.data import IdArray, Patches, StereoFeatures
 from slam.errors import SlamError
 from slam.geometry.arrays import Array, isin
-from slam.geometry.rig import RectifiedRig, StereoRig
+from slam.geometry.rig import StereoRig
 from slam.interfaces import AligningFrontend, Frontend
 from slam.third_party import checked
 from slam.tracks.localizer import LandmarkMatches
@@ -72,19 +72,17 @@ class Aligner:
             return features, landmarks
         rows, at = matches.rows[known], at[known]
         patches, poses = _stacked(landmarks.patches[at].tolist())
-        rectified = self._rig.rectified
-        warps = warps_of(rectified, poses, matches.T_world_left, positions(landmarks.ids[at]))
+        warps = warps_of(self._rig, poses, matches.T_world_left, positions(landmarks.ids[at]))
         growth = np.sqrt(np.abs(np.linalg.det(warps)))
         similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
         outgrown = (growth > _RENEWED) | (growth * _RENEWED < 1)
-        left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
-        left, right = _pixels(frontend, frontend.align(features.images, patches, warps, left, right), len(rows))
+        start = features.uv_left[rows], features.uv_right[rows]
+        left, right = _pixels(frontend, frontend.align(features.images, patches, warps, *start), len(rows))
         stereo = features.has_stereo[rows]
-        found = similar & rectified.rig.left.in_image(left) & (rectified.rig.right.in_image(right) | ~stereo)
+        found = similar & self._rig.left.in_image(left) & (self._rig.right.in_image(right) | ~stereo)
         right[~stereo] = np.nan
         uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
-        uv_left[rows[found]] = rectified.unrectify_left(left[found])
-        uv_right[rows[found]] = rectified.unrectify_right(right[found])
+        uv_left[rows[found]], uv_right[rows[found]] = left[found], right[found]
         return replace(features, uv_left=uv_left, uv_right=uv_right), landmarks.with_patches(
             at[~found | outgrown], None
         )
@@ -111,11 +109,11 @@ class Aligner:
         if not len(at):
             return landmarks
         rows = seen.rows_of(landmarks.ids[at])
-        uv, sizes = self._rig.rectified.rectify_left(features.uv_left[rows]), {"n": len(at)}
+        sizes = {"n": len(at)}
         one = next((patch for patch in landmarks.patches.tolist() if patch is not None), None)
         if one is not None:
             sizes["s"] = len(one.image)
-        answer = frontend.patches(features.images, uv, features.scale[rows])
+        answer = frontend.patches(features.images, features.uv_left[rows], features.scale[rows])
         taken: Patches = checked(frontend, "patches", answer, **sizes)
         new = [Patch(*of_one, T_world_left) for of_one in zip(taken.images, taken.centres, taken.size)]
         return landmarks.with_patches(at, new)
@@ -136,13 +134,13 @@ def _pixels(frontend: AligningFrontend, answer: Any, count: int) -> tuple[Array,
     return answer[0], answer[1]
 
 
-def warps_of(rectified: RectifiedRig, poses: Array, T_world_left: Array, positions: Array) -> Array:
+def warps_of(rig: StereoRig, poses: Array, T_world_left: Array, positions: Array) -> Array:
     """Matrices (N, 2, 2) from present pixel offsets to those seen from earlier poses (N, 4, 4), at points (N, 3) [m].
 
     The surface around a point is taken to face the camera.
     """
-    turn, f = rectified.R_left.T, np.array([rectified.rig.left.fu, rectified.rig.left.fv])
-    R_now, R_then = T_world_left[:3, :3] @ turn, poses[:, :3, :3] @ turn
+    f = np.array([rig.left.fu, rig.left.fv])
+    R_now, R_then = T_world_left[:3, :3], poses[:, :3, :3]
     depth = (positions - T_world_left[:3, 3]) @ R_now[:, 2]
     then = np.einsum("nij,ni->nj", R_then, positions - poses[:, :3, 3])
     R = np.einsum("nij,ik->njk", R_then, R_now)

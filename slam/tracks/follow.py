@@ -21,15 +21,10 @@ Descriptors = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pairs of a landmark and a feature.
+    """Pairs of a landmark and a feature."""
 
-    Attributes:
-        landmarks: rows of the landmarks (K,).
-        features: rows of the features (K,).
-    """
-
-    landmarks: NDArray[np.intp]
-    features: NDArray[np.intp]
+    landmarks: NDArray[np.intp]  # rows of the landmarks (K,)
+    features: NDArray[np.intp]  # rows of the features (K,)
 
     def __len__(self) -> int:
         return len(self.landmarks)

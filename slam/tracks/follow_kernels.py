@@ -103,7 +103,6 @@ def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows,
     levels, last = len(sizes), sizes[len(sizes) - 1]
     count, room = 0, 4 * len(pixels) + 64
     a, b, level = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.intp)
-    distance = np.empty(room, np.float32)
     for row in range(len(pixels)):
         x, y = pixels[row, 0], pixels[row, 1]
         if not (np.isfinite(x) and np.isfinite(y)):
@@ -140,23 +139,56 @@ def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows,
             if count == room:
                 room *= 2
                 a, b, level = grown(a, room), grown(b, room), grown(level, room)
-                distance = grown(distance, room)
-            likeness = product(looks[rows[row]], others[feature])
             a[count], b[count], level[count] = row, feature, smallest
-            distance[count] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
             count += 1
     found = 0  # tracks that look alike to the bit may share a feature
     done, taken = np.zeros(len(pixels), np.bool_), np.zeros(len(uv), np.bool_)
     allowed, good = np.empty(count, np.bool_), np.empty(count, np.bool_)
+    distance = np.empty(count, np.float32)
     for number in range(levels):
         for p in range(count):
             allowed[p] = level[p] <= number and not done[a[p]] and not taken[b[p]]
+            if allowed[p] and level[p] == number:  # in a larger window, of tracks that are not found yet alone
+                likeness = product(looks[rows[a[p]]], others[b[p]])
+                distance[p] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
         best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[number], ratio, good)
         for p in range(count):
             if good[p]:
                 done[a[p]] = taken[b[p]] = True
                 pairs[0, found], pairs[1, found] = a[p], b[p]
                 found += 1
+    return found
+
+
+@kernel
+def nearest(points, order, places, radius, looks, others, alike):
+    """Of each place (M, 2 or more) the nearest point (N, 2 or more) that has it as its own nearest place; −1 for none.
+
+    Both are less than `radius` apart, and their descriptors (N, D), (M, D) less than `alike`; `order` is that of the
+    places' columns.
+    """
+    found, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
+    for n in range(len(points)):
+        x, y, best, least = points[n, 0], points[n, 1], -1, radius * radius
+        place, end = 0, len(order)
+        while place < end:
+            middle = (place + end) // 2
+            if places[order[middle], 0] < x - radius:
+                place = middle + 1
+            else:
+                end = middle
+        while place < len(order) and places[order[place], 0] <= x + radius:
+            m = order[place]
+            gap = (places[m, 0] - x) ** 2 + (places[m, 1] - y) ** 2
+            if gap < least:
+                best, least = m, gap
+            place += 1
+        if best >= 0 and least < gaps[best]:
+            off = np.float32(0.0)
+            for k in range(looks.shape[1]):
+                off += (looks[n, k] - others[best, k]) ** 2
+            if off < alike * alike:
+                found[best], gaps[best] = n, least
     return found
 
 

@@ -28,22 +28,15 @@ from slam.tracks.visibility import similar_view
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMatches:
-    """Landmarks found in a frame.
+    """Landmarks found in a frame."""
 
-    Attributes:
-        ids: landmark ids (K,), ascending.
-        rows: rows of their features (K,).
-        T_world_left: the pose (4, 4) on which they agree, if there is one.
-        kidnapped: the prediction's uncertainty does not allow that pose, but several frames agree on it: the camera was
-            moved while it saw nothing.
-        doubted: number of landmarks that agree on a pose which is too far from the prediction to be believed yet.
-    """
-
-    ids: IdArray
-    rows: NDArray[np.intp]
-    T_world_left: Array | None = None
+    ids: IdArray  # landmark ids (K,), ascending
+    rows: NDArray[np.intp]  # rows of their features (K,)
+    T_world_left: Array | None = None  # the pose (4, 4) on which they agree, if there is one
+    # the prediction's uncertainty does not allow that pose, but several frames agree on it: the camera was moved while
+    # it saw nothing
     kidnapped: bool = False
-    doubted: int = 0
+    doubted: int = 0  # number of landmarks that agree on a pose which is too far from the prediction to be believed yet
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -96,7 +89,6 @@ class Localizer:
         self.rig = rig
         self.config = config
         self.pixel_sigma = models.pixel_sigma
-        self._rectified_sigma = models.pixel_sigma * rig.rectified.scale
         self._models = models
         self._lost_after = lost_after
 
@@ -303,16 +295,14 @@ class Localizer:
     def _consensus(
         self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False
     ) -> PoseConsensus:
-        """The pose on which matches agree, found in rectified pixels: lenses would be the larger part of its cost."""
-        r, rows = self.rig.rectified, matches.features
-        measured = measurement_rows(r.rectify_left(features.uv_left[rows]), r.rectify_right(features.uv_right[rows]))
-        threshold = self.config.consistency_sigmas * self._rectified_sigma
+        """The pose on which matches agree."""
+        rows, points = matches.features, positions[matches.landmarks]
+        measured = measurement_rows(features.uv_left[rows], features.uv_right[rows])
+        threshold = self.config.consistency_sigmas * self.pixel_sigma
         if wide and len(matches) < self.config.minimum_consistent:
             return PoseConsensus(guess, np.zeros(len(matches), bool))
         hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses
-        X, points = r.T_left_rectified, positions[matches.landmarks]
-        found = find_consensus(r.rig, points, measured, guess @ X, threshold, hypotheses, seed)
-        return PoseConsensus(found.T_world_left @ X.T, found.inliers)
+        return find_consensus(self.rig, points, measured, guess, threshold, hypotheses, seed)
 
     def _expected(
         self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkTable, positions: Array

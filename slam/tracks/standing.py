@@ -8,14 +8,13 @@ alike. While the camera stands, only features that stay are used to measure its 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from slam.chi_square import SIGMAS, chi_square_limit
-from slam.data import BoolArray, StereoFeatures
+from slam.data import StereoFeatures
 from slam.geometry.arrays import median
 from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
 from slam.geometry.rig import StereoRig
@@ -33,19 +32,12 @@ _BLIND = (
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Features that may stay at their pixels, a row each.
+    """Features that may stay at their pixels, a row each."""
 
-    Attributes:
-        z: mean (uL, vL, uR) of their first sights (K, 3) [px].
-        descriptors: at first sight (K, D).
-        sights: number of frames in which each was there (K,).
-        missed: frames since (K,).
-    """
-
-    z: Array
-    descriptors: NDArray[np.float32]
-    sights: NDArray[np.int64]
-    missed: NDArray[np.int64]
+    z: Array  # mean (uL, vL, uR) of their first sights (K, 3) [px]
+    descriptors: NDArray[np.float32]  # at first sight (K, D)
+    sights: NDArray[np.int64]  # number of frames in which each was there (K,)
+    missed: NDArray[np.int64]  # frames since (K,)
 
     @classmethod
     def of(cls, z: Array, descriptors: NDArray[np.float32]) -> Places:
@@ -54,19 +46,14 @@ class Places:
 
     def find(self, z: Array, descriptors: NDArray[np.float32], radius: float) -> tuple[NDArray, NDArray]:
         """Rows of those that are found again less than `radius` [px] away among features (N,), and the features."""
-        none = np.zeros(0, np.intp)
         if not len(self.z) or not len(z):
-            return none, none
-        distance, nearest = cKDTree(self.z[:, :2]).query(z[:, :2], distance_upper_bound=radius)
-        rows = np.flatnonzero(np.isfinite(distance))
-        places = nearest[rows]
+            return np.zeros(0, np.intp), np.zeros(0, np.intp)
+        from slam.tracks.follow_kernels import nearest
+
         # 0.5: largest distance of descriptors of one feature in unchanged light
-        alike = np.linalg.norm(self.descriptors[places] - descriptors[rows], axis=1) < 0.5
-        rows, places = rows[alike], places[alike]
-        order = np.argsort(distance[rows], kind="stable")
-        _, first = np.unique(places[order], return_index=True)
-        kept = order[first]
-        return places[kept], rows[kept]
+        found = nearest(z, np.argsort(self.z[:, 0], kind="stable"), self.z, radius, descriptors, self.descriptors, 0.5)
+        places = np.flatnonzero(found >= 0)
+        return places, found[places]
 
     def after(self, places: NDArray, rows: NDArray, z: Array, descriptors: NDArray[np.float32]) -> Places:
         """The places after a frame with features (N,), of which `rows` were found at `places` again."""
@@ -88,23 +75,15 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """What is known of a camera at rest.
+    """What is known of a camera at rest."""
 
-    Attributes:
-        places: features that may stay; None before the first frame.
-        frames: number of frames in which most features stayed where they were in the first of them.
-        witnesses: rows of the present features that stay (M,); meaningful if the camera stands.
-        variance: of a pixel of a feature that stays [px²], as seen so far; infinite before anything was.
-        T_world_left: the camera's last pose (4, 4).
-        blind: number of frames in which too little of what stays was seen to tell, as something hides it.
-    """
-
-    places: Places | None = None
-    frames: int = 0
+    places: Places | None = None  # features that may stay; None before the first frame
+    frames: int = 0  # number of frames in which most features stayed where they were in the first of them
+    # rows of the present features that stay (M,); meaningful if the camera stands
     witnesses: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
-    variance: float = np.inf
-    T_world_left: Array = field(default_factory=lambda: np.eye(4))
-    blind: int = 0
+    variance: float = np.inf  # of a pixel of a feature that stays [px²], as seen so far; infinite before anything was
+    T_world_left: Array = field(default_factory=lambda: np.eye(4))  # the camera's last pose (4, 4)
+    blind: int = 0  # number of frames in which too little of what stays was seen to tell, as something hides it
 
     @property
     def stands(self) -> bool:
@@ -128,12 +107,16 @@ class Standing:
         if self.places is None or self.places.descriptors.shape[1] != descriptors.shape[1]:
             return begun
         places, rows = self.places.find(z, descriptors, SIGMAS * np.sqrt(2.0) * sigma)
-        stay, at_rest, variance = _staying(rig, self.places.z[places], z[rows], sigma, self.variance)
-        places, rows = places[stay], rows[stay]
+        shift = z[rows] - self.places.z[places]
+        stay = np.square(shift).sum(axis=1) <= _GATE * min(self.variance, 2.0 * sigma**2)
+        places, rows, shift = places[stay], rows[stay], shift[stay]
         most = 2 * len(rows) > min(len(z), int((self.places.missed == 0).sum()))
+        if not (self.stands or most):
+            return begun
         witnesses = stereo[rows[self.places.sights[places] >= _FRAMES]]
         known = self.places.after(places, rows, z, descriptors)
-        if at_rest and (self.stands or most):
+        at_rest, variance = _at_rest(rig, self.places.z[places], shift, self.variance)
+        if at_rest:
             return Standing(known, self.frames + 1, witnesses, variance, self.T_world_left)
         if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, _BLIND):
             return replace(self, places=known, witnesses=witnesses, blind=self.blind + 1)
@@ -162,9 +145,7 @@ class Standing:
 
     def witnessed(self, features: StereoFeatures) -> StereoFeatures:
         """Those of the features that stay."""
-        rows = self.witnesses
-        parts = {f.name: getattr(features, f.name)[rows] for f in fields(features)[1:8]}
-        return replace(features, **parts)
+        return features.select(self.witnesses)
 
 
 def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array) -> float:
@@ -176,17 +157,15 @@ def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray
     return float((((moved - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2).mean()) if seen.any() else 0.0
 
 
-def _staying(rig: StereoRig, before: Array, now: Array, sigma: float, variance: float) -> tuple[BoolArray, bool, float]:
-    """Which features (M,) stay, of (uL, vL, uR) (M, 3) before and now [px], whether the camera does, and the variance.
+def _at_rest(rig: StereoRig, before: Array, d: Array, variance: float) -> tuple[bool, float]:
+    """Whether no common motion moves features that stay by more than noise, and the variance of a pixel [px²].
 
-    The camera stays unless a common motion moves those that stay by more than noise; `variance` is that of a pixel.
+    They were at (uL, vL, uR) (M, 3) `before` and have moved by `d` (M, 3) [px].
     """
-    d = now - before
-    stay = (d**2).sum(axis=1) <= _GATE * min(variance, 2.0 * sigma**2)
-    local = rig.triangulate(before[:, :2], np.column_stack([before[:, 2], before[:, 1]]))
-    used = np.flatnonzero(stay & np.isfinite(local).all(axis=1))
+    local = rig.triangulate(before[:, :2], before[:, [2, 1]])
+    used = np.flatnonzero(np.isfinite(local).all(axis=1))
     if len(used) <= _FEW:
-        return stay, False, variance
+        return False, variance
     _, J = rig.project_stereo(local[used])
     J = J @ points_by_pose(local[used])
     d, weight = d[used], np.ones(len(used))
@@ -201,4 +180,4 @@ def _staying(rig: StereoRig, before: Array, now: Array, sigma: float, variance: 
     test = float(np.einsum("n,nij,nij->", weight, by_motion[:, :, None], by_motion[:, :, None])) / variance
     # 0.25: of the variance of a pixel, that features may share: light moves them alike, too
     within_noise = float((by_motion**2).mean()) < 0.25 * variance
-    return stay, test < _MOVES or within_noise, variance
+    return test < _MOVES or within_noise, variance

@@ -22,17 +22,11 @@ _ASIDE = 0.1  # guard: [m] by which a vehicle has moved for certain
 
 @dataclass(frozen=True, eq=False)
 class PoseHypotheses:
-    """Poses on which landmarks agreed in successive frames.
+    """Poses on which landmarks agreed in successive frames."""
 
-    Attributes:
-        count: number of successive poses that agree with each other.
-        stamp: of the last one [s].
-        T_world_left: the last one (4, 4).
-    """
-
-    count: int = 0
-    stamp: float = float("nan")
-    T_world_left: Array | None = None
+    count: int = 0  # number of successive poses that agree with each other
+    stamp: float = float("nan")  # of the last one [s]
+    T_world_left: Array | None = None  # the last one (4, 4)
 
     def after(self, T_world_left: Array, stamp: float, models: EstimatorModels) -> PoseHypotheses:
         """A copy with one more pose, which agrees with the last one if the camera may have moved that far meanwhile."""
@@ -49,27 +43,18 @@ NO_POSE = PoseHypotheses()
 
 @dataclass(frozen=True, eq=False)
 class TrackingState:
-    """How localization has gone recently.
+    """How localization has gone recently."""
 
-    Attributes:
-        unmatched: frames since the pose was last measured.
-        unknown: how many of these had enough features to be localised in a mapped place.
-        lost: the pose has not been measured for so long, and the prediction is so uncertain, that it is not known.
-        showed_enough: the last frame had enough features to be localised in a mapped place.
-        doubted: poses too far from the predictions to be believed at once.
-        believed: the last pose that was believed.
-        stood: the camera stood when its pose was last measured.
-        hidden_at: the pose (4, 4) at which a vehicle's camera stood when something hid what it saw and a new map began:
-            what is in that map is then perhaps what hides the rest. None where it was not so, or it drove on.
-    """
-
-    unmatched: int = 0
-    unknown: int = 0
+    unmatched: int = 0  # frames since the pose was last measured
+    unknown: int = 0  # how many of these had enough features to be localised in a mapped place
+    # the pose has not been measured for so long, and the prediction is so uncertain, that it is not known
     lost: bool = False
-    showed_enough: bool = False
-    doubted: PoseHypotheses = NO_POSE
-    believed: PoseHypotheses = NO_POSE
-    stood: bool = False
+    showed_enough: bool = False  # the last frame had enough features to be localised in a mapped place
+    doubted: PoseHypotheses = NO_POSE  # poses too far from the predictions to be believed at once
+    believed: PoseHypotheses = NO_POSE  # the last pose that was believed
+    stood: bool = False  # the camera stood when its pose was last measured
+    # the pose (4, 4) at which a vehicle's camera stood when something hid what it saw and a new map began: what is in
+    # that map is then perhaps what hides the rest. None where it was not so, or it drove on
     hidden_at: Array | None = None
 
     def after(

@@ -16,19 +16,12 @@ from slam.showing import count
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """The image around a landmark, seen from a pose.
+    """The image around a landmark, seen from a pose."""
 
-    Attributes:
-        image: (S, S) float32.
-        centre: coordinates of the landmark within it (2,).
-        size: of the feature [px].
-        T_world_left: pose of the left camera (4, 4).
-    """
-
-    image: NDArray[np.float32]
-    centre: Array
-    size: float
-    T_world_left: Array
+    image: NDArray[np.float32]  # (S, S) float32
+    centre: Array  # coordinates of the landmark within it (2,)
+    size: float  # of the feature [px]
+    T_world_left: Array  # pose of the left camera (4, 4)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,25 +16,15 @@ from slam.tracks.follow import pairs_in_boxes
 
 @dataclass(frozen=True, eq=False)
 class MapView:
-    """The map and the frame's features as seen from one pose.
+    """The map and the frame's features as seen from one pose."""
 
-    Attributes:
-        T_world_left: the pose (4, 4).
-        positions: of the landmarks (N, 3) in world coordinates [m].
-        local: the same in left-camera coordinates (N, 3).
-        uv_left: the landmarks' left pixels (N, 2), NaN behind the camera.
-        in_image: which landmarks are in front of the camera and inside the left image (N,).
-        points: the features in left-camera coordinates (F, 3), NaN without depth.
-        depth_sigma: standard deviations of the features' depths (F,) [m].
-    """
-
-    T_world_left: Array
-    positions: Array
-    local: Array
-    uv_left: Array
-    in_image: BoolArray
-    points: Array
-    depth_sigma: Array
+    T_world_left: Array  # the pose (4, 4)
+    positions: Array  # of the landmarks (N, 3) in world coordinates [m]
+    local: Array  # the same in left-camera coordinates (N, 3)
+    uv_left: Array  # the landmarks' left pixels (N, 2), NaN behind the camera
+    in_image: BoolArray  # which landmarks are in front of the camera and inside the left image (N,)
+    points: Array  # the features in left-camera coordinates (F, 3), NaN without depth
+    depth_sigma: Array  # standard deviations of the features' depths (F,) [m]
 
     @classmethod
     def of(

@@ -100,12 +100,12 @@ def test_a_small_part_of_16_bits(gain, offset):
 def test_mask():
     mask = np.zeros((240, 320), np.uint8)
     mask[120:] = 1
-    features = SurfFrontend(RIG, mask=mask).extract(StereoFrame(0, 0.0, LEFT, RIGHT))
+    features = SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, RIGHT, mask))
     assert len(features) > 30
     assert features.uv_left[:, 1].min() > 115  # localisation may move a feature by a sixth of its size
-    assert len(SurfFrontend(RIG, mask=BLACK).extract(StereoFrame(0, 0.0, LEFT, RIGHT))) == 0
-    with pytest.raises(ConfigurationError, match="mask: 10x10"):
-        SurfFrontend(RIG, mask=np.ones((10, 10)))
+    assert len(SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, RIGHT, BLACK))) == 0
+    with pytest.raises(SequenceError, match="mask: 10x10"):
+        SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, RIGHT, np.ones((10, 10))))
 
 
 def test_threshold_keeps_the_number_of_features():

@@ -32,7 +32,7 @@ from tests.fuzz.hostile import VALUES, broken_bytes, broken_text, choose
 from tests.fuzz.settings import scene
 
 _NUMBERS = (0, -1, 1, 2**31, 2**62, -(2**63), 1e308, -1e308, 1e-308, 1e30, 1e10, np.nan, np.inf, -np.inf, 0.5)
-_MAP = b"surf-stereo-slam map 4\n"
+_MAP = b"surf-stereo-slam map 5\n"
 
 
 @lru_cache(maxsize=1)

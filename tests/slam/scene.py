@@ -14,7 +14,8 @@ RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
 class Cloud:
     """Points with unit descriptors; what a camera sees of them."""
 
-    def __init__(self, count: int = 120, seed: int = 0, dimensions: int = 32) -> None:
+    def __init__(self, count: int = 120, seed: int = 0, dimensions: int = 32, rig: StereoRig = RIG) -> None:
+        self.rig = rig
         self.rng = np.random.default_rng(seed)
         self.points = np.column_stack(
             [self.rng.uniform(-2, 2, count), self.rng.uniform(-1.5, 1.5, count), self.rng.uniform(2, 6, count)]
@@ -26,11 +27,12 @@ class Cloud:
     def features(self, T_world_left: np.ndarray, stamp: float, noise: float = 0.0) -> tuple[StereoFeatures, np.ndarray]:
         """Features in an order of their own, and which point each is (N,)."""
         local = se3.transform(se3.inverse(T_world_left), self.points)
-        left, right = RIG.project(local)
-        ids = self.rng.permutation(np.flatnonzero(RIG.left.in_image(left)))
+        left, right = self.rig.project(local)
+        ids = self.rng.permutation(np.flatnonzero(self.rig.left.in_image(left)))
         uv = left[ids] + noise * self.rng.normal(size=(len(ids), 2))
         uv_right = right[ids] + noise * self.rng.normal(size=(len(ids), 2))
-        uv_right[:, 1] = uv[:, 1]
+        if self.rig.is_rectified:
+            uv_right[:, 1] = uv[:, 1]
         n = len(ids)
         return StereoFeatures(
             stamp, uv, uv_right, np.full(n, 12.0), np.zeros(n), 1.0 + self.rng.random(n), self.laplacian[ids],

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
@@ -47,10 +47,8 @@ class Found:
 class LoopCloser:
     """Adds keyframes to an atlas and closes loops.
 
-    Internally, pixels and coordinates are those of the rectified rig.
-
     Args:
-        rig: the cameras.
+        rig: the rectified pair.
         config: settings.
         association: settings of the search by descriptor.
         models: with the noise of uL, vL, uR [px].
@@ -61,8 +59,7 @@ class LoopCloser:
         self, rig: StereoRig, config: AtlasConfig, association: AssociationConfig, models: EstimatorModels,
         max_depth_error: float,
     ) -> None:  # fmt: skip
-        self._rectified = rig.rectified
-        self._rig = rig.rectified.rig
+        self._rig = rig
         self._config = config
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
         lax = 2 * association.consistency_sigmas  # a keyframe's points have the depth of one frame alone
@@ -81,7 +78,6 @@ class LoopCloser:
             return atlas, None
         landmark_of = step.matches.landmark_of(len(step.features))
         landmark_of[step.added.rows] = step.added.ids
-        step = replace(step, features=self._rectify(step.features))
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:
             return atlas, None
@@ -90,7 +86,8 @@ class LoopCloser:
         atlas = replace(atlas.with_new(new), restarts=len(atlas.gaps))
         found = self._verified(atlas, candidates, step.features, step.correction, step.index)
         if not found:  # whatever the path says
-            found = self._verified(atlas, self._anywhere(atlas, new, known), step.features, step.correction, step.index)
+            lookalike = self._anywhere(atlas, new, known, step.features)
+            found = self._verified(atlas, lookalike, step.features, step.correction, step.index)
             found = [one for one in found if self._is_same_view(one[1], step.features)]
         if not found:
             return atlas, None
@@ -107,7 +104,6 @@ class LoopCloser:
         """
         if not self._config.enabled or len(features) < self._config.inliers:
             return None
-        features = self._rectify(features)
         likely = self._most_alike(atlas, features.descriptors, np.ones(len(atlas), bool))
         verified = self._verified(atlas, self._ranked(atlas, likely, features), features, correction, seed)
         if not verified:
@@ -116,10 +112,10 @@ class LoopCloser:
         if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other, _ in verified):
             return None
         T = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first)
-        points, X = seen.keyframe.points.astype(float), T @ self._rectified.T_left_rectified
+        points = seen.keyframe.points.astype(float)
         P = self._rig.triangulation_covariance(points, self._sigma)
-        landmarks = replace(keyframe_landmarks(seen.keyframe), seen_from=np.tile(X[:3, 3], (len(points), 1)))
-        place = OldPlace.at(landmarks, np.arange(len(points)), X, points, P)
+        landmarks = replace(keyframe_landmarks(seen.keyframe), seen_from=np.tile(T[:3, 3], (len(points), 1)))
+        place = OldPlace.at(landmarks, np.arange(len(points)), T, points, P)
         stamp = -np.inf if loop.first < atlas.prior_count else seen.keyframe.stamp
         return Found(T @ loop.T_first_second, place, stamp)
 
@@ -132,14 +128,7 @@ class LoopCloser:
         P = R @ self._rig.triangulation_covariance(points, self._sigma) @ R.T
         P = P + J @ seen.covariance @ np.swapaxes(J, 1, 2)
         landmarks = keyframe_landmarks(seen.keyframe).select(m.landmarks)
-        return OldPlace.at(landmarks, m.features, self._rectified.T_left_rectified, near, P)
-
-    def _rectify(self, features: StereoFeatures) -> StereoFeatures:
-        """Features in pixels of the rectified rig."""
-        r = self._rectified
-        if r.original.is_rectified:
-            return features
-        return replace(features, uv_left=r.rectify_left(features.uv_left), uv_right=r.rectify_right(features.uv_right))
+        return OldPlace.at(landmarks, m.features, np.eye(4), near, P)
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
         """Whether the view differs enough from the last keyframe's, or its loop waits to be confirmed by another."""
@@ -148,9 +137,8 @@ class LoopCloser:
             return True
         if len(atlas) == atlas.prior_count:
             return True
-        last, X = atlas.keyframes[-1], self._rectified.T_left_rectified
-        motion = inverse(X) @ inverse(last.T_odom_left) @ step.estimate.T_world_left @ X
-        return view_has_changed(last, motion, self._rig, self._config)
+        last = atlas.keyframes[-1]
+        return view_has_changed(last, inverse(last.T_odom_left) @ step.estimate.T_world_left, self._rig, self._config)
 
     def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray) -> Keyframe | None:
         """The frame as a keyframe; None where too few features have a depth."""
@@ -196,12 +184,17 @@ class LoopCloser:
         likely = np.unique(np.concatenate([likely, nearest[: min(_NEARBY, int(possible.sum()))]]))
         return self._ranked(atlas, self._not_measured(atlas, likely, known), step.features)
 
-    def _anywhere(self, atlas: Atlas, new: Keyframe, known: IdArray) -> NDArray[np.intp]:
-        """Number of the keyframe that looks most like a new one, unless the path says that it shows the same view."""
+    def _anywhere(self, atlas: Atlas, new: Keyframe, known: IdArray, features: StereoFeatures) -> NDArray[np.intp]:
+        """Number of the keyframe that looks most like a new one, unless the path says that it shows the same view.
+
+        Of the same view most features agree on a pose, so that a third of them at least match by descriptor alone.
+        """
         moved = inverse(atlas.poses[:-1]) @ new.T_odom_left
         apart = np.linalg.norm(moved[:, :3, 3], axis=1) > self._config.keyframe_distance * new.depth
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), np.append(apart, False))
-        return self._not_measured(atlas, likely, known)[:1]
+        best = self._not_measured(atlas, likely, known)[:1]
+        enough = min(self._config.features, int(features.has_stereo.sum())) / 3
+        return self._ranked(atlas, best, features, enough)
 
     def _not_measured(self, atlas: Atlas, rows: NDArray[np.intp], known: IdArray) -> NDArray[np.intp]:
         """Those keyframes whose landmarks the back end does not measure."""
@@ -221,13 +214,15 @@ class LoopCloser:
         best = np.argsort(-similarity, kind="stable")[: self._config.candidates]
         return np.asarray(best[np.isfinite(similarity[best])])
 
-    def _ranked(self, atlas: Atlas, likely: NDArray[np.intp], features: StereoFeatures) -> NDArray[np.intp]:
+    def _ranked(
+        self, atlas: Atlas, likely: NDArray[np.intp], features: StereoFeatures, enough: float = 0.0
+    ) -> NDArray[np.intp]:
         """The keyframes with most matches by descriptor, if there are enough of them, best first."""
         seen, config = [atlas.keyframes[k] for k in likely.tolist()], self._localizer.config
         found = [match_everywhere(k.descriptors.astype(np.float32), k.laplacian, features, config) for k in seen]
         number = np.array([len(matches) for matches in found], int)
         order = np.argsort(-number, kind="stable")[:_VERIFIED]
-        return likely[order[number[order] >= self._config.inliers]]
+        return likely[order[number[order] >= max(enough, self._config.inliers)]]
 
     def _verified(
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, correction: Correction | None,
@@ -237,15 +232,14 @@ class LoopCloser:
 
         Their second number is that of the newest keyframe, which is the present camera's unless it is lost.
         """
-        X = self._rectified.T_left_rectified
-        A, found = adjoint(X), []
+        found = []
         for k in candidates.tolist():
             keyframe = atlas.keyframes[k].corrected(correction, self._rig)
             seen = verify(keyframe, features, self._rig, self._localizer, self._config, seed)
             if seen is not None:
                 # Each of both poses has an error of its own frame too, at most as large as such a measurement's noise.
-                T, P = X @ seen.T_keyframe_left @ inverse(X), A @ (seen.covariance + seen.noise) @ A.T
-                found.append((Loop(k, len(atlas) - 1, T, P, len(seen.matches)), seen))
+                P = seen.covariance + seen.noise
+                found.append((Loop(k, len(atlas) - 1, seen.T_keyframe_left, P, len(seen.matches)), seen))
         return found
 
     def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:

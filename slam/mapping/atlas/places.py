@@ -79,26 +79,24 @@ def learn_words(descriptors: Vectors, number: int) -> Vectors:
     descriptors = descriptors[np.linspace(0, len(descriptors) - 1, some).astype(int)]
     words = descriptors[np.linspace(0, some - 1, number).astype(int)].copy()
     for _ in range(_ROUNDS):
-        nearest = _nearest(descriptors, words)
-        count = np.bincount(nearest, minlength=number)
-        total = np.stack([np.bincount(nearest, column, minlength=number) for column in descriptors.T], axis=1)
+        members = _members(descriptors, words)
+        count = members.sum(axis=1)
         used = count > 0
-        words[used] = total[used] / count[used, None]
+        words[used] = (members @ descriptors)[used] / count[used, None]
     return words
 
 
 def aggregate(descriptors: Vectors, words: Vectors) -> NDArray[np.float32]:
     """VLAD vector (W · D,) of descriptors (F, D): each word's part is normalised, then the whole, to unit length."""
-    parts = np.zeros_like(words)
-    if len(descriptors):
-        nearest = _nearest(descriptors, words)
-        np.add.at(parts, nearest, descriptors - words[nearest])
+    members = _members(descriptors, words)
+    parts = members @ descriptors - members.sum(axis=1)[:, None] * words
     parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), _NONE)
     vector = parts.ravel()
     return np.asarray(vector / max(float(np.linalg.norm(vector)), _NONE), np.float32)
 
 
-def _nearest(descriptors: Vectors, words: Vectors) -> NDArray[np.intp]:
-    """Row of each descriptor's nearest word (F,)."""
+def _members(descriptors: Vectors, words: Vectors) -> Vectors:
+    """Which descriptors (F, D) are nearest to each word, as ones and zeros (W, F)."""
     squares = np.einsum("wd,wd->w", words, words)
-    return np.asarray(np.argmin(squares[None, :] - 2 * descriptors @ words.T, axis=1))
+    nearest = np.argmin(squares[None, :] - 2 * descriptors @ words.T, axis=1)
+    return (nearest == np.arange(len(words))[:, None]).astype(np.float32)

@@ -41,7 +41,7 @@ class Street:
         self.descriptors = (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
 
     def features(self, stamp, T_world_left, parameters=None, noise=0.15, outliers=0.0, most=400, residual=None):
-        """What a rig sees that `parameters` (n,) would make ideal; `residual` fields (m,) come on top."""
+        """What a rig sees, rectified, that `parameters` (n,) would make ideal; `residual` fields (m,) come on top."""
         rng, rig, model = self.rng, self.rig, self.model
         local = self.scale * se3.transform(se3.inverse(T_world_left), self.points)
         left, right = rig.project(local)
@@ -65,11 +65,7 @@ class Street:
         right[wrong] += rng.normal(0, 3, (wrong.sum(), 2))
         left[wrong] += rng.normal(0, 5, (wrong.sum(), 2))
         ones = np.ones(n)
-        return StereoFeatures(
-            stamp, rectified_rig.unrectify_left(left), rectified_rig.unrectify_right(right), ones, ones, ones,
-            np.ones(n, np.int8),
-            self.descriptors[ids],
-        )  # fmt: skip
+        return StereoFeatures(stamp, left, right, ones, ones, ones, np.ones(n, np.int8), self.descriptors[ids])
 
 
 def pose(k, step=1.2):
@@ -86,7 +82,7 @@ def drive(parameters=None, seed=0, frames=30, step=1.2, rig=CAR, scale=1.0, sett
         features = street.features(0.1 * k, T, parameters, **seen)
         guess = T.copy()
         guess[:3, 3] *= scale
-        calibration.observe(features, guess if poses else np.eye(4))
+        calibration.observe(features, guess @ rig.rectified.T_left_rectified if poses else np.eye(4))
     return calibration
 
 

@@ -166,20 +166,6 @@ def test_nothing_seen_is_no_error():
     assert calibration.summary()["pairs"] == 0
 
 
-@pytest.mark.parametrize("rig", [RIG, GENERAL_RIG])
-def test_features_that_move_are_corrected_again(rig):
-    calibration, before = SelfCalibration(rig, SelfCalibrationConfig()), Cloud(60).features(np.eye(4), 0.0, 0.1)[0]
-    moved = replace(before, uv_left=before.uv_left.copy(), uv_right=before.uv_right.copy())
-    moved.uv_left[3] += 0.4
-    moved.uv_right[5:7] = np.nan
-    assert calibration.correct_again(before, before, moved) is moved  # nothing is known yet
-    calibration.applied = RigCorrection(RigModel(rig), parameters(right_cx=2e-3, yaw=1e-3))
-    again = calibration.correct_again(calibration.correct(before), before, moved)
-    whole = calibration.correct(moved)
-    np.testing.assert_allclose(again.uv_left, whole.uv_left, atol=1e-9)
-    np.testing.assert_allclose(again.uv_right, whole.uv_right, atol=1e-9)
-
-
 @pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_a_revision_does_not_move_the_camera(backend):
     """Landmarks follow the new correction: else a sudden change of all pixels looks like motion."""

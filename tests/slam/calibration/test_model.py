@@ -86,17 +86,13 @@ def test_features_are_corrected_and_revised(rig):
     rng = np.random.default_rng(1)
     before, after = (RigCorrection(model, 2e-3 * rng.standard_normal(len(model.names))) for _ in range(2))
     points = rng.uniform((-2, -1, 5), (2, 1, 10), (20, 3))
-    left, right = rig.project(points)
+    left, right = rig.rectified.rig.project(points)
     right[3] = np.nan
     ones = np.ones(20)
     features = StereoFeatures(0.0, left, right, ones, ones, ones, np.ones(20, np.int8), np.ones((20, 4), np.float32))
     corrected = before.features(features)
     assert np.isnan(corrected.uv_right[3]).all() and np.isfinite(corrected.uv_left).all()
-    rectified_rig = rig.rectified
-    rows = [
-        np.column_stack([rectified_rig.rectify_left(f.uv_left), rectified_rig.rectify_right(f.uv_right)[:, 0]])
-        for f in (features, corrected, after.features(features))
-    ]
+    rows = [np.column_stack([f.uv_left, f.uv_right[:, 0]]) for f in (features, corrected, after.features(features))]
     np.testing.assert_allclose(before.rows(rows[0]), rows[1], atol=1e-6)
     np.testing.assert_allclose(before.undone(rows[1]), rows[0], atol=1e-4)
     np.testing.assert_allclose(Revision(before, after).rows(rows[1]), rows[2], atol=1e-4)

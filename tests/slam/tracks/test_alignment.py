@@ -39,7 +39,7 @@ def test_warps_are_the_derivative_of_a_surface_that_faces_the_camera():
     now = se3.exp(rng.normal(0, 0.1, 6))
     then = se3.exp(rng.normal(0, 0.1, 6))
     points = np.column_stack([rng.uniform(-1, 1, (5, 2)), rng.uniform(4, 9, 5)])
-    warps = warps_of(RIG.rectified, np.tile(then, (5, 1, 1)), now, points)
+    warps = warps_of(RIG, np.tile(then, (5, 1, 1)), now, points)
     local = se3.transform(se3.inverse(now), points)
     for k in range(2):
         side = np.zeros(3)
