@@ -28,39 +28,26 @@ class SolverError(SlamError):
 
 @dataclass
 class Track:
-    """A landmark's smart factor.
+    """A landmark's smart factor."""
 
-    Attributes:
-        begun: see `SmootherLandmarks.begun`.
-        poses: numbers of the poses that measured it.
-        keys, points: their variables, and the measurements.
-        stereo: whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only.
-        slot: of the factor in the solver, −1 while there is none.
-    """
-
-    begun: int
-    poses: list[int] = field(default_factory=list)
-    keys: list[int] = field(default_factory=list)
+    begun: int  # see `SmootherLandmarks.begun`
+    poses: list[int] = field(default_factory=list)  # numbers of the poses that measured it
+    keys: list[int] = field(default_factory=list)  # their variables, and the measurements
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
+    # whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only
     stereo: bool = False
-    slot: int = -1
+    slot: int = -1  # of the factor in the solver, −1 while there is none
 
 
 @dataclass
 class GraphProblem:
-    """Factors and first values, and what grew.
+    """Factors and first values, and what grew."""
 
-    Attributes:
-        factors, values: for gtsam.
-        removed: slots of factors that others replace.
-        grown: smart factors with new measurements.
-        stamps: times of variables for the fixed lag: numbers of poses.
-    """
-
-    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)  # for gtsam
     values: gtsam.Values = field(default_factory=gtsam.Values)
-    removed: list[int] = field(default_factory=list)
-    grown: dict[tuple[int, int], Track] = field(default_factory=dict)
+    removed: list[int] = field(default_factory=list)  # slots of factors that others replace
+    grown: dict[tuple[int, int], Track] = field(default_factory=dict)  # smart factors with new measurements
+    # times of variables for the fixed lag: numbers of poses
     stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = field(default_factory=dict)
 
 

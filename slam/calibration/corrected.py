@@ -17,15 +17,10 @@ from slam.geometry.se3 import Array, so3_exp
 
 
 class CorrectedRig(NamedTuple):
-    """A rig corrected by its estimated error.
+    """A rig corrected by its estimated error."""
 
-    Attributes:
-        rig: in the form of a calibration file.
-        left_off, right_off: deviation of its pixels from the corrected ones, root mean square over the image [px].
-    """
-
-    rig: StereoRig
-    left_off: float
+    rig: StereoRig  # in the form of a calibration file
+    left_off: float  # deviation of its pixels from the corrected ones, root mean square over the image [px]
     right_off: float
 
 

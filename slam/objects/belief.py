@@ -20,27 +20,16 @@ _TURN = 0.01  # cost: a point is seen from elsewhere by no less [rad]; what is l
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of a body, a row each.
+    """Points of a body, a row each."""
 
-    Attributes:
-        ids: (N,), −1 of those that were given up but still take part.
-        position: in body coordinates (N, 3) [m].
-        local: covariance (N, 3, 3) [m²] in the coordinates of the newest camera, by which they are known.
-        failures: how often running each was rejected (N,).
-        unseen: frames since each was seen (N,).
-        sights: frames in which each was used (N,).
-        first: direction (N, 3) from which each was seen first, in body coordinates.
-        turned: largest angle between that and later ones (N,) [rad], as far as it is allowed for.
-    """
-
-    ids: IdArray
-    position: Array
-    local: Array
-    failures: IdArray
-    unseen: IdArray
-    sights: IdArray
-    first: Array
-    turned: Array
+    ids: IdArray  # (N,), −1 of those that were given up but still take part
+    position: Array  # in body coordinates (N, 3) [m]
+    local: Array  # covariance (N, 3, 3) [m²] in the coordinates of the newest camera, by which they are known
+    failures: IdArray  # how often running each was rejected (N,)
+    unseen: IdArray  # frames since each was seen (N,)
+    sights: IdArray  # frames in which each was used (N,)
+    first: Array  # direction (N, 3) from which each was seen first, in body coordinates
+    turned: Array  # largest angle between that and later ones (N,) [rad], as far as it is allowed for
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -62,39 +51,23 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class BodyBelief:
-    """One body in the last K frames.
+    """One body in the last K frames."""
 
-    Attributes:
-        since: when the estimate began [s].
-        T_begun: pose T_world_object (4, 4) then.
-        moved: whether it has moved for certain since.
-        velocity, sigmas: what was known of the velocity [ω, v] (6,) in the first interval: mean, in world axes, and
-            standard deviations.
-        stamps: times of the frames (K,) [s].
-        poses: T_body_left (K, 4, 4).
-        scales: factors (K,) on the impulse before each frame.
-        points: of the body.
-        rows: what was measured of them in these frames.
-        places: what is known of points besides, from a frame.
-        prior: what earlier frames say of the poses and points.
-        covariance: of the poses together (6 K, 6 K), perturbed on the right.
-        estimate: of the newest frame, as it is reported.
-    """
-
-    since: float
-    T_begun: Array
-    moved: bool
+    since: float  # when the estimate began [s]
+    T_begun: Array  # pose T_world_object (4, 4) then
+    moved: bool  # whether it has moved for certain since
+    # what was known of the velocity [ω, v] (6,) in the first interval: mean, in world axes, and standard deviations
     velocity: Array
     sigmas: Array
-    stamps: Array
-    poses: Array
-    scales: Array
-    points: Points
-    rows: Rows
-    places: Places
-    prior: RelativePrior
-    covariance: Array
-    estimate: ObjectEstimate
+    stamps: Array  # times of the frames (K,) [s]
+    poses: Array  # T_body_left (K, 4, 4)
+    scales: Array  # factors (K,) on the impulse before each frame
+    points: Points  # of the body
+    rows: Rows  # what was measured of them in these frames
+    places: Places  # what is known of points besides, from a frame
+    prior: RelativePrior  # what earlier frames say of the poses and points
+    covariance: Array  # of the poses together (6 K, 6 K), perturbed on the right
+    estimate: ObjectEstimate  # of the newest frame, as it is reported
 
     def __len__(self) -> int:
         return len(self.stamps)

@@ -26,70 +26,38 @@ _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A body.
-
-    Attributes:
-        id: its id.
-        T: pose T_world_object (4, 4) at the present frame.
-        velocity: [ω, v] (6,) in world axes.
-        covariance: of the pose (6, 6), body axes.
-        velocity_covariance: of the velocity (6, 6).
-        history: poses at the window's slots (W, 4, 4).
-        known: at which slots there is a measured one (W,).
-        T_before: pose at the previous frame.
-        lower, upper: extent of its points (3,), body coordinates.
-        size: what it measures across at least [m].
-        reach: its points lie no farther from its origin [m].
-        seen_at: when its points were last found together [s].
-        measured_at: when the estimate last used them [s].
-        seen: number of frames in which it was measured.
-        missed: number of frames since it was measured.
-        measured: whether it was in this frame.
-        moving: whether it moves now.
-        evidence: that it has moved, given all that is uncertain; see `slam.objects.proof`.
-        far: whether it was followed for farther than it is wide before it became a body.
-        proven: whether it has moved for certain by its tracks, and
-        moved: by its estimate, see `slam.objects.estimator`: only then it is reported.
-        alike: number of frames in which it moved as an older body did, as a part of that would.
-        age: number of frames since it was found.
-        existence: probability that it exists, see `slam.objects.existence`.
-        reported: number of frames in which it was reported as measured.
-        reported_unmeasured: number of frames in which it was reported though it was not measured.
-        apart_from: id of the body of which it is a part with a motion of its own; None for none.
-        distinct: ids of bodies that it is known not to be a part of.
-        belief: its estimate; None where there is none yet.
-    """
+    """A body."""
 
     id: int
-    T: Array
-    velocity: Array
-    covariance: Array
-    history: Array
-    known: BoolArray
-    T_before: Array
-    lower: Array
-    upper: Array
-    size: float
-    reach: float
-    seen_at: float
-    velocity_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    seen: int = 1
-    missed: int = 0
-    measured: bool = True
-    moving: bool = True
-    evidence: float = 0.0
-    far: bool = False
-    proven: bool = False
-    moved: bool = False
-    alike: int = 0
-    age: int = 0
-    existence: float = EVEN
-    measured_at: float = float("nan")
-    reported: int = 0
-    reported_unmeasured: int = 0
-    apart_from: int | None = None
-    distinct: frozenset[int] = frozenset()
-    belief: BodyBelief | None = field(default=None, repr=False)
+    T: Array  # pose T_world_object (4, 4) at the present frame
+    velocity: Array  # [ω, v] (6,) in world axes
+    covariance: Array  # of the pose (6, 6), body axes
+    history: Array  # poses at the window's slots (W, 4, 4)
+    known: BoolArray  # at which slots there is a measured one (W,)
+    T_before: Array  # pose at the previous frame
+    lower: Array  # corner (3,) of the extent of its points, body coordinates
+    upper: Array  # the opposite corner
+    size: float  # what it measures across at least [m]
+    reach: float  # its points lie no farther from its origin [m]
+    seen_at: float  # when its points were last found together [s]
+    velocity_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of the velocity (6, 6)
+    seen: int = 1  # number of frames in which it was measured
+    missed: int = 0  # number of frames since it was measured
+    measured: bool = True  # whether it was in this frame
+    moving: bool = True  # whether it moves now
+    evidence: float = 0.0  # evidence that it has moved, given all that is uncertain; see `slam.objects.proof`
+    far: bool = False  # whether it was followed for farther than it is wide before it became a body
+    proven: bool = False  # whether it has moved for certain by its tracks
+    moved: bool = False  # whether it has by its estimate, too, see `slam.objects.estimator`: only then it is reported
+    alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
+    age: int = 0  # number of frames since it was found
+    existence: float = EVEN  # probability that it exists, see `slam.objects.existence`
+    measured_at: float = float("nan")  # when the estimate last used them [s]
+    reported: int = 0  # number of frames in which it was reported as measured
+    reported_unmeasured: int = 0  # number of frames in which it was reported though it was not measured
+    apart_from: int | None = None  # id of the body of which it is a part with a motion of its own; None for none
+    distinct: frozenset[int] = frozenset()  # ids of bodies that it is known not to be a part of
+    belief: BodyBelief | None = field(default=None, repr=False)  # its estimate; None where there is none yet
 
     @property
     def across(self) -> float:

@@ -41,21 +41,13 @@ def region_radius(depth: Any, size: float) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class MovingTracks:
-    """Tracks of a frame with their constant velocities, a row each.
+    """Tracks of a frame with their constant velocities, a row each."""
 
-    Attributes:
-        rows: in the table of tracks (N,).
-        ids: of the tracks (N,).
-        motion: their constant velocities.
-        radius: of the region about each (N,) [m].
-        moves: whether a fixed point does not explain it (N,).
-    """
-
-    rows: NDArray[np.intp]
-    ids: IdArray
-    motion: ConstantVelocity
-    radius: Array
-    moves: BoolArray
+    rows: NDArray[np.intp]  # in the table of tracks (N,)
+    ids: IdArray  # of the tracks (N,)
+    motion: ConstantVelocity  # their constant velocities
+    radius: Array  # of the region about each (N,) [m]
+    moves: BoolArray  # whether a fixed point does not explain it (N,)
 
     @classmethod
     def of(
@@ -111,34 +103,21 @@ class MovingTracks:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A region that may move.
+    """A region that may move."""
 
-    Attributes:
-        state: place and velocity (6,) in world axes [m], [m/s].
-        covariance: of the state (6, 6).
-        start: place where it began (3,), and
-        start_covariance: its covariance (3, 3).
-        supporters: ids of the tracks that supported it.
-        frames: number of frames with support.
-        agreeing, contradicting: number of tracks inside it so far that moved with it, and that did not.
-        unseen: number of frames without a track.
-        members: rows of the tracks that support it in this frame.
-        radius: of the region [m].
-        way: how far its velocity has taken it since it began (3,) [m].
-    """
-
-    state: Array
-    covariance: Array
-    start: Array
-    start_covariance: Array
-    supporters: frozenset[int]
-    frames: int = 1
-    agreeing: int = 0
-    contradicting: int = 0
-    unseen: int = 0
+    state: Array  # place and velocity (6,) in world axes [m], [m/s]
+    covariance: Array  # of the state (6, 6)
+    start: Array  # place where it began (3,)
+    start_covariance: Array  # its covariance (3, 3)
+    supporters: frozenset[int]  # ids of the tracks that supported it
+    frames: int = 1  # number of frames with support
+    agreeing: int = 0  # number of tracks inside it so far that moved with it
+    contradicting: int = 0  # and that did not
+    unseen: int = 0  # number of frames without a track
+    # rows of the tracks that support it in this frame
     members: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
-    radius: float = 0.0
-    way: Array = field(default_factory=lambda: np.zeros(3))
+    radius: float = 0.0  # of the region [m]
+    way: Array = field(default_factory=lambda: np.zeros(3))  # how far its velocity has taken it since it began (3,) [m]
 
     def twist(self, turn: float) -> tuple[Array, Array]:
         """Its twist [ω, v] (6,), and the covariance (6, 6) of it; `turn` [rad/s] is the deviation of ω."""

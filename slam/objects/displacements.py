@@ -18,19 +18,13 @@ _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 
 @dataclass(frozen=True, eq=False)
 class Displacements:
-    """How tracks moved from the older to the recent frames, a row each.
+    """How tracks moved from the older to the recent frames, a row each."""
 
-    Attributes:
-        points: where they are (N, 3), relative to the camera, in world axes [m].
-        d: displacements (N, 3) [m].
-        W: their information (N, 3, 3).
-        lag: frames between the older and the recent measurements, in the mean (N,); a pose error that grows evenly
-            shows in proportion.
-    """
-
-    points: Array
-    d: Array
-    W: Array
+    points: Array  # where they are (N, 3), relative to the camera, in world axes [m]
+    d: Array  # displacements (N, 3) [m]
+    W: Array  # their information (N, 3, 3)
+    # frames between the older and the recent measurements, in the mean (N,); a pose error that grows evenly shows in
+    # proportion
     lag: Array
 
 

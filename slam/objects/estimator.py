@@ -60,19 +60,13 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class _Expected:
-    """A belief with a new frame that is not measured yet.
+    """A belief with a new frame that is not measured yet."""
 
-    Attributes:
-        belief: with the predicted pose; it has no covariance yet.
-        covariance: of the new pose given the last one (6, 6): by the velocity, its impulse, and the camera's motion.
-        impulse: what the impulse adds to it (6, 6).
-        local: covariances of the points in the new camera, for a known motion since the last frame (N, 3, 3).
-    """
-
-    belief: BodyBelief
+    belief: BodyBelief  # with the predicted pose; it has no covariance yet
+    # of the new pose given the last one (6, 6): by the velocity, its impulse, and the camera's motion
     covariance: Array
-    impulse: Array
-    local: Array
+    impulse: Array  # what the impulse adds to it (6, 6)
+    local: Array  # covariances of the points in the new camera, for a known motion since the last frame (N, 3, 3)
 
 
 class BodyEstimator:

@@ -30,17 +30,11 @@ _RIDGE = 1e-6  # numerics: share of the trace
 
 @dataclass(frozen=True, eq=False)
 class FirstSights:
-    """Landmarks as they were when they were first seen.
+    """Landmarks as they were when they were first seen."""
 
-    Attributes:
-        ids: of the landmarks (N,), ascending.
-        points: where they were, in world coordinates (N, 3) [m].
-        frame: in which they were seen (N,).
-    """
-
-    ids: IdArray
-    points: Array
-    frame: IdArray
+    ids: IdArray  # of the landmarks (N,), ascending
+    points: Array  # where they were, in world coordinates (N, 3) [m]
+    frame: IdArray  # in which they were seen (N,)
 
     @classmethod
     def none(cls) -> FirstSights:

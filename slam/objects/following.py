@@ -87,27 +87,17 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The search for tracks in a frame, in windows about expected places.
+    """The search for tracks in a frame, in windows about expected places."""
 
-    Attributes:
-        tracks: all tracks.
-        T_world_left: the camera's pose (4, 4).
-        order: rows of the frame's features (F,) by ascending line of the left image.
-        features: their left and right pixels (F, 2), descriptors (F, D), and signs of the Laplacian (F,).
-        dt: time since the previous frame [s].
-        config: settings.
-        rig: the cameras.
-        sigma: pixel noise [px].
-    """
-
-    tracks: Tracks
-    T_world_left: Array
-    order: NDArray[np.intp]
+    tracks: Tracks  # all tracks
+    T_world_left: Array  # the camera's pose (4, 4)
+    order: NDArray[np.intp]  # rows of the frame's features (F,) by ascending line of the left image
+    # their left and right pixels (F, 2), descriptors (F, D), and signs of the Laplacian (F,)
     features: tuple[NDArray, ...]
-    dt: float
-    config: ObjectsConfig
-    rig: StereoRig
-    sigma: float
+    dt: float  # time since the previous frame [s]
+    config: ObjectsConfig  # settings
+    rig: StereoRig  # the cameras
+    sigma: float  # pixel noise [px]
 
     @classmethod
     def of(

@@ -22,43 +22,25 @@ _FAR = 3.0  # so many times the median distance from the median point is no part
 
 
 class MovingGroup(NamedTuple):
-    """Tracks that move alike.
+    """Tracks that move alike."""
 
-    Attributes:
-        members: their rows (K,).
-        centre: the point (3,) that the twist is about [m], world coordinates.
-        twist: [ω, v] (6,) at the centre [rad/s, m/s].
-        covariance: of the twist (6, 6).
-    """
-
-    members: NDArray[np.intp]
-    centre: Array
-    twist: Array
-    covariance: Array
+    members: NDArray[np.intp]  # their rows (K,)
+    centre: Array  # the point (3,) that the twist is about [m], world coordinates
+    twist: Array  # [ω, v] (6,) at the centre [rad/s, m/s]
+    covariance: Array  # of the twist (6, 6)
 
 
 class BodyInitializer(NamedTuple):
-    """Initializes bodies in one frame.
+    """Initializes bodies in one frame."""
 
-    Attributes:
-        rig: the cameras.
-        config: settings.
-        sigma: pixel noise [px].
-        models: how bodies are assumed to move.
-        times: of the window's slots less the present (W,) [s].
-        slot: the present frame's place in the window.
-        stamp: of the present frame [s].
-        eye: the left camera's place (3,) in the world [m].
-    """
-
-    rig: StereoRig
-    config: ObjectsConfig
-    sigma: float
-    models: ObjectModels
-    times: Array
-    slot: int
-    stamp: float
-    eye: Array
+    rig: StereoRig  # the cameras
+    config: ObjectsConfig  # settings
+    sigma: float  # pixel noise [px]
+    models: ObjectModels  # how bodies are assumed to move
+    times: Array  # of the window's slots less the present (W,) [s]
+    slot: int  # the present frame's place in the window
+    stamp: float  # of the present frame [s]
+    eye: Array  # the left camera's place (3,) in the world [m]
 
     def moving_group(self, tracks: Tracks, members: NDArray[np.intp]) -> MovingGroup | None:
         """Those of the tracks `members` (K,) that lie together and move alike; None if they are too few or too far."""

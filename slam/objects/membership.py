@@ -51,17 +51,11 @@ _APART = 2.0  # a group has a motion of its own that leaves so many times less �
 
 @dataclass(frozen=True, eq=False)
 class MembershipTest:
-    """How well tracks fit a body, a row each.
+    """How well tracks fit a body, a row each."""
 
-    Attributes:
-        gain: by how much χ² the body explains them better than the still world (N,).
-        fits: whether the body explains them (N,).
-        count: number of frames that say so (N,).
-    """
-
-    gain: Array
-    fits: BoolArray
-    count: NDArray[np.int64]
+    gain: Array  # by how much χ² the body explains them better than the still world (N,)
+    fits: BoolArray  # whether the body explains them (N,)
+    count: NDArray[np.int64]  # number of frames that say so (N,)
 
 
 def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> MembershipTest:

@@ -38,19 +38,12 @@ _CANDIDATES = 12  # cost: features with the largest determinants among which a t
 
 @dataclass(frozen=True, eq=False)
 class ObjectDatabase:
-    """What is known of an object beforehand: its features in the initial scene.
+    """What is known of an object beforehand: its features in the initial scene."""
 
-    Attributes:
-        points: 3D positions (M, 3) in world coordinates [m], M_j of step c.
-        descriptors: (M, D) float32.
-        laplacian: signs (M,) int8.
-        origin: A (3,), the origin of the object's coordinates in the initial scene [m].
-    """
-
-    points: Array
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    origin: Array
+    points: Array  # 3D positions (M, 3) in world coordinates [m], M_j of step c
+    descriptors: NDArray[np.float32]  # (M, D) float32
+    laplacian: NDArray[np.int8]  # signs (M,) int8
+    origin: Array  # A (3,), the origin of the object's coordinates in the initial scene [m]
 
     @classmethod
     def of(
@@ -113,23 +106,14 @@ class ObjectDatabase:
 
 @dataclass(frozen=True, eq=False)
 class ObjectMotion:
-    """The object's motion from the initial to the current scene, or why there is none.
+    """The object's motion from the initial to the current scene, or why there is none."""
 
-    Attributes:
-        reason: empty, or one line that says why there is no motion.
-        R: ``R_2^1`` (3, 3) (step d).
-        rpy: roll, pitch, yaw (3,) [rad] of R by the printed formulas.
-        translation: ``AA′`` (3,) [m] (step e).
-        triple: rows of the three features in the current scene (3,), and
-        database: in the database (3,).
-    """
-
-    reason: str
-    R: Array
-    rpy: Array
-    translation: Array
-    triple: NDArray[np.intp]
-    database: NDArray[np.intp]
+    reason: str  # empty, or one line that says why there is no motion
+    R: Array  # ``R_2^1`` (3, 3) (step d)
+    rpy: Array  # roll, pitch, yaw (3,) [rad] of R by the printed formulas
+    translation: Array  # ``AA′`` (3,) [m] (step e)
+    triple: NDArray[np.intp]  # rows of the three features in the current scene (3,)
+    database: NDArray[np.intp]  # and in the database (3,)
 
     @classmethod
     def refused(cls, reason: str) -> ObjectMotion:

@@ -43,20 +43,13 @@ _WEAK = 1e-9  # numerics: of information [1/m²], of variance [m²]
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """Where a body was in the frames of the window.
+    """Where a body was in the frames of the window."""
 
-    Attributes:
-        places: of its middle in some of them (K, 3), in world coordinates [m].
-        times: of these frames (K,) [s].
-        by_rig: how far it seems to go in a frame by a disparity that is wrong by the deviation of a pixel (3,) [m].
-        of_camera: how far the camera went in these frames [m].
-        part: whether it is a part of another body, which moves for certain: it does not slide over the still world.
-    """
-
-    places: Array
-    times: Array
-    by_rig: Array
-    of_camera: float
+    places: Array  # of its middle in some of them (K, 3), in world coordinates [m]
+    times: Array  # of these frames (K,) [s]
+    by_rig: Array  # how far it seems to go in a frame by a disparity that is wrong by the deviation of a pixel (3,) [m]
+    of_camera: float  # how far the camera went in these frames [m]
+    # whether it is a part of another body, which moves for certain: it does not slide over the still world
     part: bool = False
 
     @classmethod

@@ -33,17 +33,11 @@ _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of win
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Tracks that moved alike, and otherwise than the rest.
+    """Tracks that moved alike, and otherwise than the rest."""
 
-    Attributes:
-        members: their rows (K,).
-        test: χ²(6) of their motion against the rest's.
-        away: how far they went against the rest, in the mean [m].
-    """
-
-    members: NDArray[np.intp]
-    test: float
-    away: float
+    members: NDArray[np.intp]  # their rows (K,)
+    test: float  # χ²(6) of their motion against the rest's
+    away: float  # how far they went against the rest, in the mean [m]
 
     def moves(self, test: float, away: float) -> bool:
         """Whether it went farther than `away` [m] and moved for certain: by a χ²(6) above `limit` of `test`."""
@@ -52,19 +46,12 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the displacements say.
+    """What the displacements say."""
 
-    Attributes:
-        groups: those that moved on their own, the clearest first.
-        alone: χ²(3) of every track's displacement against the rest's common motion (N,).
-        common: the motion ξ (6,) of the rest in a frame, by the error of the camera's motion, and
-        covariance: its covariance (6, 6).
-    """
-
-    groups: list[Group]
-    alone: Array
-    common: Array
-    covariance: Array
+    groups: list[Group]  # those that moved on their own, the clearest first
+    alone: Array  # χ²(3) of every track's displacement against the rest's common motion (N,)
+    common: Array  # the motion ξ (6,) of the rest in a frame, by the error of the camera's motion
+    covariance: Array  # its covariance (6, 6)
 
 
 def limit(test: float, size: NDArray[np.intp] | int) -> Array:

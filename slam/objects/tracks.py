@@ -26,61 +26,36 @@ _ROOM = 1000  # cost: rows that a table begins with
 
 @dataclass(eq=False)
 class Tracks:
-    """A table of tracks; the one mutable thing of the detector. Rows of tracks that were given up are used again.
+    """A table of tracks; the one mutable thing of the detector. Rows of tracks that were given up are used again."""
 
-    Attributes:
-        ids: (N,), never used twice; −1 for unused rows, which are neither seen nor of a body.
-        descriptors, laplacian: as last seen (N, D) float32, (N,) int8.
-        row: row of the feature in this frame (N,), −1 where not seen.
-        landmark: id of the landmark that it is (N,), −1 for none.
-        body: id of the body that it belongs to (N,), −1 for none.
-        missed: frames since a feature was last found that looks like it (N,).
-        anchor: origin of the track's own coordinates, in world axes (N, 3).
-        A: information (N, W, 3, 3), zero where there is no measurement; slot ``frame % W``.
-        p: the point that the pixels say (N, W, 3), relative to the anchor.
-        dof: numbers measured (N, W): 3, 2 or 0.
-        older_A, older_b: fading sums of A and ``A p`` of what has left the window (N, 3, 3), (N, 3), and
-        older_age: of the ages of these measurements in frames, each times the trace of its A (N,).
-        position: where it is now, in world coordinates (N, 3).
-        covariance: of the position (N, 3, 3).
-        velocity: of those that a fixed point does not explain (N, 3) [m/s]; zero for the others.
-        velocity_covariance: (N, 3, 3), of those that have one.
-        streak: number of frames in which it was part of a moving group, less those since in which it was not (N,).
-        doubtful: not still for certain (N,).
-        local: point in the body's coordinates (N, 3), and
-        local_information: its information (N, 3, 3).
-        misfit: how often lately it disagreed with its body (N,).
-        sure: whether its motion with the body is certain (N,).
-        expelled: whether it was removed from a body (N,): then it needs proof of its motion to become a member again.
-        still: whether its feature stays at its pixel while the camera stands (N,): it belongs to no body.
-    """
-
-    ids: IdArray
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    row: NDArray[np.intp]
-    landmark: IdArray
-    body: IdArray
-    missed: IdArray
-    anchor: Array
-    A: Array
-    p: Array
-    dof: NDArray[np.int8]
-    older_A: Array
-    older_b: Array
-    older_age: Array
-    position: Array
-    covariance: Array
-    velocity: Array
-    velocity_covariance: Array
+    ids: IdArray  # (N,), never used twice; −1 for unused rows, which are neither seen nor of a body
+    descriptors: NDArray[np.float32]  # as last seen (N, D)
+    laplacian: NDArray[np.int8]  # sign of the Laplacian as last seen (N,)
+    row: NDArray[np.intp]  # row of the feature in this frame (N,), −1 where not seen
+    landmark: IdArray  # id of the landmark that it is (N,), −1 for none
+    body: IdArray  # id of the body that it belongs to (N,), −1 for none
+    missed: IdArray  # frames since a feature was last found that looks like it (N,)
+    anchor: Array  # origin of the track's own coordinates, in world axes (N, 3)
+    A: Array  # information (N, W, 3, 3), zero where there is no measurement; slot ``frame % W``
+    p: Array  # the point that the pixels say (N, W, 3), relative to the anchor
+    dof: NDArray[np.int8]  # numbers measured (N, W): 3, 2 or 0
+    older_A: Array  # fading sum of A of what has left the window (N, 3, 3)
+    older_b: Array  # fading sum of its ``A p`` (N, 3)
+    older_age: Array  # fading sum of its ages in frames, each times the trace of its A (N,)
+    position: Array  # where it is now, in world coordinates (N, 3)
+    covariance: Array  # of the position (N, 3, 3)
+    velocity: Array  # of those that a fixed point does not explain (N, 3) [m/s]; zero for the others
+    velocity_covariance: Array  # (N, 3, 3), of those that have one
+    # number of frames in which it was part of a moving group, less those since in which it was not (N,)
     streak: IdArray
-    doubtful: BoolArray
-    local: Array
-    local_information: Array
-    misfit: IdArray
-    sure: BoolArray
+    doubtful: BoolArray  # not still for certain (N,)
+    local: Array  # point in the body's coordinates (N, 3)
+    local_information: Array  # its information (N, 3, 3)
+    misfit: IdArray  # how often lately it disagreed with its body (N,)
+    sure: BoolArray  # whether its motion with the body is certain (N,)
+    # whether it was removed from a body (N,): then it needs proof of its motion to become a member again
     expelled: BoolArray
-    still: BoolArray
+    still: BoolArray  # whether its feature stays at its pixel while the camera stands (N,): it belongs to no body
 
     @classmethod
     def empty(cls, dimensions: int, window: int, rows: int = _ROOM) -> Tracks:
@@ -172,21 +147,13 @@ def fit_positions(tracks: Tracks, rows: NDArray[np.intp]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ConstantVelocity:
-    """Points with an even velocity, a row each.
+    """Points with an even velocity, a row each."""
 
-    Attributes:
-        position: now (N, 3).
-        covariance: of the position (N, 3, 3).
-        velocity: (N, 3) [m/s].
-        velocity_covariance: (N, 3, 3).
-        test: χ²(3) of the velocity (N,).
-    """
-
-    position: Array
-    covariance: Array
-    velocity: Array
-    velocity_covariance: Array
-    test: Array
+    position: Array  # now (N, 3)
+    covariance: Array  # of the position (N, 3, 3)
+    velocity: Array  # (N, 3) [m/s]
+    velocity_covariance: Array  # (N, 3, 3)
+    test: Array  # χ²(3) of the velocity (N,)
 
 
 def constant_velocity(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> ConstantVelocity:

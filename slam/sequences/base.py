@@ -101,26 +101,20 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RecordedSequence:
-    """A sequence on disk. It keeps the `Sequence` protocol; properties are described there.
-
-    Attributes:
-        source: where the images come from.
-        gps: a positions-only track (N, 4) of rows ``stamp [s], forward, right, third [m]``, good in the plane only;
-            None where there is none. It is no pose and in no camera's axes: compare positions after alignment.
-        truth_noise: how well the ground truth is known.
-        masks: of both cameras, where their images may be used; see `slam.sequences.door`.
-    """
+    """A sequence on disk. It keeps the `Sequence` protocol; properties are described there."""
 
     name: str
     format: str
     kind: str
     rig: StereoRig
-    source: FrameSource
+    source: FrameSource  # where the images come from
     ground_truth: Trajectory | None = None
+    # a positions-only track (N, 4) of rows ``stamp [s], forward, right, third [m]``, good in the plane only; None where
+    # there is none. It is no pose and in no camera's axes: compare positions after alignment
     gps: Array | None = None
     warnings: list[str] = field(default_factory=list)
-    truth_noise: TruthNoise = field(default_factory=TruthNoise)
-    masks: Masks = (None, None)
+    truth_noise: TruthNoise = field(default_factory=TruthNoise)  # how well the ground truth is known
+    masks: Masks = (None, None)  # of both cameras, where their images may be used; see `slam.sequences.door`
 
     def __post_init__(self) -> None:
         if self.ground_truth is not None and self.rig.turns:

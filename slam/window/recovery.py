@@ -30,19 +30,12 @@ _ANY_TURN = np.pi**2 / 3  # variance of a turn by any angle [rad²]
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """A solution.
+    """A solution."""
 
-    Attributes:
-        T: the newest pose (4, 4).
-        used: which observations (M,) agree with it.
-        jump: variances (6,) that the prediction lacks, if the problem shall be restarted; else None.
-        contradicted: updates in succession, with this one, in which most observations agreed on another pose than
-            was expected.
-    """
-
-    T: Array
-    used: BoolArray
-    jump: Array | None = None
+    T: Array  # the newest pose (4, 4)
+    used: BoolArray  # which observations (M,) agree with it
+    jump: Array | None = None  # variances (6,) that the prediction lacks, if the problem shall be restarted; else None
+    # updates in succession, with this one, in which most observations agreed on another pose than was expected
     contradicted: int = 0
 
 
