@@ -36,7 +36,7 @@ from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
 from slam.objects.merging import merge
 from slam.objects.parts import moving_parts
-from slam.objects.proof import Way, with_frame
+from slam.objects.proof import PROOF, Way, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Scene, classify_scene
 from slam.objects.revision import CorrectRows, revise_tracks
@@ -207,8 +207,10 @@ class MovingObjectDetector:
             members = members[tracks.count(members) >= c.min_frames - 1]
             moved = displacements(tracks, members, ages, self._poses[:, :3, 3], self.slide)
             way = Way.of(body, self._stamps, self._poses, self.rig, self.sigma)
-            evidence, proven = with_frame(body.evidence, moved, scene, way, body.far)
-            body = replace(body, evidence=evidence, proven=body.proven or proven)
+            evidence, certain = with_frame(body.evidence, moved, scene, way, body.far)
+            frames = body.certain + 1 if certain else 0
+            proven = body.proven or frames >= PROOF
+            body = replace(body, evidence=evidence, certain=frames, proven=proven)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
                 self._drop(body)

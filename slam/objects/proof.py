@@ -32,6 +32,7 @@ from slam.objects.regions import Scene
 
 PROVEN = 12.0  #: −log10 of the chance from which a body has moved for certain if it went farther than the camera; at 8
 #: the same bodies are found in `boxes` and on drives, and twice as many pieces of a walker
+PROOF = 2  #: frames in succession that must be certain; at 1 what jumps once is a body in two of five runs of MH_01
 _SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to some 1e-19
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves

@@ -34,9 +34,9 @@ def moving_box():
 def test_a_body_out_of_view_is_reported_for_a_short_while_only(moving_box):
     step, _ = moving_box
     rows = [thing for k in range(EVEN, GONE) for thing in step(k).objects]
-    # It moves in 40 of these frames; two tests together are sure of that some 20 frames later.
+    # It moves in 40 of these frames; two tests are sure of that, in two frames in succession, some 20 frames later.
     measured = sum(thing.estimate.measured for thing in rows)
-    assert measured >= 18 and rows[-1].existence > 0.99
+    assert measured >= 17 and rows[-1].existence > 0.99
     assert rows[-1].measured_at == rows[-1].estimate.stamp
     things = [thing for k in range(GONE, GONE + 40) for thing in step(k, covered=True).objects]
     after = [thing for thing in things if thing.id == rows[-1].id]
