@@ -5,10 +5,11 @@ Bars are `bars.ROOM` times the medians over perturbations in ``tests/bars.json``
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from experiments.ablation_parts import CASES, RECORDED, USUAL, error_of
-from experiments.bars import bars
+from experiments.bars import bars, errors
 from slam.geometry.trajectory import Trajectory
 from slam.run.options import RunOptions
 from slam.run.runner import run
@@ -26,8 +27,12 @@ def run_defaults(slam_data, case, backend, out, frames=None):
     return sequence, run(sequence, RunOptions(backend, "surf", config, out, 0, frames or case.frames))
 
 
+SCATTERED = CASES[-1]  # the library, without what recognises a place: single runs differ by a factor of four
+
+
 @pytest.mark.parametrize(
-    ("case", "backend"), [pytest.param(c, b, id=f"{c.name}-{b}") for c in RECORDED for b in bars(c.name)]
+    ("case", "backend"),
+    [pytest.param(c, b, id=f"{c.name}-{b}") for c in RECORDED if c is not SCATTERED for b in bars(c.name)],
 )
 def test_errors_are_those_measured(slam_data, tmp_path, case, backend):
     """Plain stereo odometry on OpenCV's ORB or SIFT has 0.36 and 0.20 m on KITTI 06.
@@ -41,6 +46,14 @@ def test_errors_are_those_measured(slam_data, tmp_path, case, backend):
     assert summary["frames"] == case.frames
     for path, allowed in bars(case.name)[backend].items():
         assert error_of(Trajectory.read_tum(tmp_path / PATHS[path]), sequence) < allowed, path
+
+
+def test_the_median_is_that_measured_where_single_runs_scatter(slam_data):
+    sequence, allowed = open_sequence(slam_data / SCATTERED.path), bars(SCATTERED.name)
+    trials = [errors(SCATTERED, sequence, tuple(allowed), trial) for trial in range(3)]
+    for backend, figures in allowed.items():
+        for path, most in figures.items():
+            assert np.median([trial[backend][path] for trial in trials]) < most, (backend, path)
 
 
 def test_the_same_run_twice_is_the_same_to_the_byte(slam_data, tmp_path):
