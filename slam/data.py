@@ -355,7 +355,7 @@ class FrameResult:
         status, reason: how it ended, and one line that says why, if it was not tracked; else empty.
         estimate: pose after the step, without landmarks; `StereoSlam.estimate` includes them.
         report: the back end's report.
-        features: of the frame.
+        features: of the frame, without those outside of the rectified image: rows count what is left.
         predicted: number of landmarks in the angle of view.
         matched, matched_features: ids of landmarks associated with a feature (after the geometric check), and rows of
             those features (K,).

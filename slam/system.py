@@ -137,7 +137,7 @@ class StereoSlam:
 
     @property
     def atlas(self) -> Atlas:
-        """Keyframes and loops after the last step."""
+        """Keyframes and loops after the last step; their poses are of the rectified left camera."""
         return self._state.atlas
 
     @property

@@ -21,7 +21,7 @@ def fit(
 ):  # fmt: skip
     """Gauss-Newton of `slam.calibration.motion.fit_motion` on R, t and `points`, all in place.
 
-    Points are weighted as in `slam.calibration.robust.student_weights`, `median` being that of χ². Returns the last
+    Points are weighted as in `slam.calibration.evidence.student_weights`, `median` being that of χ². Returns the last
     change of a predicted point [px], infinite where there is no solution.
     """
     H, step, turn, before, last = np.empty((6, 6)), np.empty(6), np.empty((3, 4)), np.empty((3, 3)), np.inf

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.data import Estimate, FrameResult, StereoFeatures
+from slam.data import Estimate, FrameResult, Observations, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import adjoint, inverse
+from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
@@ -41,20 +41,36 @@ class Rectification:
             raise ConfigurationError("the back end works behind rectification: make it with rig.rectified.rig")
 
     def models(self, models: EstimatorModels) -> EstimatorModels:
-        """Models for the rectified pair: the noise of its pixels, and the first pose of its left camera."""
+        """Models for the rectified pair: noise and drift of its pixels, and the first pose of its left camera."""
         if self._none:
             return models
-        T = models.initial_pose @ self._ways.T_left_rectified
-        return replace(models, pixel_sigma=models.pixel_sigma * self._ways.scale, T_world_left=T.tolist())
+        T, scale = models.initial_pose @ self._ways.T_left_rectified, self._ways.scale
+        objects = replace(models.objects, drift=models.objects.drift * scale)
+        return replace(models, pixel_sigma=models.pixel_sigma * scale, T_world_left=T.tolist(), objects=objects)
 
     def features_in(self, features: StereoFeatures) -> StereoFeatures:
         """Features in pixels of the rectified pair; those outside of its left image are left out."""
         if self._none:
             return features
-        left, right = self._ways.rectify_left(features.uv_left), self._ways.rectify_right(features.uv_right)
-        moved = replace(features, uv_left=left, uv_right=right)
+        left = self._ways.rectify_left(features.uv_left)
+        moved = replace(features, uv_left=left, uv_right=self._right(features.uv_right))
         inside = self.rig.left.in_image(left)
         return moved if inside.all() else moved.select(np.flatnonzero(inside))
+
+    def observations_in(self, seen: Observations) -> Observations:
+        """Observations in pixels of the rectified pair."""
+        if self._none:
+            return seen
+        return Observations(seen.ids, self._ways.rectify_left(seen.uv_left), self._right(seen.uv_right))
+
+    def _right(self, uv: Array) -> Array:
+        """Right pixels (N, 2); none where they come to lie farther outside the image than that is large.
+
+        A fisheye sees rays across its axis, whose pixels in the rectified pair lie at infinity.
+        """
+        right, size = self._ways.rectify_right(uv), np.array([self.rig.width, self.rig.height])
+        far = (np.abs(right - 0.5 * size) > 1.5 * size).any(axis=1, keepdims=True)  # NaN compares false
+        return np.where(far, np.nan, right)
 
     def result_out(self, result: FrameResult) -> FrameResult:
         """A result in pixels and axes of the rig's own left camera."""

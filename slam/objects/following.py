@@ -38,7 +38,7 @@ def follow(
 ) -> None:
     """Find each track's feature in this frame; sets rows, descriptors and misses, in place.
 
-    Members of bodies take over their feature's descriptor even if `slam.objects.recovery.locate` does not confirm the
+    Members of bodies take over their feature's descriptor even if `slam.objects.recovery.located` does not confirm the
     match afterwards, because the body's pose is wrong more often than the match. Members of a body that was not
     measured in the last frame keep theirs: otherwise they would take over descriptors of what occludes the body.
 

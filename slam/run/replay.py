@@ -12,6 +12,7 @@ import numpy as np
 
 from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
+from slam.input.rectification import Rectification
 from slam.interfaces import Backend, RevisingBackend
 from slam.run.recorded import RecordedFrame, Recording
 from slam.third_party import checked, named_failures
@@ -27,7 +28,7 @@ def replay(
 
     Args:
         recording: what to give.
-        backend: a new back end for the recording's rig.
+        backend: a new back end for the recording's rectified pair, ``recording.rig.rectified.rig``.
         guess: give `Backend.update` the pose on which the observations agree, as the system does; it is found again
             from this back end's own map. All observations are given, also those that do not agree.
         association: settings of that search; None for the defaults.
@@ -37,39 +38,41 @@ def replay(
 
     Raises:
         MeasurementError: the recording is not consistent: an unknown id, or one that is in the map already.
+        ConfigurationError: the back end was made for cameras that are not rectified.
         PartError: a back end from elsewhere raised an exception of its own.
     """
-    config = association or AssociationConfig()
+    config, inside = association or AssociationConfig(), Rectification(recording.rig)
+    inside.require_fits(backend)
     for k, frame in enumerate(recording):
         with named_failures(f"frame {frame.number}", backend):
-            result = _step(recording, backend, k, frame, config if guess else None)
+            result = _step(recording, inside, backend, k, frame, config if guess else None)
         yield result
 
 
 def _step(
-    recording: Recording, backend: Backend, k: int, frame: RecordedFrame, config: AssociationConfig | None
-) -> FrameResult:
+    recording: Recording, inside: Rectification, backend: Backend, k: int, frame: RecordedFrame,
+    config: AssociationConfig | None,
+) -> FrameResult:  # fmt: skip
     """One frame."""
-    times, guess, seen = [time.perf_counter()], None, frame.observed
+    times, guess = [time.perf_counter()], None
+    seen, added = inside.observations_in(frame.observed), inside.observations_in(frame.added)
     if frame.revision is not None and isinstance(backend, RevisingBackend):
         backend.revise(frame.revision.rows)
     prediction = checked(backend, "predict", backend.predict(frame.stamp))
     times.append(time.perf_counter())
     if config is not None and len(seen):
-        ways, points = recording.rig.rectified, backend.positions(seen.ids)
-        measured = measurement_rows(ways.rectify_left(seen.uv_left), ways.rectify_right(seen.uv_right))
-        threshold = config.consistency_sigmas * recording.models.pixel_sigma
-        expected = prediction.T_world_left @ ways.T_left_rectified
-        found = find_consensus(ways.rig, points, measured, expected, threshold, config.hypotheses, seed=k)
-        guess = found.T_world_left @ ways.T_left_rectified.T
+        points, measured = backend.positions(seen.ids), measurement_rows(seen.uv_left, seen.uv_right)
+        threshold = config.consistency_sigmas * inside.models(recording.models).pixel_sigma
+        expected, tries = prediction.T_world_left, config.hypotheses
+        guess = find_consensus(inside.rig, points, measured, expected, threshold, tries, seed=k).T_world_left
     times.append(time.perf_counter())
     report = checked(backend, "update", backend.update(seen, guess))
     times.append(time.perf_counter())
     at_once = np.isin(frame.removed, frame.added.ids)  # what has just been added may leave at once
     if not at_once.all():
         backend.remove(frame.removed[~at_once])
-    if len(frame.added):
-        backend.add(frame.added)
+    if len(added):
+        backend.add(added)
     if at_once.any():
         backend.remove(frame.removed[at_once])
     times.append(time.perf_counter())
@@ -80,8 +83,8 @@ def _step(
     nothing = np.full(every, np.nan)
     features = StereoFeatures(
         frame.stamp,
-        np.concatenate([seen.uv_left, frame.added.uv_left]),
-        np.concatenate([seen.uv_right, frame.added.uv_right]),
+        np.concatenate([frame.observed.uv_left, frame.added.uv_left]),
+        np.concatenate([frame.observed.uv_right, frame.added.uv_right]),
         *(nothing, nothing, nothing),
         np.zeros(every, np.int8),
         np.zeros((every, 0), np.float32),
@@ -90,7 +93,7 @@ def _step(
         index=k,
         status=status,
         reason=reason,
-        estimate=estimate,
+        estimate=inside.estimate_out(estimate),
         report=report,
         features=features,
         predicted=len(prediction.ids),

@@ -17,6 +17,7 @@ from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
 from slam.geometry.trajectory import Trajectory
+from slam.input.rectification import Rectification
 from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
 from slam.outputs import require_outputs
@@ -117,8 +118,9 @@ def run_recording(
     Raises:
         SlamError: bad input; one line says what and where.
     """
-    config = options.config
-    backend = registry.create("backends", options.backend, recording.rig, models=config.models, **config.backend)
+    config, inside = options.config, Rectification(recording.rig)
+    models = inside.models(config.models)
+    backend = registry.create("backends", options.backend, inside.rig, models=models, **config.backend)
     results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
     record = RunRecord() if record is None else record
     return _Run(recording, options, Replayed(recording, backend, record), record).drive(results, on_frame)

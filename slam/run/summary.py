@@ -13,6 +13,7 @@ from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
+from slam.input.rectification import Rectification
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend
 from slam.rig_error import CommonError
@@ -98,13 +99,13 @@ class Replayed:
     def trajectory(self) -> Trajectory:
         """The back end's final estimate of every frame's pose."""
         with named_failures("the path", self.backend):
-            return self.backend.trajectory()
+            return Rectification(self.recording.rig).path_out(self.backend.trajectory())
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
         with named_failures("the estimate", self.backend):
             estimate: Estimate = checked(self.backend, "estimate", self.backend.estimate())
-            return estimate
+            return Rectification(self.recording.rig).estimate_out(estimate)
 
     @property
     def landmarks(self) -> LandmarkTable:

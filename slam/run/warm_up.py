@@ -75,7 +75,7 @@ def compiled_in_background(backend: str) -> Iterator[None]:
     """
     from slam.objects.scene_kernels import groups_apart
 
-    folder = groups_apart.stats.cache_path
+    folder = groups_apart.stats.cache_path if hasattr(groups_apart, "stats") else None  # without Numba's compiler
     cold = folder is not None and not any(Path(folder).glob("scene_kernels.groups_apart-*.nbi"))
     if available_cores() < 2 or not cold:
         yield

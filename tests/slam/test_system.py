@@ -122,6 +122,13 @@ def frames_without_images(count: int = 12) -> list[StereoFrame]:
     return [StereoFrame(k, k / 30, none, none) for k in range(count)]
 
 
+def test_a_run_with_overlap_gives_the_same_bytes_as_one_step_after_the_other():
+    frames, systems = frames_without_images(), [StereoSlam(RIG, CloudFrontend(), "ekf", config=CONFIG) for _ in "123"]
+    runs = [[result for _, result in systems[overlap].run(frames, bool(overlap))] for overlap in (0, 1)]
+    runs.append([systems[2].process(frame) for frame in frames])
+    assert len({np.array([r.estimate.T_world_left for r in results]).tobytes() for results in runs}) == 1
+
+
 def test_a_frame_that_cannot_be_extracted_ends_a_run_after_the_frames_before_it():
     system = StereoSlam(RIG, CloudFrontend(broken=5), "ekf", config=CONFIG)
     done = []

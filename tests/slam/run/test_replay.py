@@ -34,7 +34,9 @@ def online(results):
     return np.array([r.estimate.T_world_left for r in results])
 
 
-def test_a_run_replayed_into_the_same_back_end_is_the_same_run(desk):
+@pytest.mark.parametrize("rig", ["rectified", "toedin"])
+def test_a_run_replayed_into_the_same_back_end_is_the_same_run(rig):
+    desk = slam.open_sequence(f"synthetic:desk?frames={FRAMES}&rig={rig}")
     config = SystemConfig.for_kind("handheld", None, "ekf").with_settings(["models.pixel_sigma=0.5"])  # the world's
     system = StereoSlam(desk.rig, None, "ekf", config=config)
     results = [system.process_features(desk.observations(k)) for k in range(FRAMES)]
