@@ -127,14 +127,27 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
             registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
     goes_on = not overwrite and (out / SWEEP).is_file()
     if goes_on:
-        before = read_object(out / SWEEP).get("versions")
+        held = read_object(out / SWEEP)
+        before = held.get("versions")
         if not isinstance(before, dict):
             raise SlamError(f"{out / SWEEP}: not that of a comparison")
         changed = changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code())
         if changed:
             raise SlamError(f"{out}: begun with {changed[0]}: runs cannot be compared; give another --out")
+        if not _has_all_of(plan, held.get("plan")):
+            raise SlamError(f"{out}: holds a comparison of more or other runs; give another --out, or --overwrite")
     require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)
     return frames
+
+
+def _has_all_of(plan: Plan, before: object) -> bool:
+    """Whether all runs of an earlier plan, in plain types, are among those of this one: its report may be replaced."""
+    now = json.loads(json.dumps(asdict(plan)))
+    if not isinstance(before, dict) or any(before.get(key) != now[key] for key in ("start", "stop", "replay")):
+        return False
+    parts = [(before.get(key), now[key]) for key in ("sequences", "backends", "variants")]
+    held = all(isinstance(old, list) and all(one in new for one in old) for old, new in parts)
+    return held and isinstance(before.get("trials"), int) and before["trials"] <= plan.trials
 
 
 def read_run(trial: Trial, out: Path) -> Run:

@@ -137,9 +137,10 @@ def test_bad_input_of_a_trial_is_an_outcome():
 
 
 def test_a_folder_with_other_runs_is_left_alone(again):
-    other = replace(PLAN, variants=(Variant("simulated", "simulated", ("map.max_landmarks=190",)),))
-    with pytest.raises(SlamError, match="other settings"):
-        sweep(other, again, LocalScheduler(1))
+    settings = replace(PLAN, variants=(Variant("simulated", "simulated", ("map.max_landmarks=190",)),))
+    for other in (settings, replace(PLAN, trials=PLAN.trials - 1), replace(PLAN, backends=PLAN.backends[:1])):
+        with pytest.raises(SlamError, match="more or other runs"):
+            sweep(other, again, LocalScheduler(1))
     tree = json.loads((again / SWEEP).read_text())
     for name in ("numpy", "code"):
         (again / SWEEP).write_text(json.dumps({**tree, "versions": {**tree["versions"], name: "0.1"}}))
