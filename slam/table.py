@@ -35,7 +35,7 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkTable(Table):
+class LandmarkRows(Table):
     """A row for each landmark of a map."""
 
     ids: IdArray  # (N,), negative for one that is in the map no more

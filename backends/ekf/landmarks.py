@@ -16,7 +16,7 @@ import numpy as np
 
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array, hat
-from slam.table import LandmarkTable
+from slam.table import LandmarkRows
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
@@ -92,7 +92,7 @@ COORDINATES: dict[str, Coordinates] = {"inverse_depth": InverseDepth(), "euclide
 
 
 @dataclass(frozen=True, eq=False)
-class FilterLandmarks(LandmarkTable):
+class FilterLandmarks(LandmarkRows):
     """The map in rows: landmarks of the filter's state, in its order; those that left it; those that are only known."""
 
     anchors: Array  # (N, 3, 4), constants

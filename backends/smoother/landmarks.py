@@ -10,7 +10,7 @@ import numpy as np
 from backends.smoother.landmark_kernels import carried_by, information_of
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array, points_by_pose
-from slam.table import LandmarkTable
+from slam.table import LandmarkRows
 from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
@@ -20,7 +20,7 @@ _BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies b
 
 
 @dataclass(frozen=True, eq=False)
-class SmootherLandmarks(LandmarkTable):
+class SmootherLandmarks(LandmarkRows):
     """The map, a row for each landmark."""
 
     serial: IdArray  # number of each in the order of their coming (S,); an id may come back, a serial number not

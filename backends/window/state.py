@@ -9,13 +9,13 @@ import numpy as np
 from backends.window.past import Past
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
-from slam.table import LandmarkTable
+from slam.table import LandmarkRows
 from slam.window.problem import Places, RelativePrior, Rows
 from slam.window.stereo import relative_covariance
 
 
 @dataclass(frozen=True, eq=False)
-class WindowLandmarks(LandmarkTable):
+class WindowLandmarks(LandmarkRows):
     """A row for each landmark, and for each that was removed (its id is −1) but has measurements in the window."""
 
     serial: IdArray  # number of each in the order of their coming (S,); an id may come back, a serial number not

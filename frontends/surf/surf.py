@@ -137,6 +137,8 @@ class Surf:
         mask = None if mask is None else binary_mask(mask, image.shape)
         return self.describe_in(integral, self.detect_in(integral, FULL_SCALE[image.dtype], mask))
 
+    # What people know from OpenCV's Feature2D; `detect` is above, and gives what serves as a list of cv2.KeyPoint.
+
     def compute(
         self, image: NDArray, keypoints: Iterable[cv2.KeyPoint]
     ) -> tuple[tuple[cv2.KeyPoint, ...], NDArray[np.float32]]:
@@ -157,11 +159,19 @@ class Surf:
         return found.to_cv2(), descriptors
 
     def detectAndCompute(
-        self, image: NDArray, mask: NDArray | None = None
+        self, image: NDArray, mask: NDArray | None = None, descriptors: None = None, useProvidedKeypoints: bool = False
     ) -> tuple[tuple[cv2.KeyPoint, ...], NDArray[np.float32]]:
-        """The same as OpenCV's method of this name: ``cv2.KeyPoint`` objects and descriptors (N, 16 or 64)."""
-        keypoints, descriptors = self.detect_and_describe(image, mask)
-        return keypoints.to_cv2(), descriptors
+        """The same as OpenCV's method of this name: ``cv2.KeyPoint`` objects and descriptors (N, 16 or 64).
+
+        `descriptors` is OpenCV's place for the output; keypoints of one's own are for `compute`.
+
+        Raises:
+            ConfigurationError: `useProvidedKeypoints` is true.
+        """
+        if useProvidedKeypoints:
+            raise ConfigurationError("useProvidedKeypoints: use compute(image, keypoints)")
+        keypoints, described = self.detect_and_describe(image, mask)
+        return keypoints.to_cv2(), described
 
     def getHessianThreshold(self) -> float:
         """Least determinant of the Hessian."""
@@ -169,7 +179,7 @@ class Surf:
 
     def setHessianThreshold(self, hessianThreshold: float) -> None:
         """Set it; raises ConfigurationError below 0."""
-        if not (np.isfinite(hessianThreshold) and hessianThreshold >= 0):
+        if not (isinstance(hessianThreshold, (int, float, np.number)) and 0 <= hessianThreshold < np.inf):
             raise ConfigurationError(f"threshold: must be a number of at least 0, not {hessianThreshold}")
         self.threshold = float(hessianThreshold)
 

@@ -31,7 +31,7 @@ from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
 from slam.interfaces import Backend, RevisingBackend
 from slam.models import EstimatorModels
 from slam.rig_error import CommonError
-from slam.table import LandmarkTable
+from slam.table import LandmarkRows
 
 #: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
 #: tenths of a percent. It scales the whole world, so images never show it.
@@ -41,7 +41,7 @@ _SIGNIFICANT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkSensitivities(LandmarkTable):
+class LandmarkSensitivities(LandmarkRows):
     """How landmarks depend on m errors of the rig, and what is known of them beside these."""
 
     by_rig: Array  # L (N, 3, m), in world coordinates

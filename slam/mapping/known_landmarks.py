@@ -8,7 +8,7 @@ from slam.checks import FARTHEST_POSITION
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import LEAST_VARIANCE, Array
-from slam.table import LandmarkTable
+from slam.table import LandmarkRows
 
 _NEAREST = 1e-3  # guard: least depth [m] of a landmark that a camera sees
 _LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having
@@ -51,7 +51,7 @@ def definite(covariances: Array) -> Array:
 
 
 def known_landmarks(
-    backend: str, table: LandmarkTable, ids: IdArray, positions: Array, covariances: Array, seen: bool
+    backend: str, table: LandmarkRows, ids: IdArray, positions: Array, covariances: Array, seen: bool
 ) -> tuple[IdArray, Array, Array]:
     """Copies of landmarks (N,) handed to `slam.interfaces.MapBackend`, checked; they may not be in the table yet.
 

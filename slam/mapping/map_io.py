@@ -132,8 +132,8 @@ class SavedMap:
         written_by: name and version of the program.
         seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
         source: where it was read from, for messages; not part of the map.
-        keyframes: with the poses that the back end estimated at the time.
-        keyframe_poses: poses in the map's world frame (K, 4, 4), corrected by loops; by default those of `keyframes`.
+        keyframes: with the poses of the rectified left camera that the back end estimated at the time.
+        keyframe_poses: those poses in the map's world frame (K, 4, 4), corrected by loops; by default uncorrected.
         loops: between keyframes.
 
     Raises:

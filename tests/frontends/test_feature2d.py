@@ -93,6 +93,7 @@ def test_setters_change_what_is_found():
     ("name", "value", "words"),
     [
         ("HessianThreshold", -1, "threshold: must be"),
+        ("HessianThreshold", "a", "threshold: must be"),
         ("NOctaves", 5, "octaves: must be 1 to 4"),
         ("NOctaveLayers", 4, "layers: must be 2 or 3"),
         ("Extended", True, "no descriptors of 128 numbers"),
@@ -103,3 +104,11 @@ def test_what_this_surf_does_not_have_is_refused(name, value, words):
     with pytest.raises(ConfigurationError, match=words):
         getattr(surf, f"set{name}")(value)
     assert getattr(surf, f"get{name}")() == getattr(frontends.surf.create(), f"get{name}")()
+
+
+def test_detect_and_compute_takes_opencv_s_arguments():
+    surf = Surf(100)
+    every, plain = surf.detectAndCompute(IMAGE, None, None, False), surf.detectAndCompute(IMAGE)
+    assert np.array_equal(every[1], plain[1])
+    with pytest.raises(ConfigurationError, match="use compute"):
+        surf.detectAndCompute(IMAGE, None, useProvidedKeypoints=True)
