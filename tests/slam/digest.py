@@ -16,7 +16,7 @@ from slam.config import SystemConfig
 from slam.system import StereoSlam
 
 WORLD = "synthetic:box?density=300&frames=90"
-FIRST = 58  # the box moves, and is found twenty frames later
+FIRST = 58  # the box moves, and is found some twenty-five frames later
 BACKENDS = ("ekf", "smoother")
 
 
@@ -54,7 +54,7 @@ def main() -> None:
 
     def work() -> None:
         for backend in BACKENDS:
-            found[backend] = run(backend, 26, 4, threads)
+            found[backend] = run(backend, 32, 4, threads)
 
     if elsewhere:
         thread = threading.Thread(target=work)
