@@ -100,7 +100,7 @@ def write_kitti(dataset: Path) -> Path:
 
 
 def write_raw(day: Path) -> Path:
-    """Six frames of a KITTI raw drive, with a GPS track; the calibration is in the day's folder."""
+    """Six frames of a KITTI raw drive; the calibration is in the day's folder."""
     drive = day / "2011_09_26_drive_0013_sync"
     for number in (0, 1):
         camera = drive / f"image_{number:02d}"
@@ -113,7 +113,6 @@ def write_raw(day: Path) -> Path:
         rows += [f"S_rect_{camera_name}: {WIDTH} {HEIGHT}", projection_row(f"P_rect_{camera_name}", offset)]
     rows += ["R_rect_00: 1 0 0 0 1 0 0 0 1"]
     (day / "calib_cam_to_cam.txt").write_text("\n".join(rows) + "\n")
-    (drive / "ego_gps_m.txt").write_text("# frame forward right third\n" + "".join(f"{i} {i} 0 0\n" for i in range(6)))
     return drive
 
 

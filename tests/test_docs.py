@@ -25,7 +25,7 @@ from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
-from slam.sequences.calibration_files import write_opencv
+from slam.sequences.rigs import write_opencv
 from slam.settings import require_settable
 from tests.scripts import load_script
 

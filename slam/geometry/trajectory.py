@@ -164,9 +164,10 @@ def tum_line(stamp: float, T: Array) -> str:
 
 def _rotations(path: str | Path, quaternions: Array) -> Array:
     """Rotations (N, 3, 3) of a file's quaternions (N, 4) as (x, y, z, w)."""
-    lengths = np.linalg.norm(quaternions, axis=1)
-    if (lengths < 1e-6).any():
-        raise TrajectoryError(f"{path}: the quaternion of row {int(np.argmax(lengths < 1e-6))} is zero")
+    largest = np.abs(quaternions).max(axis=1)
+    for wrong, what in ((largest < 1e-6, "zero"), (largest > 1e6, "none: its numbers are too large")):
+        if wrong.any():
+            raise TrajectoryError(f"{path}: the quaternion of row {int(np.argmax(wrong))} is {what}")
     return rotation_from_quaternion(quaternions)
 
 

@@ -24,7 +24,7 @@ from slam.outputs import Output, require_outputs
 from slam.runtime.blas import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live
-from slam.sequences.calibration_files import require_kalibr, write_kalibr, write_opencv
+from slam.sequences.rigs import require_kalibr, write_kalibr, write_opencv
 from slam.system import StereoSlam
 
 _BACKEND, _FRONTEND = "ekf", "surf"  # poses are a first guess alone

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -14,17 +13,13 @@ from urllib.parse import quote
 
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
 from slam.files import expanded, note_input, reason
-from slam.naming import suggestion, unknown
+from slam.naming import unknown
 from slam.sequences import hints
-from slam.sequences.base import RecordedSequence, Sequence, is_live
-from slam.sequences.door import read_masks
-from slam.sequences.faults import held_back
-from slam.sequences.given import KINDS, OPTIONS, Given, check_values, read_options
+from slam.sequences.base import RecordedSequence, Sequence, is_live, read_masks, turned
+from slam.sequences.faults import FaultLog
+from slam.sequences.given import OPTIONS, Given, check_options, read_options
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
-
-_SYNTHETIC = "synthetic:"
-_CAMERA = "camera:"
 
 #: Formats on disk, in the order in which they are tried: module, the end of its functions' names, and description.
 _FORMATS = {
@@ -38,7 +33,6 @@ _FORMATS = {
         "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
     ),
 }
-_CAMERA_OPTIONS = frozenset({"kind", "mask"})
 
 
 def formats() -> dict[str, str]:
@@ -66,13 +60,13 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
     text = str(path)
     if not text:
         raise SequenceError("no sequence is named: the path is empty")
-    for start, own, what in ((_SYNTHETIC, "synthetic", "synthetic world"), (_CAMERA, "camera", "camera")):
-        if text.startswith(start) and format not in (None, own):
-            raise ConfigurationError(f"{text}: format {format!r} does not go with a {what}")
-    if format == "synthetic" or text.startswith(_SYNTHETIC):
-        return _open_world(text)
-    if format == "camera" or text.startswith(_CAMERA):
-        return _open_camera(text.removeprefix(_CAMERA))
+    scheme = next((name for name in ("synthetic", "camera") if text.startswith(f"{name}:")), None)
+    if scheme is not None and format not in (None, scheme):
+        raise ConfigurationError(f"{text}: format {format!r} does not go with a {scheme}: path")
+    if "synthetic" in (scheme, format):
+        return _open_world(text.removeprefix("synthetic:"))
+    if "camera" in (scheme, format):
+        return _open_camera(text.removeprefix("camera:"))
     try:
         return _open_folder(text, format)
     except OSError as error:  # no permission, too long a name, a folder that is not what it seems (/proc)
@@ -92,27 +86,27 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
         raise UnknownNameError(unknown("format", name, formats()))
     module_name, end, _ = _FORMATS[name]
     module = import_module(module_name)
-    _check_options(name, options, OPTIONS | getattr(module, "OPTIONS", frozenset()))
-    check_values(options)
+    check_options(name, options, OPTIONS | getattr(module, "OPTIONS", frozenset()))
     note_input(folder)
-    given = Given(options)
-    with held_back():
-        opened: RecordedSequence = getattr(module, f"open_{end}")(folder, given)
-        masks = read_masks(given.get("mask"), folder if folder.is_dir() else folder.parent, opened.rig)
+    given, lines = Given(options), list[str]()
+    with FaultLog(lines, at_the_end=True) as faults:
+        found: RecordedSequence = getattr(module, f"open_{end}")(folder, given, faults)
+        masks = read_masks(given.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
         given.require_read(f"{folder} is read as {name}")
-    return replace(opened, masks=masks)
+    return replace(found, ground_truth=turned(found.ground_truth, found.rig), masks=masks, warnings=lines)
 
 
 def _open_world(text: str) -> Sequence:
-    """A synthetic world by its text, ``synthetic:`` in front."""
+    """A synthetic world by its text, ``synthetic:`` left out."""
     from slam.worlds import open_world
 
     name, mark, query = text.partition("?")
-    masks = [part for part in query.split("&") if part.startswith("mask=")]
-    opened = open_world(name + mark + "&".join(part for part in query.split("&") if part not in masks))
+    parts = query.split("&")
+    masks = [part for part in parts if part.startswith("mask=")]
+    opened = open_world(name + mark + "&".join(part for part in parts if part not in masks))
     if masks:
         opened.masks = read_masks(read_options(masks[-1])["mask"], Path.cwd(), opened.rig)
-        opened.name = text.removeprefix(_SYNTHETIC)
+        opened.name = text
     return opened
 
 
@@ -130,11 +124,10 @@ def _open_camera(text: str) -> Sequence:
     from slam.sequences import camera
 
     name, mark, query = text.rpartition("?")
-    known = camera.OPTIONS | _CAMERA_OPTIONS
     options = read_options(query) if mark else {}
-    if not mark or ("://" in name and not set(options) <= known):
+    if not mark or ("://" in name and not set(options) <= camera.OPTIONS):
         name, options = text, {}
-    _check_options("camera", options, known)
+    check_options("camera", options, camera.OPTIONS)
     return camera.open_camera(name, options)
 
 
@@ -161,9 +154,9 @@ def _require_recording(folder: Path, text: str) -> None:
 
 def _detect(folder: Path, options: dict[str, str]) -> str:
     """The first format that the folder looks like; told where left and right are, it needs not look."""
-    if _matches("ros", folder):
-        return "ros"
-    name = "folders" if options.keys() & {"left", "right", "layout"} else _format_of(folder)
+    if options.keys() & {"left", "right", "layout"} and not _matches("ros", folder):
+        return "folders"
+    name = _format_of(folder)
     if name is None:
         hint = hints.of_sequences_near(folder, _format_of)
         raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
@@ -171,21 +164,10 @@ def _detect(folder: Path, options: dict[str, str]) -> str:
 
 
 def _format_of(folder: Path) -> str | None:
-    """The first format that a folder or file looks like; None for no sequence."""
-    return next((name for name in _FORMATS if _matches(name, folder)), None)
+    """The first format that a folder or file looks like, a ROS recording before all; None for no sequence."""
+    return next((name for name in ("ros", *_FORMATS) if _matches(name, folder)), None)
 
 
 def _matches(name: str, folder: Path) -> bool:
-    """Whether a folder, or a file, looks like a format."""
     module, end, _ = _FORMATS[name]
     return bool(getattr(import_module(module), f"matches_{end}")(folder))
-
-
-def _check_options(name: str, options: dict[str, str], known: AbstractSet[str]) -> None:
-    """Refuse unknown options, and kinds of motion that do not exist."""
-    strange = sorted(set(options) - known)
-    if strange:
-        hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"
-        raise ConfigurationError(f"unknown option {strange[0]!r} of format {name}{hint}")
-    if options.get("kind", KINDS[0]) not in KINDS:
-        raise ConfigurationError(unknown("kind of motion", options["kind"], KINDS))

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from slam.data import StereoFrame
-from slam.errors import SequenceError
+from slam.errors import ConfigurationError, SequenceError
+from slam.files import expanded
 from slam.geometry.rig import StereoRig, quarter_turn
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.sequences.door import Masks, at_the_door
 from slam.sequences.faults import FaultLog
+from slam.sequences.images import read_image, recorded_size, size_text
 from slam.showing import sequence_line
 
 
@@ -85,6 +87,9 @@ Image = np.ndarray | SequenceError | None
 #: The left and the right image of each frame.
 Images = Generator[tuple[Image, Image], None, None]
 
+#: Of the left and the right camera (H, W) bool, False where the image is not to be used; None for all of it.
+Masks = tuple[np.ndarray | None, np.ndarray | None]
+
 
 class FrameSource(Protocol):
     """Where a recorded sequence's images come from."""
@@ -109,18 +114,9 @@ class RecordedSequence:
     rig: StereoRig
     source: FrameSource  # where the images come from
     ground_truth: Trajectory | None = None
-    # a positions-only track (N, 4) of rows ``stamp [s], forward, right, third [m]``, good in the plane only; None where
-    # there is none. It is no pose and in no camera's axes: compare positions after alignment
-    gps: Array | None = None
-    warnings: list[str] = field(default_factory=list)
     truth_noise: TruthNoise = field(default_factory=TruthNoise)  # how well the ground truth is known
-    masks: Masks = (None, None)  # of both cameras, where their images may be used; see `slam.sequences.door`
-
-    def __post_init__(self) -> None:
-        if self.ground_truth is not None and self.rig.turns:
-            truth, Q = self.ground_truth, np.eye(4)
-            Q[:3, :3] = quarter_turn(-self.rig.turns)
-            object.__setattr__(self, "ground_truth", Trajectory(truth.stamps, truth.poses @ Q))
+    warnings: list[str] = field(default_factory=list)
+    masks: Masks = (None, None)  # where the images of both cameras may be used
 
     @property
     def stamps(self) -> Array:
@@ -153,4 +149,50 @@ class RecordedSequence:
                     faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {left}")
                 elif left is not None:
                     right = right if isinstance(right, np.ndarray) else None
-                    yield at_the_door(StereoFrame(index, float(self.stamps[index]), left, right), self.rig, self.masks)
+                    yield as_used(StereoFrame(index, float(self.stamps[index]), left, right), self.rig, self.masks)
+
+
+def turned(truth: Trajectory | None, rig: StereoRig) -> Trajectory | None:
+    """The path of the left camera as recorded as that of the camera that is turned as the rig is."""
+    if truth is None or not rig.turns:
+        return truth
+    Q = np.eye(4)
+    Q[:3, :3] = quarter_turn(-rig.turns)
+    return Trajectory(truth.stamps, truth.poses @ Q)
+
+
+def as_used(frame: StereoFrame, rig: StereoRig, masks: Masks) -> StereoFrame:
+    """A frame as recorded, turned as the rig is, with the masks of both cameras."""
+    if rig.turns:
+        right = None if frame.right is None else np.ascontiguousarray(np.rot90(frame.right, rig.turns))
+        frame = replace(frame, left=np.ascontiguousarray(np.rot90(frame.left, rig.turns)), right=right)
+    none = masks[0] is None and masks[1] is None
+    return frame if none else replace(frame, left_mask=masks[0], right_mask=masks[1])
+
+
+def read_masks(text: str | None, folder: Path, rig: StereoRig) -> Masks:
+    """The masks by the option ``mask``: one image for both cameras, or two joined by a comma, one perhaps empty.
+
+    Masks are of the images as recorded, before they are turned; names are relative to `folder`. SequenceError where one
+    cannot be read, ConfigurationError where it is of another size than the images, or covers all of them.
+    """
+    if text is None:
+        return None, None
+    names = text.split(",")
+    if len(names) > 2 or not any(names):
+        raise ConfigurationError(f"mask must be one image, or two joined by a comma, got {text!r}")
+    masks = [_read_mask(folder / expanded(name), rig) if name else None for name in names]
+    return masks[0], masks[-1]
+
+
+def _read_mask(path: Path, rig: StereoRig) -> np.ndarray:
+    try:
+        mask = np.rot90(read_image(path) > 0, rig.turns)
+    except SequenceError as error:
+        raise SequenceError(f"mask: {error}") from error
+    if mask.shape != (rig.height, rig.width):
+        size = size_text(recorded_size(rig))
+        raise ConfigurationError(f"mask {path}: images are {size}, the mask is of another size")
+    if not mask.any():
+        raise ConfigurationError(f"mask {path}: it is black all over, so that nothing is left of the images")
+    return mask

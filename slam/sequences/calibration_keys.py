@@ -16,8 +16,7 @@ from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, pose, so3_exp
-from slam.sequences.calibration import array, projection_offset, rig_from_projections, rigid
-from slam.sequences.calibration_forms import read_form
+from slam.sequences.calibration import array, projection_offset, read_form, rig_from_projections, rigid
 from slam.sequences.images import Size
 
 #: Names of entries, in lower case, letters and digits only, without the side: K1, cameraMatrix1, camera_matrix_left,
@@ -49,57 +48,49 @@ _FROM_ZERO = ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx")  # one of th
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PLAIN = ("fx", "fy", "cx", "cy")
 
-#: Whose a form is, by entries that only it has, which options go with it, and what it calls the two cameras and how
-#: they stand to each other, if not K1, K2 and T.
-_FORMS = (
-    ("Kalibr's", ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel"), ()),
-    ("EuRoC's", ("lefttbs",), ()),
-    ("ROS's", ("leftcameramatrix",), ("rectified",)),
-    ("ORB-SLAM's", ("camerabf", "stereotc1c2", "stereob", "camera1fx"), ("rectified",)),
-    ("stella_vslam's", ("camerafocalxbaseline",), ("rectified",)),
-)
-_MISSING = {
-    "Kalibr's": ("cam0/intrinsics", "cam1/intrinsics", "cam1/T_cn_cnm1"),
-    "EuRoC's": ("intrinsics", "intrinsics of the right camera", "T_BS"),
+#: Whose a form is, by entries that only it has.
+_FORMS = {
+    "Kalibr's": ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel"),
+    "EuRoC's": ("lefttbs",),
+    "ROS's": ("leftcameramatrix",),
+    "ORB-SLAM's": ("camerabf", "stereotc1c2", "stereob", "camera1fx"),
+    "stella_vslam's": ("camerafocalxbaseline",),
 }
+
+Entry = tuple[str, Any]  # an entry's name as written, and its value
 
 
 class Entries:
     """The entries of calibration files by their names in lower case, letters and digits only.
 
     Args:
-        files: name to name as written, and value; of two files of one camera each the first is the left one's.
-        form: whose form it is, as ``"Kalibr's"``; empty where the entries themselves are to tell.
-
-    Attributes:
-        form: whose form it is; empty for OpenCV's, and for plain numbers.
-        options: that mean something for this form.
+        files: entries by such names; of two files of one camera each the first is the left one's.
+        form: whose form it is, as ``"Kalibr's"``; empty where the entries are to tell. OpenCV's, and five plain
+            numbers, stay without: of these alone the unit and the model of the lens may be another one.
     """
 
-    def __init__(self, files: Sequence[Mapping[str, tuple[str, Any]]], form: str = "") -> None:
-        self.form = form
-        self.options: tuple[str, ...] = () if form else ("unit", "rectified", "fisheye")
-        self._values: dict[str, tuple[str, Any]] = {}
+    def __init__(self, files: Sequence[Mapping[str, Entry]], form: str = "") -> None:
+        self._values: dict[str, Entry] = {}
         single = len(files) == 2 and any(all(n in f for f in files) for n in _OF_ONE)
         for side, file in zip(("left", "right"), files):
             self._values |= {(side + name if single else name): entry for name, entry in file.items()}
-        for known, names, options in _FORMS:
-            if not self.form and any(name in self._values for name in names):
-                self.form, self.options = known, options
+        found = (known for known, names in _FORMS.items() if any(name in self._values for name in names))
+        self.form = form or next(found, "")
         counts = ("0", "1") if any(name in self._values for name in _FROM_ZERO) else ("1", "2")
         self._sides = [
             (word, word[0], count, f"cam{side}", f"camera{count}", f"{word}camera")
             for side, (word, count) in enumerate(zip(("left", "right"), counts))
         ]
 
-    def find(self, role: str, side: int | None = None) -> tuple[str, Any] | None:
-        """Name as written, and value, of an entry; None where there is none."""
+    def find(self, role: str, side: int | None = None) -> Entry | None:
+        """An entry, of a camera (0 left, 1 right) or of the pair; None where there is none."""
         spellings = _SPELLINGS.get(role, (role,))
         if side is None:
             names = [*spellings, *(f"camera{s}" for s in spellings)]
         else:
             names = [name for s in spellings for token in self._sides[side] for name in (s + token, token + s)]
-        return next((self._values[n] for n in names if self._values.get(n, ("", None))[1] is not None), None)
+        there = (entry for n in names if (entry := self._values.get(n)) is not None)
+        return next((e for e in there if not (e[1] is None or (isinstance(e[1], str) and not e[1]))), None)
 
     def both(self, role: str) -> bool:
         """Whether both cameras have an entry."""
@@ -147,23 +138,18 @@ def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, 
         raise CalibrationError("names no image size: give size=(width, height)")
     P, K, scalars = ([entries.find(role, side) is not None for side in (0, 1)] for role in ("P", "K", "fx"))
     if rectified or (any(P) and not K[0] and not scalars[0]):
-        _require(entries, P, "P1", "P2")
+        _require(entries, {"P1": P[0], "P2": P[1]})
         return rig_from_projections(*_projections(entries, unit), size)
     T_right_left = _extrinsics(entries, unit)
-    if T_right_left is None and not any(K):
-        plain = _plain(entries, size, unit)
-        if plain is not None:
-            return plain
-    cameras_there = [k or s for k, s in zip(K, scalars)]
-    if entries.form or entries.find("R") is not None:
-        labels = _MISSING.get(entries.form, ("K1", "K2", "T"))
-        _require(entries, [*cameras_there, T_right_left is not None], *labels)
-    else:
-        _require(entries, [*cameras_there, False, entries.find("T") is not None], "K1", "K2", "R", "T")
+    if T_right_left is None and not any(K) and (plain := _plain(entries, size, unit)) is not None:
+        return plain
+    there = {"K1": K[0] or scalars[0], "K2": K[1] or scalars[1]}
+    there |= {role: T_right_left is not None or entries.find(role) is not None for role in ("R", "T")}
+    _require(entries, there)
     assert T_right_left is not None  # `_require` has seen it
-    left, right = (_camera(entries, side, sizes[side] or size, fisheye) for side in (0, 1))
+    cameras = [_camera(entries, side, sizes[side] or size, fisheye) for side in (0, 1)]
     R, t = T_right_left[:3, :3], T_right_left[:3, 3]
-    return StereoRig.side_by_side(left, right, R, R.T @ t)  # h_right = R (h_left + b), paper A, Eq. 6
+    return StereoRig.side_by_side(cameras[0], cameras[1], R, R.T @ t)  # h_right = R (h_left + b), paper A, Eq. 6
 
 
 def body_pose(entries: Entries, side: int) -> Array:
@@ -175,9 +161,9 @@ def body_pose(entries: Entries, side: int) -> Array:
     return np.eye(4) if found is None else inverse(rigid(found, "T_cam_imu"))
 
 
-def _require(entries: Entries, there: Sequence[bool], *names: str) -> None:
+def _require(entries: Entries, there: Mapping[str, bool]) -> None:
     """Raise CalibrationError with the names of all that is not there, and of the entries that are."""
-    missing = [name for name, found in zip(names, there) if not found]
+    missing = [name for name, found in there.items() if not found]
     if missing:
         verb = "is" if len(missing) == 1 else "are"
         whose = f" (it looks like {entries.form})" if entries.form else ""
@@ -222,8 +208,7 @@ def _projections(entries: Entries, unit: float) -> tuple[Array, Array]:
 
 def _baseline(entries: Entries, unit: float) -> float | None:
     """The baseline [m], perhaps by its product with the focal length; None where there is none."""
-    found = entries.find("baseline")
-    if found is not None:
+    if (found := entries.find("baseline")) is not None:
         return unit * _number(found)
     product, focal = entries.find("bf"), entries.find("fx")
     return None if product is None or focal is None else unit * _number(product) / _number(focal)
@@ -243,11 +228,9 @@ def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:
     values, wrong = {}, []
     for name, entry in found.items():
         try:
-            if entry is None:
-                raise CalibrationError(f"{name} is missing")
-            values[name] = _number(entry)
+            values[name] = _number(entry or (name, None))
             if values[name] <= 0 and name not in ("cx", "cy"):
-                raise CalibrationError(f"{name} is {values[name]:g}, which must be positive")
+                wrong.append(f"{name} is {values[name]:g}, which must be positive")
         except CalibrationError as error:
             wrong.append(str(error))
     if wrong:
@@ -270,12 +253,8 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
     found = entries.find("K", side)
     if found is None:
         values = [_number(entries.find(name, side) or (name, None)) for name in _PLAIN]
-    else:
-        values = array(found[1], found[0], None).tolist()
-        if len(values) != 4 and entries.form in _MISSING:
-            raise CalibrationError(f"{found[0]} has {len(values)} numbers, 4 expected")
-        if len(values) != 4:
-            values = array(found[1], found[0], (3, 3))[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    elif len(values := array(found[1], found[0], None).tolist()) != 4:
+        values = array(found[1], found[0], (3, 3))[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     D = entries.numbers("D", side, None)
     if D is None:
         names = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS
@@ -292,19 +271,19 @@ def _size(entries: Entries, side: int) -> Size | None:
     """Width and height of a camera's images, where the files name them."""
     for which in (side, None):
         both = entries.numbers("size", which, (2,))
-        if both is None:
-            parts = [entries.numbers(name, which, (1,)) for name in ("width", "height")]
-            both = None if parts[0] is None or parts[1] is None else np.concatenate([parts[0], parts[1]])
+        parts = [entries.numbers(name, which, (1,)) for name in ("width", "height")]
         if both is not None:
             return int(both[0]), int(both[1])
+        if parts[0] is not None and parts[1] is not None:
+            return int(parts[0][0]), int(parts[1][0])
     return None
 
 
-def _number(entry: tuple[str, Any]) -> float:
-    """One finite number."""
+def _number(entry: Entry) -> float:
+    """One finite number; CalibrationError where it is none, or is missing."""
     name, value = entry
-    if isinstance(value, bool) or value is None:
-        raise CalibrationError(f"{name} is no number")
+    if value is None:
+        raise CalibrationError(f"{name} is missing")
     return float(array(value, name, ())[()])
 
 
@@ -313,7 +292,7 @@ def _plain_name(name: Any) -> str:
     return "".join(filter(str.isalnum, str(name).lower()))
 
 
-def _flat(node: Mapping[str, Any], written: str, plain: str) -> Iterator[tuple[str, tuple[str, Any]]]:
+def _flat(node: Mapping[str, Any], written: str, plain: str) -> Iterator[tuple[str, Entry]]:
     """Entries of nested mappings, their names joined; matrices are values."""
     for key, value in node.items():
         name = _plain_name(key)

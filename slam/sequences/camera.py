@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,23 +13,21 @@ import numpy as np
 from slam.data import StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.files import expanded
-from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.sequences import devices, rigs
-from slam.sequences.door import at_the_door, read_masks
+from slam.sequences import captures as devices
+from slam.sequences.base import as_used, read_masks
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import flag, number
-from slam.sequences.images import Size, halves, recorded_size, require_same_size, size_text
+from slam.sequences.given import CALIBRATION_OPTIONS, flag, number
+from slam.sequences.images import halves, recorded_size, require_same_size, size_text
+from slam.sequences.rigs import calibration_files, read_rig
 
-#: Options besides ``kind`` and ``mask``.
-OPTIONS = frozenset({"left", "right", "swap", "width", "height", "fps", "wait"}) | rigs.OPTIONS
+OPTIONS = CALIBRATION_OPTIONS | {"left", "right", "swap", "width", "height", "fps", "wait"}
 
 #: How long frames are waited for where a camera gives none [s].
 WAIT = 10.0
 
-_AGAIN = 0.25  # [s] between two attempts to open a camera again
+_AGAIN = 0.25  # [s] between two attempts to get an image
 _LONGEST_WAIT = 86400.0
-_OLD = 1.0  # [s] after which a camera that nobody read is opened again: its images have waited in a queue
 _WIDEST = 100_000
 
 Pair = tuple[float, np.ndarray, np.ndarray]  # stamp [s], left and right image
@@ -41,10 +38,11 @@ class CameraSequence:
     """A camera as a sequence without an end. It keeps the `Sequence` protocol, but its length is not known.
 
     Stamps are this machine's time when the images were grabbed [s since 1970]. A camera that gives no frames is opened
-    again and again for a while; one that stays silent ends the sequence with an error.
+    again and again for a while; one that stays silent ends the sequence with an error. `frames` opens it anew: images
+    that waited in a queue until then are old.
 
     Args:
-        addresses: one device or two, see `slam.sequences.devices.open_device`.
+        addresses: one device or two, see `slam.sequences.captures.open_device`.
         options: those of `OPTIONS` that are given.
 
     Raises:
@@ -63,31 +61,24 @@ class CameraSequence:
         self.warnings: list[str] = []
         self._addresses, self._swap = addresses, flag(options, "swap")
         sides = [number(options, name, 1, _WIDEST) for name in ("width", "height")]
-        wanted = [None if side is None else int(side) for side in sides]
-        self._wanted = *wanted, number(options, "fps", 1e-3, 1e5)
+        self._wanted = *(None if side is None else int(side) for side in sides), number(options, "fps", 1e-3, 1e5)
         wait = number(options, "wait", 0.0, _LONGEST_WAIT)
         self._wait = WAIT if wait is None else wait
-        self._origin = time.time() - time.monotonic()
-        self._cameras: _Cameras | None
-        self._cameras = cameras = self._open()
+        self._origin = time.time() - time.monotonic()  # since 1970 when the monotonic clock was zero [s]
+        opened = self._open()
         try:
             missing = f"{self.name}: there is no calibration.yaml or the like in {Path.cwd()}"
             missing += f"; name the file: '{self.name}?calibration=FILE'"
-            paths = rigs.calibration_files(Path.cwd(), options, missing)
-            _, left, _ = self._waited(cameras.read, "it is open, but gives no images")  # some take a moment
-            self.rig = self._rig(paths, (left.shape[1], left.shape[0]), options)
+            paths = calibration_files(Path.cwd(), options, missing)
+            silent = "it is open, but gives no images"
+            _, left, _ = self._waited(lambda: self._read(opened), silent)  # some take a moment
+            self.rig = read_rig(paths, (left.shape[1], left.shape[0]), options)
             self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
-        except BaseException:
-            cameras.release()
-            raise
-
-    def _rig(self, paths: list[Path], size: Size, options: Mapping[str, str]) -> StereoRig:
-        """The rig of the calibration, which must be for images of this size."""
-        try:
-            return rigs.read_rig(paths, size, options)
         except SequenceError as error:
-            hint = "" if self._wanted[0] else "; ask the camera for another size with width=… and height=…"
-            raise SequenceError(f"{self.name}: {error}{hint}") from None
+            hint = "; ask the camera for another size with width=… and height=…" if "images are" in str(error) else ""
+            raise SequenceError(f"{self.name}: {str(error).removeprefix(f'{self.name}: ')}{hint}") from None
+        finally:
+            _release(opened)
 
     def __len__(self) -> int:
         raise TypeError(f"{self.name}: a camera has no number of frames")
@@ -102,30 +93,28 @@ class CameraSequence:
         return self._frames(start, stop)
 
     def _frames(self, start: int, stop: int | None) -> Iterator[StereoFrame]:
-        kept, self._cameras = self._cameras, None
-        if kept is not None and time.monotonic() - kept.last_read > _OLD:
-            kept.release()
-            kept = None
-        cameras = kept or self._open()
-        index, last, expected = 0, -math.inf, recorded_size(self.rig)
-        with ExitStack() as stack, FaultLog(self.warnings) as faults:
-            stack.callback(lambda: cameras.release())  # whichever they are in the end
-            while stop is None or index < stop:
-                pair = cameras.read()
-                if pair is None:
-                    cameras.release()
-                    began = time.monotonic()
-                    faults.report("silent", f"{self.name}: no more frames; they are waited for {self._wait:g} s")
-                    cameras, pair = self._waited(self._again, f"no frames for {self._wait:g} s (see wait=…)")
-                    faults.report("back", f"{self.name}: frames again after {time.monotonic() - began:.1f} s")
-                if pair[1].shape[::-1] != expected:  # as of one that was opened again
-                    now = f"images are {size_text(pair[1].shape[::-1])} now"
-                    raise SequenceError(f"{self.name}: {now}; they were {size_text(expected)}, as in the calibration")
-                if pair[0] > last:  # the clock of the machine may have been set back
-                    last = pair[0]
-                    if index >= start:
-                        yield at_the_door(StereoFrame(index, *pair), self.rig, self._masks)
-                    index += 1
+        opened, index, last, expected = self._open(), 0, -math.inf, recorded_size(self.rig)
+        try:
+            with FaultLog(self.warnings) as faults:
+                while stop is None or index < stop:
+                    pair = self._read(opened)
+                    if pair is None:
+                        _release(opened)
+                        began = time.monotonic()
+                        faults.report("silent", f"{self.name}: no more frames; they are waited for {self._wait:g} s")
+                        opened, pair = self._waited(self._again, f"no frames for {self._wait:g} s (see wait=…)")
+                        faults.report("back", f"{self.name}: frames again after {time.monotonic() - began:.1f} s")
+                    if pair[1].shape[::-1] != expected:  # as of one that was opened again
+                        now = f"images are {size_text(pair[1].shape[::-1])} now"
+                        was = f"they were {size_text(expected)}, as in the calibration"
+                        raise SequenceError(f"{self.name}: {now}; {was}")
+                    if pair[0] > last:  # the clock of the machine may have been set back
+                        last = pair[0]
+                        if index >= start:
+                            yield as_used(StereoFrame(index, *pair), self.rig, self._masks)
+                        index += 1
+        finally:
+            _release(opened)
 
     def _waited(self, attempt: Callable[[], T | None], silent: str) -> T:
         """What an attempt gives in the end; raises SequenceError where it gives nothing for so long."""
@@ -136,76 +125,54 @@ class CameraSequence:
             time.sleep(_AGAIN)
         return found
 
-    def _again(self) -> tuple[_Cameras, Pair] | None:
-        """The cameras, opened again, with their first images; None where they stay silent."""
+    def _again(self) -> tuple[list[Any], Pair] | None:
+        """The devices, opened again, with their first images; None where they stay silent."""
         try:
-            cameras = self._open()
-            pair = cameras.read()
+            opened = self._open()
         except SequenceError:
             return None
-        if pair is not None:
-            return cameras, pair
-        cameras.release()
-        return None
+        pair = self._read(opened)
+        if pair is None:
+            _release(opened)
+            return None
+        return opened, pair
 
-    def _open(self) -> _Cameras:
-        return _Cameras(self._addresses, self._swap, self._origin, self._wanted)
-
-
-class _Cameras:
-    """The open devices: two, or one with both images side by side.
-
-    Args:
-        addresses: of the devices.
-        swap: the right image comes first.
-        origin: time since 1970 when the monotonic clock was zero [s].
-        wanted: width, height and rate that are asked of a camera; None for its own choice.
-    """
-
-    def __init__(self, addresses: list[str], swap: bool, origin: float, wanted: tuple[Any, ...]) -> None:
-        self._swap, self._origin = swap, origin
-        self._name = "camera:" + ",".join(map(devices.without_password, addresses))
-        self.last_read = time.monotonic()
-        self._devices: list[Any] = []
+    def _open(self) -> list[Any]:
+        """The devices: two, or one with both images side by side."""
+        opened: list[Any] = []
         try:
-            for address in addresses:
-                self._devices.append(devices.open_device(address, *wanted))
+            for address in self._addresses:
+                opened.append(devices.open_device(address, *self._wanted))
         except BaseException:
-            self.release()
+            _release(opened)
             raise
+        return opened
 
-    def read(self) -> Pair | None:
+    def _read(self, opened: list[Any]) -> Pair | None:
         """The next pair; None where a camera gives none. SequenceError where the two differ in size.
 
         All are grabbed before any is decoded: so they lie as close together in time as they can.
         """
-        if not all([device.grab() for device in self._devices]):
+        if not all([device.grab() for device in opened]):
             return None
-        self.last_read = time.monotonic()
-        images = [image for device in self._devices if (image := devices.read_image(device)) is not None]
-        if len(images) < len(self._devices):
+        stamp = self._origin + time.monotonic()
+        images = [image for device in opened if (image := devices.read_image(device)) is not None]
+        if len(images) < len(opened):
             return None
-        left, right = halves(images[0], self._name) if len(images) == 1 else images
-        require_same_size(left.shape[::-1], right.shape[::-1], f"{self._name}, left", f"{self._name}, right")
-        left, right = (right, left) if self._swap else (left, right)
-        return self._origin + self.last_read, left, right
+        left, right = halves(images[0], self.name) if len(images) == 1 else images
+        require_same_size(left.shape[::-1], right.shape[::-1], f"{self.name}, left", f"{self.name}, right")
+        return (stamp, right, left) if self._swap else (stamp, left, right)
 
-    def release(self) -> None:
-        """Close them."""
-        for device in self._devices:
-            device.release()
+
+def _release(opened: list[Any]) -> None:
+    for device in opened:
+        device.release()
 
 
 def open_camera(text: str, options: Mapping[str, str]) -> CameraSequence:
-    """Open one camera or two.
+    """Open one camera or two: the address, or two joined by a comma; none where the options left and right name them.
 
-    Args:
-        text: the address, or two joined by a comma; empty where the options ``left`` and ``right`` name them.
-        options: those of `OPTIONS` that are given.
-
-    Raises:
-        SequenceError, CalibrationError: as `CameraSequence`.
-        ConfigurationError: an option has an impossible value; no camera is named, or more than two.
+    Raises as `CameraSequence`, and ConfigurationError where no camera is named, or more than two.
     """
     addresses = [text] if "!" in text else [part.strip() for part in text.split(",")]
     if "left" in options or "right" in options:

@@ -7,17 +7,25 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import CalibrationError, SequenceError, TrajectoryError
-from slam.geometry.se3 import Array, pose, rotation_from_quaternion
-from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import naming
 from slam.sequences.calibration_keys import body_pose, read_entries
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given
+from slam.sequences.pairs import (
+    Listing,
+    by_names,
+    image_names,
+    image_pairs,
+    in_order,
+    number_of,
+    present,
+    read_times,
+    timed,
+)  # fmt: skip
 from slam.sequences.rigs import calibration_files, read_rig
-from slam.sequences.source import Listing, by_names, image_names, in_order, number_of, pair_up, present, read_times
-from slam.sequences.tables import LARGEST, numbers, read_rows, require_truth, shorten, stamp_and_name
+from slam.sequences.tables import MOST_NANOSECONDS, read_rows, require_truth, shorten
 
 #: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
 #: half a metre apart, which makes 2 mrad. The camera's orientation in the vehicle is calibrated to half a degree or so,
@@ -34,26 +42,19 @@ def matches_folder(folder: Path) -> bool:
     return any((_root(folder) / cam / part).exists() for cam in _CAMERAS for part in ("data", "data.csv"))
 
 
-def open_folder(folder: Path, options: Given) -> RecordedSequence:
-    """Open a sequence in EuRoC's format; `folder` holds ``mav0`` or is it.
-
-    Raises:
-        SequenceError: a camera, its list or all its images are missing, or nothing can be paired.
-        CalibrationError: a calibration is missing, unreadable or impossible.
-    """
+def open_folder(folder: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+    """Open a sequence in EuRoC's format; `folder` holds ``mav0`` or is it."""
     root = _root(folder)
-    warnings: list[str] = []
-    with FaultLog(warnings) as faults:
-        left, right = _listings(root, faults)
-        _, source = pair_up(left, right, options, faults, read_times(folder, options, faults))
-        own, missing = _calibration(root), f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing"
-        missing += " (nor is there a Kalibr camchain.yaml): add calibration=FILE"
-        named = "calibration" in options or not own
-        rig = read_rig(calibration_files(folder, options, missing) if named else own, source.size, options)
-        truth = _ground_truth(root, own, faults)
+    left, right = _listings(root, faults)
+    source = image_pairs(timed(left, right, options, faults, read_times(folder, options, faults)), right.folder)
+    own = _calibration(root)
+    missing = f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing (nor is there a Kalibr camchain.yaml)"
+    named = "calibration" in options or not own
+    files = calibration_files(folder, options, f"{missing}: add calibration=FILE") if named else own
+    rig = read_rig(files, source.size, options)
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    kind = options.get("kind", "handheld")
-    return RecordedSequence(name, "euroc", kind, rig, source, truth, None, warnings, MOCAP_NOISE)
+    truth = _ground_truth(root, own, faults)
+    return RecordedSequence(name, "euroc", options.get("kind", "handheld"), rig, source, truth, MOCAP_NOISE)
 
 
 def _root(folder: Path) -> Path:
@@ -81,9 +82,21 @@ def _listings(root: Path, faults: FaultLog) -> list[Listing]:
 
 def _listed(table: Path, faults: FaultLog) -> Listing:
     """The images that a ``data.csv`` lists."""
-    rows = [row for row in read_rows(table, stamp_and_name, faults) if row is not None]
+    rows = [row for row in read_rows(table, _stamp_and_name, faults) if row is not None]
     listing = Listing(table.parent / "data", np.array([s for s, _ in rows], np.int64), [n for _, n in rows], True)
     return present(in_order(listing, str(table), faults), str(table), faults)
+
+
+def _stamp_and_name(text: str) -> tuple[int, str]:
+    """A row of ``data.csv``: nanoseconds and file name; the name defaults to the stamp."""
+    stamp, name = (cell.strip() for cell in f"{text},".split(",")[:2])
+    try:
+        value = int(stamp)
+    except ValueError:
+        raise ValueError(f"{shorten(stamp)} is not a time in whole nanoseconds") from None
+    if not 0 <= value <= MOST_NANOSECONDS:
+        raise ValueError(f"{shorten(stamp)} is no possible time in nanoseconds")
+    return value, name or f"{stamp}.png"
 
 
 def _calibration(root: Path) -> list[Path]:
@@ -103,25 +116,8 @@ def _ground_truth(root: Path, calibration: list[Path], faults: FaultLog) -> Traj
                     raise SequenceError(f"{path}: no sensor.yaml says where the camera is on the body")
                 with naming(calibration[0]):
                     T_body_camera = body_pose(read_entries(calibration, None), 0)
-                return _camera_path(path, T_body_camera, faults)
+                bodies = Trajectory.read_euroc(path)
+                return require_truth(Trajectory(bodies.stamps, bodies.poses @ T_body_camera), path)
             except (TrajectoryError, SequenceError, CalibrationError) as error:
                 faults.report("ground truth", f"{error}; there is no ground truth")
     return None
-
-
-def _camera_path(path: Path, T_body_camera: Array, faults: FaultLog) -> Trajectory:
-    """Read body poses, leave out rows that run backwards in time, and take them to the camera."""
-    rows = np.array([row for row in read_rows(path, _pose_row, faults) if row is not None])
-    rows = rows[increasing(rows[:, 0])]
-    bodies = pose(rotation_from_quaternion(rows[:, [5, 6, 7, 4]]), rows[:, 1:4])
-    return require_truth(Trajectory(rows[:, 0] * 1e-9, bodies @ T_body_camera), path)
-
-
-def _pose_row(text: str) -> list[float]:
-    """Stamp [ns], position [m] and quaternion (w, x, y, z) of a row; further columns do not count."""
-    what = "stamp, position and unit quaternion"
-    row = numbers(text, 8, what, ",")
-    far = max(map(abs, row[1:4])) > LARGEST or max(map(abs, row[4:])) > 2
-    if far or abs(np.linalg.norm(row[4:]) - 1) > 0.1 or not 0 <= row[0] < 2**63:
-        raise ValueError(f"{shorten(text)} is not {what}")
-    return row

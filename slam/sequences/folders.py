@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 from slam.errors import SequenceError
 from slam.files import expanded
-from slam.sequences.base import RecordedSequence
+from slam.sequences.base import FrameSource, RecordedSequence
+from slam.sequences.captures import VIDEO_SUFFIXES, open_videos
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given, layout_of
-from slam.sequences.images import IMAGE_SUFFIXES
+from slam.sequences.images import IMAGE_SUFFIXES, Size
 from slam.sequences.names import SIDES, of_sides
+from slam.sequences.pairs import by_names, image_names, image_pairs, read_times, timed
 from slam.sequences.rigs import calibration_files, read_rig
-from slam.sequences.source import ImagePairs, by_names, image_names, pair_up, read_times
-from slam.sequences.videos import VIDEO_SUFFIXES, VideoPairs, open_videos
 
 _NAMES = (*SIDES, ("image_left", "image_right"))
 _TIMES = ("times.txt", "timestamps.txt")
@@ -33,33 +33,30 @@ def matches_folder(folder: Path) -> bool:
     return any(_by_convention(folder, side) is not None for side in (0, 1))
 
 
-def open_folder(folder: Path, options: Given) -> RecordedSequence:
-    """Open two folders or two videos, or one of either that holds both cameras.
-
-    Raises:
-        SequenceError: a side is missing, empty or unreadable, or the two cannot be paired.
-        CalibrationError: the calibration is missing, unreadable or impossible.
-        ConfigurationError: an option has an impossible value.
-    """
-    warnings: list[str] = []
+def open_folder(folder: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+    """Open two folders or two videos, or one of either that holds both cameras."""
     home = folder.parent if folder.is_file() else folder
-    with FaultLog(warnings) as faults:
-        sides = _sides(folder, options)
-        paths, names = [side.path for side in sides], [side.names for side in sides]
-        source: ImagePairs | VideoPairs
-        if len({own is None for own in names}) > 1:
-            raise SequenceError(f"{paths[0]} and {paths[1]}: one is a video and the other is not")
-        if names[0] is None:
-            source = open_videos(paths[0], paths[1] if len(paths) > 1 else None, options.rate(), faults)
-        else:
-            left, *right = by_names(paths, [own or [] for own in names], faults)
-            times = read_times(home, options, faults, *(home / name for name in _TIMES))
-            _, source = pair_up(left, right[0] if right else None, options, faults, times)
-        files = calibration_files(home, options)
-        if files[0].suffix == ".txt" and "calibration" not in options:  # KITTI's, of four cameras
-            faults.assume(f"{files[0]}: the images are taken as its cameras' 0 and 1 (see calibration=…)")
-        rig = read_rig(files, source.size, options)
-    return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, source, warnings=warnings)
+    source, size = _source(_sides(folder, options), home, options, faults)
+    files = calibration_files(home, options)
+    if files[0].suffix == ".txt" and "calibration" not in options:  # KITTI's, of four cameras
+        faults.assume(f"{files[0]}: the images are taken as its cameras' 0 and 1 (see calibration=…)")
+    rig = read_rig(files, size, options)
+    return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, source)
+
+
+def _source(sides: list[_Side], home: Path, options: Given, faults: FaultLog) -> tuple[FrameSource, Size]:
+    """Where the images come from, and their size; `home` has the file of times."""
+    paths, names = [side.path for side in sides], [side.names for side in sides]
+    if len({own is None for own in names}) > 1:
+        raise SequenceError(f"{paths[0]} and {paths[1]}: one is a video and the other is not")
+    if names[0] is None:
+        videos = open_videos(paths, options.rate(), faults)
+        return videos, videos.size
+    left, *right = by_names(paths, [own or [] for own in names], faults)
+    times = read_times(home, options, faults, *(home / name for name in _TIMES))
+    pairs = timed(left, right[0] if right else None, options, faults, times)
+    images = image_pairs(pairs, right[0].folder if right else None)
+    return images, images.size
 
 
 def _sides(folder: Path, options: Given) -> list[_Side]:

@@ -8,15 +8,16 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from slam.errors import ConfigurationError
+from slam.naming import suggestion, unknown
 
 #: Kinds of motion.
 KINDS = ("driving", "handheld")
 
-#: Options of the formats whose calibration is in a file that can be named.
-CALIBRATION_OPTIONS = frozenset({"calibration", "unit", "rectified", "fisheye"})
+#: Options of every format whose calibration is in a file that can be named.
+CALIBRATION_OPTIONS = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask"})
 
 #: Options that every recorded format knows; which of them mean something depends on what is found in the folder.
-OPTIONS = CALIBRATION_OPTIONS | {"kind", "tolerance", "times", "fps", "left", "right", "layout", "mask"}
+OPTIONS = CALIBRATION_OPTIONS | {"tolerance", "times", "fps", "left", "right", "layout"}
 
 #: Frame rates that are believed [1/s].
 SLOWEST, FASTEST = 1e-3, 1e5
@@ -27,18 +28,6 @@ WIDEST_TOLERANCE = 10.0
 _MOST_OPTIONS = 100
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _YES = {"1": True, "yes": True, "true": True, "0": False, "no": False, "false": False}
-
-
-def read_options(query: str) -> dict[str, str]:
-    """The options ``key=value&key=value`` behind a question mark."""
-    try:
-        options = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=_MOST_OPTIONS))
-    except ValueError:
-        raise ConfigurationError(f"more than {_MOST_OPTIONS} options") from None
-    for key, value in options.items():
-        if "\0" in value:
-            raise ConfigurationError(f"option {key!r} holds a NUL")
-    return options
 
 
 class Given(dict[str, str]):
@@ -73,8 +62,26 @@ class Given(dict[str, str]):
         return None if seconds is None else round(1e9 * seconds)
 
 
-def check_values(options: Mapping[str, str]) -> None:
-    """Raise ConfigurationError where an option that is a number, a word, yes or no is none."""
+def read_options(query: str) -> dict[str, str]:
+    """The options ``key=value&key=value`` behind a question mark."""
+    try:
+        options = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=_MOST_OPTIONS))
+    except ValueError:
+        raise ConfigurationError(f"more than {_MOST_OPTIONS} options") from None
+    for key, value in options.items():
+        if "\0" in value:
+            raise ConfigurationError(f"option {key!r} holds a NUL")
+    return options
+
+
+def check_options(format: str, options: Mapping[str, str], known: frozenset[str]) -> None:
+    """Raise ConfigurationError where an option is not known, or where a number, a word, yes or no is none."""
+    strange = sorted(set(options) - known)
+    if strange:
+        hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"
+        raise ConfigurationError(f"unknown option {strange[0]!r} of format {format}{hint}")
+    if options.get("kind", KINDS[0]) not in KINDS:
+        raise ConfigurationError(unknown("kind of motion", options["kind"], KINDS))
     given = Given(options)
     given.rate(), given.tolerance(), metres_per_unit(given), layout_of(given)
     for name in ("rectified", "fisheye"):

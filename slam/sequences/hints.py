@@ -8,8 +8,8 @@ from itertools import chain, islice
 from pathlib import Path
 
 from slam.naming import nearest
+from slam.sequences.captures import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
-from slam.sequences.videos import VIDEO_SUFFIXES
 
 _LOOKED_AT = 1000  # files and folders below one that is no sequence
 _LEVELS_ABOVE = 3  # folders above one that is no sequence: mav0/cam0/data

@@ -1,4 +1,4 @@
-"""Reading single images: grey, as stored, whole or not at all."""
+"""Reading single images: grey, as stored, whole or not at all; and their sizes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from slam.errors import SequenceError, one_line
 from slam.files import read_bytes
 from slam.geometry.rig import StereoRig
 
-Size = tuple[int, int]
+Size = tuple[int, int]  #: width, height
 
 #: Endings of image files, in lower case.
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp"})
@@ -34,11 +34,7 @@ def read_image(path: Path, size: Size | None = None) -> np.ndarray:
     """The image (H, W) in grey, uint8 or uint16 as stored; colour is converted, EXIF rotation ignored.
 
     The size is taken from the header before anything is decoded. A file that is cut off, or a PNG with a wrong
-    checksum, is never taken for a partly grey image.
-
-    Args:
-        path: the file.
-        size: width and height that the image must have; None for any up to `MOST_PIXELS`.
+    checksum, is never taken for a partly grey image. With `size` it must have this width and height.
 
     Raises:
         SequenceError: the file is missing, cut off, damaged, or no image, or of another size; the message names it.
@@ -47,11 +43,7 @@ def read_image(path: Path, size: Size | None = None) -> np.ndarray:
 
 
 def decode_image(data: bytes, what: str, size: Size | None = None) -> np.ndarray:
-    """The image of the bytes of an image file, as `read_image`; `what` is named in errors.
-
-    Raises:
-        SequenceError: they are cut off, damaged, or no image, or of another size.
-    """
+    """The image of the bytes of an image file, as `read_image`; `what` is named in errors."""
     from PIL import Image
 
     if not data:
@@ -120,16 +112,11 @@ def require_same_size(left: tuple[int, ...], right: tuple[int, ...], *names: obj
         raise SequenceError(f"left and right images differ in size: {sizes}")
 
 
-def halved(size: Size, what: str) -> Size:
-    """Width and height of each of two images that are side by side in one; SequenceError where its width is odd."""
-    if size[0] % 2 or size[0] < 2:
-        raise SequenceError(f"{what}: an image of {size_text(size)} cannot hold two side by side")
-    return size[0] // 2, size[1]
-
-
-def halves(image: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """The left and the right half of an image that holds two side by side; raises as `halved`."""
-    width, _ = halved((image.shape[1], image.shape[0]), what)
+def halves(image: np.ndarray, what: object) -> tuple[np.ndarray, np.ndarray]:
+    """The left and the right half of an image that holds two side by side; SequenceError where its width is odd."""
+    width = image.shape[1] // 2
+    if image.shape[1] % 2 or not width:
+        raise SequenceError(f"{what}: an image of {size_text(image.shape[1::-1])} cannot hold two side by side")
     return image[:, :width], image[:, width:]
 
 

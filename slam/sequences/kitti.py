@@ -9,19 +9,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.errors import CalibrationError, SequenceError
+from slam.errors import CalibrationError, SequenceError, TrajectoryError
+from slam.geometry.euler import about
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, pose
-from slam.geometry.trajectory import TruthNoise
+from slam.geometry.se3 import Array, inverse, pose
+from slam.geometry.stamps import increasing
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import kitti_matrix, naming, projection_offset, read_kitti, rig_from_projections, rigid
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given
 from slam.sequences.images import Size, size_text
-from slam.sequences.kitti_truth import Frames, drive_truth, read_gps, read_poses
+from slam.sequences.pairs import Pairs, image_pairs, number_of, numbered, read_times, timed
 from slam.sequences.rigs import calibration_files, read_rig
-from slam.sequences.source import numbered, pair_up, read_times
-from slam.sequences.tables import date_time, read_rows
+from slam.sequences.tables import date_time, numbers, read_rows, require_truth, shorten
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 2 cm, 0.03° in roll and pitch, and 0.1°
 #: in heading, which changes slowly. That, and how the camera stands to the unit, is left to be found.
@@ -58,44 +59,37 @@ def matches_drive(folder: Path) -> bool:
     return bool(cameras) and not any(path.name.isdecimal() and path.is_dir() for path in inside)
 
 
-def open_folder(folder: Path, options: Given) -> RecordedSequence:
-    """Open one sequence of KITTI odometry, or of KITTI tracking.
-
-    Raises:
-        SequenceError: a camera or all its images are missing, or nothing can be paired.
-        CalibrationError: the calibration is missing, unreadable or impossible.
-    """
-    return _open(folder, _tracking(folder) if _is_tracking(folder) else _odometry(folder), options)
+def open_folder(folder: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+    """Open one sequence of KITTI odometry, or of KITTI tracking."""
+    return _open(folder, _tracking(folder) if _is_tracking(folder) else _odometry(folder), options, faults)
 
 
-def open_drive(folder: Path, options: Given) -> RecordedSequence:
+def open_drive(folder: Path, options: Given, faults: FaultLog) -> RecordedSequence:
     """Open one drive of KITTI raw or KITTI-360; stamps count from its first row of times. Raises as `open_folder`."""
-    return _open(folder, _drive(folder), options)
+    return _open(folder, _drive(folder), options, faults)
 
 
-def _open(folder: Path, where: Layout, options: Given) -> RecordedSequence:
-    warnings: list[str] = []
-    with FaultLog(warnings) as faults:
-        listings = [numbered(side, faults) for side in (where.left, where.right)]
-        dated = where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options)
-        origin, times = (
-            _dates(where.times, faults) if dated else (None, read_times(folder, options, faults, where.times))
-        )
-        left, source = pair_up(listings[0], listings[1], options, faults, times, by_number=True)
-        assert source.size is not None
-        rig, T_left_reference = _rig(folder, where, source.size, options)
-        frames, gps = Frames(left.keys, source.stamps, left.folder.parent.name == "image_00"), None
-        if where.drive is None:
-            poses = next((path for path in where.poses if path.is_file()), None)
-            truth = None if poses is None else read_poses(poses, frames, T_left_reference, faults)
-        else:
-            gps = read_gps(where.drive / "ego_gps_m.txt", None if times is None else times[1], faults)
-            truth = drive_truth(where.drive, where.calibration.parent, origin, T_left_reference, frames, faults)
+def _open(folder: Path, where: Layout, options: Given, faults: FaultLog) -> RecordedSequence:
+    left, right = (numbered(side, faults) for side in (where.left, where.right))
+    origin, times = None, None
+    if where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options):
+        dates = read_rows(where.times, date_time, faults)
+        origin = next(date for date in dates if date is not None)
+        times = where.times, np.array([np.nan if date is None else (date - origin) * 1e-9 for date in dates])
+    else:
+        times = read_times(folder, options, faults, where.times)
+    pairs = timed(left, right, options, faults, times, by_number=True)
+    source = image_pairs(pairs, right.folder)
+    rig, T_left_reference = _rig(folder, where, source.size, options)
+    try:
+        truth = _truth(where, origin, T_left_reference, pairs, faults)
+    except (SequenceError, CalibrationError, TrajectoryError) as error:
+        faults.report("ground truth", f"{error}; there is no ground truth")
+        truth = None
     kind = options.get("kind", "driving")
     time = 0.0 if where.drive is None or (where.drive / "oxts").is_dir() else _OXTS_TIME
     noise = replace(OXTS_NOISE, time=time, wheels=kind == "driving")
-    name = "kitti" if where.drive is None else "kitti-raw"
-    return RecordedSequence(where.name, name, kind, rig, source, truth, gps, warnings, noise)
+    return RecordedSequence(where.name, "kitti-raw" if where.drive else "kitti", kind, rig, source, truth, noise)
 
 
 def _is_tracking(folder: Path) -> bool:
@@ -128,33 +122,21 @@ def _drive(folder: Path) -> Layout:
     usual = [where / "calibration" / "perspective.txt" for where in (folder.parent.parent, folder.parent)]
     usual = [*usual, *raw] if is_360 else [*raw, *usual]
     calibration = next((path for path in usual if path.exists()), usual[0])
-    return Layout(folder.name, left, right, cameras, calibration, left.parent / "timestamps.txt", drive=folder)
+    poses, times = folder / "poses_cam0_oxts.txt", left.parent / "timestamps.txt"
+    return Layout(folder.name, left, right, cameras, calibration, times, (poses,), folder)
 
 
 def _choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
-    """The first pair of cameras of which both folders are there.
-
-    Raises:
-        SequenceError: no pair is complete.
-    """
+    """The first pair of cameras of which both folders are there; SequenceError where no pair is complete."""
     for left, right in pairs:
         if all((folder / f"image_{c}").is_dir() for c in (left, right)):
             return left, right
-    names = [f"image_{c}" for p in pairs for c in p]
-    there = [n for n in names if (folder / n).is_dir()]
-    files = [n for n in names if (folder / n).is_file()]
-    if files:
-        raise SequenceError(f"{folder / files[0]}: a file where a folder of images should be")
-    found = f"only {', '.join(there)} is there" if there else "no folder of images is there"
+    there = [path for pair in pairs for camera in pair if (path := folder / f"image_{camera}").exists()]
+    if files := [path for path in there if not path.is_dir()]:
+        raise SequenceError(f"{files[0]}: a file where a folder of images should be")
+    found = f"only {', '.join(path.name for path in there)} is there" if there else "no folder of images is there"
     wanted = " or ".join(f"image_{a} and image_{c}" for a, c in pairs)
     raise SequenceError(f"{folder}: two cameras are needed ({wanted}), {found}")
-
-
-def _dates(path: Path, faults: FaultLog) -> tuple[int, tuple[Path, Array]]:
-    """The first row's time [ns since 1970] and the times by frame number (T,) [s] from there on."""
-    rows = read_rows(path, date_time, faults)
-    origin = next(row for row in rows if row is not None)
-    return origin, (path, np.array([np.nan if row is None else (row - origin) * 1e-9 for row in rows]))
 
 
 def _rig(folder: Path, where: Layout, size: Size, options: Given) -> tuple[StereoRig, Array]:
@@ -184,3 +166,109 @@ def _require_rectified(rows: dict[str, Array], size: Size, camera: str) -> None:
         if tuple(rows.get(f"S_{camera}", ())) == size:
             text += ": this is an unrectified (extract) drive, take the rectified (sync) one"
         raise CalibrationError(text)
+
+
+_EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
+_OXTS = "latitude, longitude, altitude, roll, pitch, yaw"
+
+
+def _truth(
+    where: Layout, origin: int | None, T_left_reference: Array, pairs: Pairs, faults: FaultLog
+) -> Trajectory | None:
+    """The left camera's path.
+
+    Of drives by the OXTS records, where the world is the left camera's first frame; KITTI-360 has poses of the
+    rectified left camera. Else by rows of 12, one for each frame number, of the reference camera: of a drive camera 0
+    before rectification. `origin` is the time of stamp zero [ns since 1970], None where it is not known.
+    """
+    keys, stamps, drive = pairs.left.keys, pairs.stamps, where.drive
+    by_number = dict(zip(keys.tolist(), stamps.tolist()))
+    if drive is not None:
+        world = drive.parent.parent / "data_poses" / drive.name / "cam0_to_world.txt"
+        grey = where.cameras[0] == "00"
+        if world.is_file() and grey:
+            rows = [row for row in read_rows(world, _pose_row, faults) if row and row[0] in by_number]
+            table = np.array(sorted(rows)).reshape(-1, 17)
+            times = np.array([by_number[int(number)] for number in table[:, 0]])
+            return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), world)
+        if (drive / "oxts").is_dir():
+            day = where.calibration.parent
+            T_camera0_velo, T_velo_imu = (_extrinsics(day / f"calib_{n}.txt") for n in ("velo_to_cam", "imu_to_velo"))
+            body = require_truth(read_oxts(drive / "oxts", origin, by_number, faults), drive / "oxts")
+            poses = body.poses @ inverse(T_left_reference @ T_camera0_velo @ T_velo_imu)
+            return Trajectory(body.stamps, inverse(poses[0]) @ poses)
+        T_left_reference = np.eye(4)  # `poses_cam0_oxts.txt` is of the rectified camera
+        if not grey:
+            return None
+    path = next((path for path in where.poses if path.is_file()), None)
+    if path is None:
+        return None
+    given = Trajectory.read_kitti(path)
+    inside = keys < len(given)
+    if not inside.all():
+        faults.report("ground truth", f"{path}: {len(given)} poses, {int((~inside).sum())} frames are beyond them")
+    truth = require_truth(Trajectory(stamps[inside], given.poses[keys[inside]]), path)
+    return Trajectory(truth.stamps, truth.poses @ inverse(T_left_reference))
+
+
+def read_oxts(folder: Path, origin: int | None, frame_stamps: dict[int, float], faults: FaultLog) -> Trajectory:
+    """Poses ``T_world_imu`` of the records ``data/NUMBER.txt``; the world's origin is the first record's position.
+
+    Stamps come from ``timestamps.txt`` [s since `origin`, ns since 1970]; where it or `origin` is missing, a record
+    has the stamp of the frame of its number. SequenceError where no record is readable and has a stamp.
+    """
+    numbered = [(number_of(file.name), file) for file in sorted((folder / "data").glob("*.txt"))]
+    if all(number is None for number, _ in numbered):
+        raise SequenceError(f"{folder / 'data'}: no OXTS records")
+    stamps, rows = frame_stamps, []
+    if origin is not None and (folder / "timestamps.txt").exists():
+        dates = read_rows(folder / "timestamps.txt", date_time, faults)
+        stamps = {number: (row - origin) * 1e-9 for number, row in enumerate(dates) if row is not None}
+    for number, file in numbered:
+        if number is not None:
+            try:
+                record = read_rows(file, _record, faults)[0]
+            except SequenceError as error:
+                faults.report("OXTS records left out", f"{error}; record left out")
+                continue
+            if record is not None and number in stamps:
+                rows.append([stamps[number], *record])
+    if not rows:
+        raise SequenceError(f"{folder}: no OXTS record is readable and has a stamp")
+    table = np.array(rows)
+    table = table[increasing(table[:, 0])]
+    return Trajectory(table[:, 0], imu_poses(table[:, 1:7]))
+
+
+def imu_poses(records: Array) -> Array:
+    """Poses (N, 4, 4) of records (N, 6): latitude, longitude [deg], altitude [m], roll, pitch, yaw [rad].
+
+    World axes are east, north, up, its origin the first position. The Mercator projection is scaled by the cosine of
+    the first latitude, so that lengths near it are metres; ``R = Rz(yaw) Ry(pitch) Rx(roll)``.
+    """
+    latitude, longitude, altitude, roll, pitch, yaw = records.T
+    scale = _EARTH_RADIUS * np.cos(np.radians(latitude[0]))
+    east = scale * np.radians(longitude)
+    north = scale * np.log(np.tan(np.radians(90 + latitude) / 2))
+    position = np.stack([east, north, altitude], axis=1)
+    return pose(about(yaw, 2) @ about(pitch, 1) @ about(roll, 0), position - position[0])
+
+
+def _pose_row(text: str) -> list[float]:
+    """Frame number, and the 16 numbers of a pose."""
+    return numbers(text, 17, "a frame and its pose", exactly=True)
+
+
+def _record(text: str) -> list[float]:
+    """The first six numbers of an OXTS record."""
+    row = numbers(text, 6, _OXTS)
+    if abs(row[0]) >= 90 or max(map(abs, (row[1], *row[3:]))) > 360:
+        raise ValueError(f"{shorten(text)} is not {_OXTS}")
+    return row
+
+
+def _extrinsics(path: Path) -> Array:
+    """The rigid motion (4, 4) of a file with rows R and T."""
+    rows = read_kitti(path)
+    with naming(path):
+        return rigid(pose(kitti_matrix(rows, "R", (3, 3)), kitti_matrix(rows, "T", (3,))), "R")

@@ -30,6 +30,7 @@ class LiveFrames:
     Attributes:
         dropped: number of frames that were replaced by a newer one before they were taken.
         clock_waited: how long the clock has waited for reading, in total [s].
+        ended_early: whether it was ended by `until` before the last frame.
 
     Examples:
         >>> import slam
@@ -48,15 +49,15 @@ class LiveFrames:
     ) -> None:
         self.dropped = 0
         self.clock_waited = 0.0
+        self.ended_early = False
         self._frames = frames
         self._paced = not is_live(frames) if paced is None else paced
         self._until = until or threading.Event()  # only read: it is the caller's
         self._closed = False
         self._changed = threading.Condition()
-        self._newest: StereoFrame | None = None
-        self._since = 0.0  # when the newest came, by the clock of `time.monotonic`
+        self._newest: tuple[StereoFrame, float] | None = None  # and when it came, by the clock of `time.monotonic`
         self._arrivals: deque[tuple[int, float]] = deque(maxlen=_REMEMBERED)
-        self._over = self._ended_early = False
+        self._over = False
         self._error: BaseException | None = None
 
     def __iter__(self) -> Iterator[StereoFrame]:
@@ -77,11 +78,6 @@ class LiveFrames:
             atexit.unregister(end)
             end()
 
-    @property
-    def ended_early(self) -> bool:
-        """Whether it was ended by `until` before the last frame."""
-        return self._ended_early
-
     def age(self, frame: StereoFrame) -> float:
         """How long ago a frame came [s], for the frames taken last; NaN for others."""
         now = time.monotonic()
@@ -92,28 +88,18 @@ class LiveFrames:
         with self._changed:
             while self._newest is None and not self._over and not self._until.is_set():
                 self._changed.wait(_LOOK)
-            frame, self._newest = self._newest, None
-            if frame is None or self._until.is_set():
-                self._ended_early = self._until.is_set()
+            newest, self._newest = self._newest, None
+            self.ended_early = self._until.is_set()
+            if newest is None or self.ended_early:
                 return None
-            self._arrivals.append((frame.index, self._since))
-            return frame
+            self._arrivals.append((newest[0].index, newest[1]))
+            return newest[0]
 
     def _read(self) -> None:
-        """Put every frame where it is taken from; in a thread of its own."""
+        """Put every frame where it is taken from when it is due, until the last one or the end; in a thread."""
+        frames, origin = None, None
         try:
-            self._give(iter(self._frames))
-        except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
-            self._error = error
-        finally:
-            with self._changed:
-                self._over = True
-                self._changed.notify_all()
-
-    def _give(self, frames: Iterator[StereoFrame]) -> None:
-        """Put every frame where it is taken from when it is due, until the last one or the end."""
-        origin = None
-        try:
+            frames = iter(self._frames)
             for frame in frames:
                 if self._paced:
                     now = time.monotonic()
@@ -126,12 +112,16 @@ class LiveFrames:
                     break
                 with self._changed:
                     self.dropped += self._newest is not None
-                    self._newest, self._since = frame, time.monotonic()
+                    self._newest = frame, time.monotonic()
                     self._changed.notify_all()
+        except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
+            self._error = error
         finally:
-            close = getattr(frames, "close", None)
-            if close is not None:
+            if (close := getattr(frames, "close", None)) is not None:
                 close()  # a camera is released in the thread that reads it
+            with self._changed:
+                self._over = True
+                self._changed.notify_all()
 
     def _ending(self) -> bool:
         """Whether nobody takes frames any more."""

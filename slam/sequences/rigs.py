@@ -1,32 +1,34 @@
-"""Rigs by calibration files of any form that a reader of sequences knows: `slam.load_rig`."""
+"""Rigs by calibration files of any form: read as `slam.load_rig`, found in folders, and written."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
-from slam.errors import CalibrationError, ConfigurationError
-from slam.files import expanded
+import numpy as np
+
+from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.files import expanded, write_text
+from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from slam.sequences.calibration import naming
-from slam.sequences.calibration_forms import is_kitti
+from slam.geometry.se3 import pose
+from slam.sequences.calibration import is_kitti, naming
 from slam.sequences.calibration_keys import read_entries, rig_of
-from slam.sequences.given import CALIBRATION_OPTIONS, flag, metres_per_unit
-from slam.sequences.images import Size
-from slam.sequences.source import require_size
+from slam.sequences.given import flag, metres_per_unit
+from slam.sequences.images import Size, recorded_size, size_text
 
-OPTIONS = CALIBRATION_OPTIONS
-
-_SUFFIXES = (".yaml", ".yml", ".xml", ".json", ".conf")
-_STEMS = ("calibration", "calib", "stereo", "camchain")
-_PAIRS = (("intrinsics", "extrinsics"), ("left", "right"))
 _USUAL = (
-    *((stem + s,) for stem in _STEMS for s in _SUFFIXES),
-    *((a + s, b + s) for a, b in _PAIRS for s in _SUFFIXES[:2]),
-)
+    *((stem + end,) for stem, end in product(
+        ("calibration", "calib", "stereo", "camchain"), (".yaml", ".yml", ".xml", ".json", ".conf"))),
+    *((a + end, b + end) for (a, b), end in product(
+        (("intrinsics", "extrinsics"), ("left", "right")), (".yaml", ".yml"))),
+)  # fmt: skip
 _KITTI = ("calib.txt", "calib_cam_to_cam.txt")
-_SENSORS = tuple((f"{root}cam0/sensor.yaml", f"{root}cam1/sensor.yaml") for root in ("", "mav0/"))
+_OF_FORMATS = (*((name,) for name in _KITTI), ("dso/camchain.yaml",), ("cam0/sensor.yaml", "cam1/sensor.yaml"),
+               ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"))  # fmt: skip
+_FISHEYE = "equidistant"
 
 
 def load_rig(
@@ -45,7 +47,7 @@ def load_rig(
             right camera. Or the folder where they are under their usual names.
         size: width and height of the images [px], where the file names none.
         unit: of length in an OpenCV file: ``"m"``, ``"cm"`` or ``"mm"``.
-        rectified: of an OpenCV file take the rectified cameras (``P1``, ``P2``).
+        rectified: take the rectified cameras (``P1``, ``P2``).
         fisheye: the distortion in an OpenCV file is ``cv2.fisheye``'s.
 
     Raises:
@@ -61,8 +63,8 @@ def load_rig(
     if not files:
         raise CalibrationError("no calibration is named")
     if len(files) == 1 and files[0].is_dir():
-        folder, kitti = files[0], [(name,) for name in _KITTI]
-        files = _first(folder, [*_USUAL, *kitti, ("dso/camchain.yaml",), *_SENSORS])
+        folder = files[0]
+        files = _first(folder, [*_USUAL, *_OF_FORMATS])
         if not files:
             raise CalibrationError(f"{folder}: no calibration under one of the usual names: name the file")
     rig = read_rig(files, size, options)
@@ -72,22 +74,14 @@ def load_rig(
 def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, str]) -> StereoRig:
     """The rig of one or two files, see `load_rig`; of cameras above each other, that of turned images.
 
-    Args:
-        paths: the files.
-        size: of the images; None where it is not known.
-        options: those of `OPTIONS` that are given.
-
-    Raises:
-        CalibrationError, ConfigurationError: see `load_rig`.
-        SequenceError: the images are of another size than the calibration is for.
+    Of the `options` ``unit``, ``rectified`` and ``fisheye`` count. SequenceError where the images, of this size if it
+    is known, are of another one than the calibration is for.
     """
-    unit = metres_per_unit(options)
+    unit, rectified, fisheye = metres_per_unit(options), flag(options, "rectified"), flag(options, "fisheye")
     entries = read_entries(paths, size)
-    rectified, fisheye = flag(options, "rectified"), flag(options, "fisheye")
-    given = {"rectified", "fisheye"} | ({"unit"} if unit != 1 else set())
-    foreign = sorted((given & set(options)) - set(entries.options))
-    if foreign:
-        raise ConfigurationError(f"option {foreign[0]!r} does nothing with {paths[0]}, which is {entries.form}")
+    for name, given in (("unit", unit != 1), ("fisheye", fisheye)):
+        if given and entries.form:
+            raise ConfigurationError(f"option {name!r} does nothing with {paths[0]}, which is {entries.form}")
     with naming(paths[-1]):
         rig = rig_of(entries, size, unit, rectified, fisheye)
     if size is not None:
@@ -95,16 +89,18 @@ def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, str
     return rig
 
 
+def require_size(size: Size, rig: StereoRig, calibration: Path) -> None:
+    """Raise SequenceError where images, as recorded, are not of the calibration's size."""
+    expected = recorded_size(rig)
+    if size != expected:
+        raise SequenceError(f"images are {size_text(size)}, but {calibration} is for {size_text(expected)}")
+
+
 def calibration_files(folder: Path, options: Mapping[str, str], missing: str = "") -> list[Path]:
     """The file, or the two files, by the option ``calibration`` (names joined by a comma) or under usual names.
 
-    Args:
-        folder: of the sequence, or of the file that it is; of a camera the working folder. Names are relative to it.
-        options: those that are given.
-        missing: what is said where there is none.
-
-    Raises:
-        CalibrationError: there is none.
+    Names are relative to the folder: the sequence's, or that of the file that it is; of a camera the working folder.
+    CalibrationError, with the text `missing`, where there is none.
     """
     if "calibration" in options:
         names = options["calibration"].split(",")
@@ -113,9 +109,8 @@ def calibration_files(folder: Path, options: Mapping[str, str], missing: str = "
             if not os.path.exists(file) and os.path.exists(name):  # noqa: PTH110 false for what can be no name, too
                 raise CalibrationError(f"{file}: there is no such file; calibration={name} is relative to {folder}")
         return files
-    files = _first(folder, _USUAL)
     texts = [folder / name for name in _KITTI if (folder / name).is_file()]
-    files = files or [file for file in texts if is_kitti(file)][:1]
+    files = _first(folder, _USUAL) or [file for file in texts if is_kitti(file)][:1]
     if not files:
         there = f" ({texts[0].name} is not of KITTI's form)" if texts else ""
         usual = f"{folder}: the calibration is missing{there}: calibration.yaml, or add calibration=FILE"
@@ -127,3 +122,48 @@ def _first(folder: Path, names: Sequence[Sequence[str]]) -> list[Path]:
     """The first of several sets of files that is complete; empty where none is."""
     sets = ([folder / name for name in names_] for names_ in names)
     return next((files for files in sets if all(file.is_file() for file in files)), [])
+
+
+def write_opencv(path: Path, rig: StereoRig) -> None:
+    """Write a rig, as recorded, with the entries of ``cv2.stereoCalibrate`` [m]; SlamError where that fails."""
+    import cv2
+
+    left, right, R, b = rig.as_recorded
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
+    storage.write("image_width", left.width)
+    storage.write("image_height", left.height)
+    if rig.left.model == _FISHEYE:
+        storage.write("distortion_model", _FISHEYE)
+    for number, camera in enumerate((left, right), 1):
+        storage.write(f"K{number}", camera.K)
+        storage.write(f"D{number}", np.array([camera.distortion or (0.0,) * 4]))
+    storage.write("R", R)
+    storage.write("T", (R @ b).reshape(3, 1))
+    write_text(path, storage.releaseAndGetString())
+
+
+def write_kalibr(path: Path, rig: StereoRig) -> None:
+    """Write a rig, as recorded, as a camchain, cam0 the left camera; raises as `require_kalibr`, or SlamError."""
+    import yaml
+
+    require_kalibr(path, rig)
+    cameras = rig.as_recorded
+    left, right = (_kalibr_camera(camera) for camera in cameras[:2])
+    right["T_cn_cnm1"] = pose(cameras[2], cameras[2] @ cameras[3]).tolist()
+    write_text(path, yaml.safe_dump({"cam0": left, "cam1": right}, default_flow_style=None, sort_keys=False))
+
+
+def require_kalibr(path: Path, rig: StereoRig) -> None:
+    """Raise CalibrationError where a camera has more than the four coefficients of distortion of Kalibr's form."""
+    if max(len(camera.distortion) for camera in (rig.left, rig.right)) > 4:
+        raise CalibrationError(f"{path}: Kalibr's form has k1, k2, p1 and p2, and this rig further distortion")
+
+
+def _kalibr_camera(camera: PinholeCamera) -> dict[str, object]:
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": [float(x) for x in (camera.fu, camera.fv, camera.u0, camera.v0)],
+        "distortion_model": _FISHEYE if camera.model == _FISHEYE else "radtan",
+        "distortion_coeffs": [float(x) for x in camera.distortion or (0.0,) * 4],
+        "resolution": [int(camera.width), int(camera.height)],
+    }

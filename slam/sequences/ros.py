@@ -16,15 +16,14 @@ from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
-from slam.sequences import rigs
 from slam.sequences.base import Images, RecordedSequence
 from slam.sequences.calibration import naming
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given, flag, metres_per_unit
-from slam.sequences.images import Size, halved, halves
-from slam.sequences.ros_bag import Bag, Message, naming_recording, open_bag
-from slam.sequences.ros_topics import Topics, choose_topics, rig_from_camera_infos
-from slam.sequences.source import Listing, hardware_tolerance, in_order, in_seconds, pair_listings, require_size
+from slam.sequences.images import Size, halves
+from slam.sequences.pairs import Listing, distinct, in_order, pair_up
+from slam.sequences.rigs import calibration_files, read_rig, require_size
+from slam.sequences.ros_bag import Bag, Message, Topics, choose_topics, open_bag, rig_from_camera_infos
 
 #: Options besides those of all formats.
 OPTIONS = frozenset({"left_info", "right_info"})
@@ -48,31 +47,20 @@ def matches_folder(path: Path) -> bool:
     )
 
 
-def open_folder(path: Path, options: Given) -> RecordedSequence:
-    """Open a recording; all of it is read once, for the stamps.
-
-    Raises:
-        SequenceError: rosbags is not installed, the recording is damaged, or its topics are not found or do not pair.
-        CalibrationError: there is no calibration, or an impossible one.
-        ConfigurationError: an option has an impossible value.
-    """
-    warnings: list[str] = []
-    with FaultLog(warnings) as faults:
-        with open_bag(path) as bag:
-            topics = choose_topics(bag, options)
-            messages = [_stamps(bag, topic, faults) for topic in dict.fromkeys((topics.left, topics.right))]
-            size = _first_size(bag, topics.left)
-        left, *right = _in_time(messages, faults)
-        partners: list[str | None] = [None] * len(left)
-        if right:
-            told = options.tolerance()
-            tolerance = hardware_tolerance(left) if told is None else told
-            left, partners = pair_listings(left, right[0], tolerance, faults)
-        left, partners, stamps = in_seconds(left, partners, faults)
-        rig = _rig(path, topics, size if right else halved(size, topics.left), options)
-    rows = [(int(a), -1 if b is None else int(b))[: len(messages)] for a, b in zip(left.names, partners)]
-    source = RosPairs(stamps, path, messages, np.array(rows), size)
-    return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source, warnings=warnings)
+def open_folder(path: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+    """Open a recording; all of it is read once, for the stamps."""
+    with open_bag(path) as bag:
+        topics = choose_topics(bag, options)
+        messages = [_stamps(bag, topic, faults) for topic in dict.fromkeys((topics.left, topics.right))]
+        image = _first_image(bag, topics.left)
+    left, *right = _in_time(messages, faults)
+    pairs = distinct(pair_up(left, right[0] if right else None, options, faults), faults)
+    size = image.shape[1], image.shape[0]
+    rig = _rig(path, topics, size if right else halves(image, topics.left)[0].shape[::-1], options)
+    columns = [pairs.left.names, pairs.partners][: len(messages)]
+    rows = np.array([[-1 if row is None else int(row) for row in column] for column in columns]).T
+    source = RosPairs(pairs.stamps, path, messages, rows, size)
+    return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source)
 
 
 class Messages(NamedTuple):
@@ -119,9 +107,8 @@ class RosPairs:
 
     def _seek(self, wanted: set[tuple[str, int]]) -> tuple[int | None, Counter[str]]:
         """The time from which on to read for some messages, and each topic's first row that comes then."""
-        counts = Counter({m.topic: 0 for m in self.topics})
         if any((np.diff(m.recorded) < 0).any() for m in self.topics):
-            return None, counts
+            return None, Counter({m.topic: 0 for m in self.topics})
         recorded = {m.topic: m.recorded for m in self.topics}
         since = min(int(recorded[topic][row]) for topic, row in wanted)
         return since, Counter({topic: int(np.searchsorted(times, since)) for topic, times in recorded.items()})
@@ -181,9 +168,8 @@ def _stamps(bag: Bag, topic: str, faults: FaultLog) -> Messages:
     """Stamps of all messages of a topic; where their headers hold none, when they were recorded."""
     stamps, recorded = [], []
     for message in bag.messages([topic]):
-        stamp = bag.read(message)
-        with naming_recording(bag.path):
-            stamps.append(int(stamp.header.stamp.sec) * 10**9 + int(stamp.header.stamp.nanosec))
+        stamp = bag.read(message).header.stamp
+        stamps.append(int(stamp.sec) * 10**9 + int(stamp.nanosec))
         recorded.append(message.time)
     if not stamps:
         raise SequenceError(f"{bag.path}: topic {topic} has no messages")
@@ -193,24 +179,21 @@ def _stamps(bag: Bag, topic: str, faults: FaultLog) -> Messages:
     return Messages(topic, np.array(stamps, np.int64), np.array(recorded, np.int64))
 
 
-def _first_size(bag: Bag, topic: str) -> Size:
-    """Width and height of the first image of a topic that can be read."""
+def _first_image(bag: Bag, topic: str) -> np.ndarray:
+    """The first image of a topic that can be read."""
     reason = "no messages"
     for message in bag.messages([topic]):
         try:
-            image = bag.image(message, topic)
+            return bag.image(message, topic)
         except SequenceError as error:
             reason = str(error)
-            continue
-        return image.shape[1], image.shape[0]
     raise SequenceError(f"{bag.path}: no image of {topic} can be read: {reason}")
 
 
 def _rig(path: Path, topics: Topics, size: Size, options: Given) -> StereoRig:
     """The rig by the calibration file that is named, else by the camera messages."""
     if "calibration" in options:
-        paths = rigs.calibration_files(path if path.is_dir() else path.parent, options)
-        return rigs.read_rig(paths, size, options)
+        return read_rig(calibration_files(path if path.is_dir() else path.parent, options), size, options)
     where = Path(topics.info_names)
     rectified = flag(options, "rectified") if "rectified" in options else topics.rectified
     with naming(where):

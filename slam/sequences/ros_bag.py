@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam.errors import SequenceError, SlamError, one_line, text_of
+from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError, one_line, text_of
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.naming import suggestion
+from slam.sequences.calibration import array, naming
+from slam.sequences.calibration_keys import Entries, rig_of
+from slam.sequences.given import layout_of
 from slam.sequences.images import Size, decode_image, require_image_size, size_text
+from slam.sequences.names import SIDES
 
 #: Types of messages that hold an image.
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -22,21 +30,21 @@ DEPTH = frozenset({"16UC1", "32FC1"})
 
 # Bits and channels of an encoding, and OpenCV's conversion to grey. OpenCV names a Bayer pattern by its second row.
 _ENCODINGS: dict[str, tuple[int, int, str]] = {
-    "mono8": (8, 1, ""),
-    "8UC1": (8, 1, ""),
-    "mono16": (16, 1, ""),
-    "16UC1": (16, 1, ""),
+    **{name: (bits, 1, "") for bits in (8, 16) for name in (f"mono{bits}", f"{bits}UC1")},
     "8UC3": (8, 3, "COLOR_BGR2GRAY"),
-    "yuv422": (8, 2, "COLOR_YUV2GRAY_UYVY"),
-    "uyvy": (8, 2, "COLOR_YUV2GRAY_UYVY"),
-    "yuv422_yuy2": (8, 2, "COLOR_YUV2GRAY_YUY2"),
-    "yuyv": (8, 2, "COLOR_YUV2GRAY_YUY2"),
+    **{name: (8, 2, "COLOR_YUV2GRAY_UYVY") for name in ("yuv422", "uyvy")},
+    **{name: (8, 2, "COLOR_YUV2GRAY_YUY2") for name in ("yuv422_yuy2", "yuyv")},
+    **{
+        f"{order}{bits}": (bits, len(order), f"COLOR_{order.upper()}2GRAY")
+        for bits in (8, 16)
+        for order in ("bgr", "rgb", "bgra", "rgba")
+    },
+    **{
+        f"bayer_{order}{bits}": (bits, 1, f"COLOR_Bayer{name}2GRAY")
+        for bits in (8, 16)
+        for order, name in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB"))
+    },
 }
-for _bits in (8, 16):
-    for _order in ("bgr", "rgb", "bgra", "rgba"):
-        _ENCODINGS[f"{_order}{_bits}"] = (_bits, len(_order), f"COLOR_{_order.upper()}2GRAY")
-    for _order, _name in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
-        _ENCODINGS[f"bayer_{_order}{_bits}"] = (_bits, 1, f"COLOR_Bayer{_name}2GRAY")
 
 
 @contextmanager
@@ -98,7 +106,7 @@ class Message(NamedTuple):
 
 
 class Bag:
-    """An open recording, whatever its kind; every fault of it is a `SequenceError` with its name."""
+    """An open recording, whatever its kind."""
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path, self._reader = path, reader
@@ -107,18 +115,12 @@ class Bag:
     def messages(self, topics: Iterable[str], since: int | None = None) -> Generator[Message, None, None]:
         """All messages of some topics, from a time [ns] on, in the order of recording."""
         connections = [c for c in self._reader.connections if c.topic in topics]
-        messages = iter(self._reader.messages(connections, start=since)) if connections else iter(())
-        while True:
-            with naming_recording(self.path):
-                found = next(messages, None)
-            if found is None:
-                return
-            yield Message(found[0].topic, found[0].msgtype, int(found[1]), found[2])
+        for connection, time, data in self._reader.messages(connections, start=since) if connections else ():
+            yield Message(connection.topic, connection.msgtype, int(time), data)
 
     def read(self, message: Message) -> Any:
         """A message as an object."""
-        with naming_recording(self.path):
-            return self._reader.deserialize(message.data, message.kind)
+        return self._reader.deserialize(message.data, message.kind)
 
     def image(self, message: Message, what: str, size: Size | None = None) -> np.ndarray:
         """The image (H, W) of a message, see `grey_image`."""
@@ -134,21 +136,19 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a recording, and close it in the end; SequenceError where it cannot be read, or rosbags is missing."""
+    """Open a recording, and close it in the end; SequenceError for every fault of it, or where rosbags is missing."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         line = "ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
         raise SequenceError(f"{path}: {line}") from None
-    with ExitStack() as stack:
-        with naming_recording(path):
-            if path.name.lower().endswith(".zstd"):
-                path = _unpacked(path, Path(stack.enter_context(TemporaryDirectory())))
-            reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            stack.enter_context(reader)
-            bag = Bag(path, reader)
-        yield bag
+    with naming_recording(path), ExitStack() as stack:
+        if path.name.lower().endswith(".zstd"):
+            path = _unpacked(path, Path(stack.enter_context(TemporaryDirectory())))
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        stack.enter_context(reader)
+        yield Bag(path, reader)
 
 
 def _unpacked(path: Path, folder: Path) -> Path:
@@ -161,3 +161,210 @@ def _unpacked(path: Path, folder: Path) -> Path:
     with zstd.open(path, "rb") as packed, target.open("wb") as file:
         shutil.copyfileobj(packed, file)
     return target
+
+
+_INFO = "sensor_msgs/msg/CameraInfo"
+_IMAGES = (RAW, COMPRESSED)
+_SAME_PLACE = 1e-6  # [m] from a pair's left camera
+_LISTED = 12  # topics named in a message
+
+
+@dataclass(frozen=True, eq=False)
+class CameraInfo:
+    """A CameraInfo message of ROS 1 or 2."""
+
+    size: tuple[int, int]  # width and height [px]
+    model: str  # name of the distortion model
+    K: Array  # camera matrix (3, 3) of the raw image
+    D: Array  # its distortion coefficients
+    R: Array  # rotation (3, 3) from raw to rectified camera axes
+    P: Array  # projection (3, 4) of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair
+
+    @classmethod
+    def read(cls, bag: Bag, topic: str) -> CameraInfo:
+        """The first message of a topic, of ROS 1, which writes matrices in capitals, or 2.
+
+        Raises:
+            CalibrationError: there is none, it holds what no calibration holds, or only a part of the image is given.
+        """
+        message = bag.first(topic)
+        if message is None:
+            raise CalibrationError(f"{bag.path}: topic {topic} has no messages")
+        with naming(Path(topic)):
+            shapes = {"K": (3, 3), "D": None, "R": (3, 3), "P": (3, 4)}
+            matrices = {
+                n: array(getattr(message, n, getattr(message, n.lower(), None)), n, s) for n, s in shapes.items()
+            }
+            size = int(message.width), int(message.height)
+            roi = int(message.roi.width), int(message.roi.height)
+            if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):
+                raise CalibrationError("binning and regions of interest are not supported")
+            return cls(size, str(message.distortion_model), **matrices)
+
+    @property
+    def baseline_term(self) -> float:
+        """``-P[0, 3] / P[0, 0]``: how far the camera stands to the right of the pair's left one [m]; NaN for no P."""
+        return float(-self.P[0, 3] / self.P[0, 0]) if self.P[0, 0] > 0 else float("nan")
+
+
+def rig_from_camera_infos(infos: Sequence[CameraInfo], rectified: bool, unit: float = 1.0) -> StereoRig:
+    """The rig of the rectified or of the raw images; the baseline in ``P`` is in units of so many metres.
+
+    Raises:
+        CalibrationError: a camera is not calibrated, or not as one of a pair; or the rig is impossible.
+    """
+    for side, info in zip(("left", "right"), infos):
+        if not (info.P[0, 0] > 0 and info.K[0, 0] > 0):
+            raise CalibrationError(f"the {side} camera is not calibrated: K or P is zero")
+    if infos[0].size != infos[1].size:
+        raise CalibrationError("the images of the two cameras differ in size")
+    names = "cameramatrix", "distcoeffs", "rectificationmatrix", "projectionmatrix", "distortionmodel", "size"
+    files = [dict(zip(names, zip(names, (i.K, i.D, i.R, i.P, i.model, i.size)))) for i in infos]
+    return rig_of(Entries(files), infos[0].size, unit, rectified, False)
+
+
+@dataclass(frozen=True, eq=False)
+class Topics:
+    """The topics of a stereo rig."""
+
+    left: str  # of the images; the same where they are side by side
+    right: str
+    infos: tuple[CameraInfo, ...] = ()  # the cameras' calibrations; none where a file is named in their place
+    info_names: str = ""  # the topics of these
+
+    @property
+    def rectified(self) -> bool:
+        """Whether the images are rectified, by ROS's names for topics (``image_rect``, ``image_rect_raw``)."""
+        return all("rect" in _image_name(topic) for topic in (self.left, self.right))
+
+
+def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
+    """The topics by the options ``left``, ``right``, ``left_info``, ``right_info``; without them those of a pair.
+
+    A pair are two cameras whose messages say so: the same size and focal length of the rectified images, and a baseline
+    in the right one's projection. Depth images do not count. Where a calibration is named, names decide.
+
+    Raises:
+        SequenceError: a topic is not there, or there is not exactly one pair.
+        CalibrationError: there is no calibration.
+        ConfigurationError: one of the two images is named and the other is not.
+    """
+    if layout_of(options) is not None:
+        images = [topic for topic in _of_kind(bag, _IMAGES) if not _is_depth(bag, topic)]
+        if "left" not in options and len(images) != 1:
+            there = f"{len(images)} topics of images, where layout=sbs needs one"
+            raise SequenceError(f"{bag.path}: {there}: add left=/… of {_listed(images)}")
+        topic = _named(bag, options["left"], _IMAGES) if "left" in options else images[0]
+        return _with_infos(bag, (topic, topic), options)
+    if ("left" in options) != ("right" in options):
+        raise ConfigurationError("name both topics: left=/…&right=/…")
+    if "left" in options:
+        return _with_infos(bag, tuple(_named(bag, options[side], _IMAGES) for side in ("left", "right")), options)
+    pairs = list(_pairs_by_name(bag) if "calibration" in options else _pairs_by_messages(bag))
+    if len(pairs) == 1:
+        return pairs[0]
+    images = _of_kind(bag, _IMAGES)
+    if pairs:
+        found = "; ".join(f"left={pair.left}&right={pair.right}" for pair in pairs[:3])
+        raise SequenceError(f"{bag.path}: several stereo pairs, choose one: {found}")
+    if not images:
+        raise SequenceError(f"{bag.path}: no images; its topics are {_listed(sorted(bag.kinds))}")
+    raise SequenceError(
+        f"{bag.path}: its camera messages name no stereo pair: add left=/…&right=/… of {_listed(images)}, "
+        "and calibration=FILE where the cameras are not calibrated"
+    )
+
+
+def _with_infos(bag: Bag, images: tuple[str, ...], options: Mapping[str, str]) -> Topics:
+    """Images with their cameras' messages, named or in the same name space, unless a calibration is named."""
+    names = []
+    for side, topic in zip(("left", "right"), () if "calibration" in options else images):
+        usual = f"{_space(topic)}/camera_info"
+        if f"{side}_info" in options:
+            names.append(_named(bag, options[f"{side}_info"], (_INFO,)))
+        elif bag.kinds.get(usual) == _INFO:
+            names.append(usual)
+        else:
+            known = _listed(_of_kind(bag, (_INFO,)))
+            raise CalibrationError(
+                f"{bag.path}: no {usual} for {topic}: add {side}_info=/… (there are {known}) or calibration=FILE"
+            )
+    return Topics(images[0], images[1], tuple(CameraInfo.read(bag, name) for name in names), " and ".join(names))
+
+
+def _pairs_by_messages(bag: Bag) -> Iterator[Topics]:
+    """All pairs of cameras that say that they are one."""
+    cameras = []
+    for name in _of_kind(bag, (_INFO,)):
+        images = [t for t in _preferred(bag) if _space(t) == _space(name) and not _is_depth(bag, t)]
+        if images and bag.first(name) is not None:
+            cameras.append((images[0], name, CameraInfo.read(bag, name)))
+    for left, left_name, a in cameras:
+        for right, right_name, b in cameras:
+            same = a.size == b.size and a.P[0, 0] == b.P[0, 0]
+            if same and abs(a.baseline_term) < _SAME_PLACE and b.baseline_term > _SAME_PLACE:
+                yield Topics(left, right, (a, b), f"{left_name} and {right_name}")
+
+
+def _pairs_by_name(bag: Bag) -> list[Topics]:
+    """Pairs of topics of images that differ in one of the usual names for left and right, one of each two cameras."""
+    images = _preferred(bag)
+    found: dict[tuple[str, str], Topics] = {}
+    for topic in images:
+        for names in SIDES:
+            other = topic.replace(*names)
+            if other != topic and other in images and not _is_depth(bag, topic):
+                spaces = _space(topic), _space(other)
+                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), Topics(topic, other))
+    return list(found.values())
+
+
+def _named(bag: Bag, topic: str, kinds: tuple[str, ...]) -> str:
+    """A topic that must be there, and of one of these types."""
+    known = _of_kind(bag, kinds)
+    if topic not in known:
+        there = f"it holds {bag.kinds[topic]}" if topic in bag.kinds else "there is none"
+        raise SequenceError(f"{bag.path}: topic {topic}: {there}{suggestion(topic, known)}; there are {_listed(known)}")
+    return topic
+
+
+def _of_kind(bag: Bag, kinds: tuple[str, ...]) -> list[str]:
+    return sorted(topic for topic, kind in bag.kinds.items() if kind in kinds)
+
+
+def _is_depth(bag: Bag, topic: str) -> bool:
+    """Whether a topic holds depth images, or nothing."""
+    message = bag.first(topic)
+    if message is None or bag.kinds[topic] == COMPRESSED:
+        return message is None or "compressedDepth" in topic
+    return message.encoding in DEPTH
+
+
+def _preferred(bag: Bag) -> list[str]:
+    """Topics of images in the order in which they are chosen: rectified, raw before compressed, grey before colour."""
+
+    def key(topic: str) -> Any:
+        name = _image_name(topic)
+        return "rect" not in name, bag.kinds[topic] == COMPRESSED, "color" in name
+
+    return sorted(_of_kind(bag, _IMAGES), key=key)
+
+
+def _base(topic: str) -> str:
+    """A topic without what names its compression."""
+    base, _, last = topic.rpartition("/")
+    return base if last.startswith("compressed") else topic
+
+
+def _space(topic: str) -> str:
+    """The name space of a camera's topic."""
+    return _base(topic).rpartition("/")[0]
+
+
+def _image_name(topic: str) -> str:
+    return _base(topic).rpartition("/")[2]
+
+
+def _listed(topics: list[str]) -> str:
+    more = f", … ({len(topics)})" if len(topics) > _LISTED else ""
+    return (", ".join(topics[:_LISTED]) or "none") + more

@@ -96,18 +96,6 @@ def numbers(text: str, count: int, what: str, separator: str | None = None, exac
     return row
 
 
-def stamp_and_name(text: str) -> tuple[int, str]:
-    """A row of EuRoC's ``data.csv``: nanoseconds and file name; the name defaults to the stamp."""
-    stamp, name = (cell.strip() for cell in f"{text},".split(",")[:2])
-    try:
-        value = int(stamp)
-    except ValueError:
-        raise ValueError(f"{shorten(stamp)} is not a time in whole nanoseconds") from None
-    if not 0 <= value <= MOST_NANOSECONDS:
-        raise ValueError(f"{shorten(stamp)} is no possible time in nanoseconds")
-    return value, name or f"{stamp}.png"
-
-
 def shorten(text: str, length: int = 40) -> str:
     """The text in quotes, cut where it is long."""
     return repr(text if len(text) <= length else text[:length] + "…")

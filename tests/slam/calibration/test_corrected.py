@@ -10,7 +10,7 @@ from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
-from slam.sequences.calibration_files import write_kalibr, write_opencv
+from slam.sequences.rigs import write_kalibr, write_opencv
 from slam.testing import GENERAL_RIG
 from tests.slam.calibration.drives import CAR
 

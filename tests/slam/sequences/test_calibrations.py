@@ -13,8 +13,7 @@ import pytest
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.sequences import open_sequence
-from slam.sequences.calibration_files import write_kalibr, write_opencv
-from slam.sequences.rigs import read_rig
+from slam.sequences.rigs import read_rig, write_kalibr, write_opencv
 
 SIZE = (64, 48)
 K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
@@ -178,11 +177,11 @@ def test_kalibr(two_folders: Path) -> None:
     [
         ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),
-        ("cam1:", "cam7:", "cam1/intrinsics, cam1/T_cn_cnm1 are missing (it looks like Kalibr's)"),
-        ("T_cn_cnm1:", "T_cm_cnm1:", "T_cn_cnm1 is missing"),
+        ("cam1:", "cam7:", "K2, R, T are missing (it looks like Kalibr's)"),
+        ("T_cn_cnm1:", "T_cm_cnm1:", "R, T are missing"),
         ("[0.0, 0.0, 1.0, 0.002]", "[0.0, 0.0, 2.0, 0.002]", "T_cn_cnm1 is not a rigid motion"),
         ("[0.0, 0.0, 1.0, 0.002]", "[0.0, 0.0, 1.0]", "cam1/T_cn_cnm1 is no matrix of shape (4, 4)"),
-        ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "intrinsics has 3 numbers, 4 expected"),
+        ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "intrinsics is no matrix of shape (3, 3)"),
         ("intrinsics: [50.0", "intrinsics: [.nan", "intrinsics is not finite"),
         ("intrinsics: [50.0", "intrinsics: [-50.0", "focal lengths must be positive"),
         ("2e-4, 1e-5]", "2e-4]", "takes 4 coefficients or more, got 3"),

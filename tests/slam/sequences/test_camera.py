@@ -15,7 +15,8 @@ import pytest
 
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
-from slam.sequences import camera, devices, is_live
+from slam.sequences import camera, is_live
+from slam.sequences import captures as devices
 
 WIDTH, HEIGHT = 160, 120
 
@@ -115,15 +116,6 @@ def test_a_camera_that_comes_back_with_another_size_ends_the_frames(rig_here, pl
         next(frames)
 
 
-def test_a_camera_that_nobody_read_for_a_while_is_opened_again(rig_here, played, monkeypatch):
-    for old, opened in ((60.0, 1), (-1.0, 2)):
-        monkeypatch.setattr(camera, "_OLD", old)
-        played({"0": [np.hstack([grey(10 * k), grey(10 * k + 5)]) for k in range(9)]})
-        Played.opened = 0
-        assert len(list(slam.open_sequence("camera:0").frames(0, 3))) == 3
-        assert Played.opened == opened
-
-
 def test_a_video_is_no_camera_but_runs_live(rig_here, scene, tmp_path):
     write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in scene], 20.0)
     with pytest.raises(SequenceError, match=r"a file, not a camera; .*'both\.avi\?layout=sbs'"):
@@ -146,7 +138,7 @@ def test_a_camera_that_stops_and_comes_back_is_waited_for(rig_here, played, capl
     frames = list(sequence.frames(0, 5))
     assert [int(f.left[0, 0]) for f in frames] == [10, 20, 30, 40, 50]
     assert (np.diff([f.stamp for f in frames]) > 0).all()
-    assert Played.opened == 4  # at first, and after each of the failures
+    assert Played.opened == 5  # for the size, for the frames, and after each of the failures
     assert len(sequence.warnings) == 2
     assert "no more frames; they are waited for 10 s" in caplog.text
     assert "frames again after 0." in caplog.text

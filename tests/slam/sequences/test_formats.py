@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.errors import CalibrationError, SequenceError
 from slam.sequences import Sequence, formats, open_sequence
-from slam.sequences.kitti_truth import imu_poses
+from slam.sequences.kitti import imu_poses
 
 
 def levels(sequence: Sequence) -> list[tuple[int, int]]:
@@ -194,13 +194,11 @@ def test_kitti_without_times_runs_at_ten_hertz_and_says_so(kitti: Path) -> None:
 # ------------------------------------------------------------------------------------------------ KITTI raw
 
 
-def test_kitti_raw_rig_times_and_gps(raw: Path) -> None:
+def test_kitti_raw_rig_and_times(raw: Path) -> None:
     sequence = open_sequence(raw)
     assert sequence.rig.baseline == pytest.approx(0.5, abs=1e-12)
     assert np.allclose(sequence.stamps, 0.1 * np.arange(6), atol=1e-9)
     assert sequence.ground_truth is None
-    gps = sequence.gps
-    assert np.allclose(gps, [[0.1 * i, i, 0, 0] for i in range(6)], atol=1e-9)
 
 
 def write_oxts(drive: Path, records: list[str]) -> None:
@@ -308,8 +306,6 @@ def test_real_kitti_raw_0013(slam_data: Path) -> None:
     drive = slam_data / "kitti_raw" / "2011_09_26" / "2011_09_26_drive_0013_sync"
     sequence = open_sequence(drive)
     assert (len(sequence), sequence.rig.width, sequence.rig.height) == (144, 1242, 375)
-    assert sequence.gps.shape == (144, 4)
-    assert np.linalg.norm(np.diff(sequence.gps[:, 1:3], axis=0), axis=1).sum() == pytest.approx(172.98, abs=0.01)
     assert sequence.warnings == []
     if not (drive / "poses_cam0_oxts.txt").exists():
         pytest.skip("this copy of the drive has no poses of camera 0")

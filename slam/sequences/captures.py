@@ -1,0 +1,197 @@
+"""What OpenCV captures: video files, as a frame source, and cameras by number, pipeline or address."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.errors import SequenceError
+from slam.files import require_content
+from slam.geometry.se3 import Array
+from slam.sequences.base import Images
+from slam.sequences.faults import FaultLog
+from slam.sequences.given import FASTEST, SLOWEST
+from slam.sequences.images import MOST_PIXELS, Size, halves, require_same_size
+
+#: Endings of video files, in lower case.
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
+
+_MOST_FRAMES = 10_000_000  # of a video, four days of it: what a header says may be anything
+
+
+@dataclass(frozen=True, eq=False)
+class VideoPairs:
+    """A frame source: two videos, or one with both images side by side."""
+
+    stamps: Array  # times (N,) [s]: frame number by frame rate
+    paths: list[Path]
+    size: Size  # width and height of each camera's images
+
+    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
+        """Decode frames `start` to `stop`, in grey; a video that ends too early ends the sequence with a line.
+
+        A video cannot be entered in the middle without errors, so what is skipped is passed over, though not
+        converted.
+        """
+        with ExitStack() as stack:
+            videos = [stack.enter_context(_open(path)) for path in self.paths]
+            with quiet_libraries():
+                for _ in range(start):
+                    for video in videos:
+                        video.grab()
+            for index in range(start, stop):
+                images = [read_image(video) if video.grab() else None for video in videos]
+                for path, image in zip(self.paths, images):
+                    if image is None:
+                        faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
+                whole = [image for image in images if image is not None]
+                if len(whole) < len(images):
+                    return
+                yield halves(whole[0], self.paths[0]) if len(whole) == 1 else (whole[0], whole[1])
+
+
+def open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> VideoPairs:
+    """The frame source of two videos, or of one side by side; `rate` [1/s] overrides what the left one says of itself.
+
+    SequenceError where a file is no readable video, the frame sizes differ, or the frame rate is not known.
+    """
+    found = [_describe(path) for path in paths]
+    counts, images = [count for count, _, _ in found], [image for *_, image in found]
+    images = list(halves(images[0], paths[0])) if len(paths) == 1 else images
+    size = images[0].shape[1], images[0].shape[0]
+    require_same_size(size, images[1].shape[::-1], *paths)
+    if counts[0] != counts[-1]:
+        line = f"{paths[0]} has {counts[0]} frames, {paths[1]} has {counts[1]}: the surplus is left out"
+        faults.report("videos", line)
+    rate = rate or found[0][1]
+    if not SLOWEST <= rate <= FASTEST:
+        raise SequenceError(f"{paths[0]}: the frame rate is not known, add fps=…")
+    return VideoPairs(np.arange(min(counts)) / rate, paths, size)
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Any]:
+    """A ``cv2.VideoCapture``, released in the end; SequenceError where the file is no readable video."""
+    import cv2
+
+    require_content(path)  # a pipe would be waited for
+    with quiet_libraries():
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # others take a name for a pattern
+    try:
+        if not capture.isOpened():
+            raise SequenceError(f"{path}: not a readable video")
+        if capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT) > MOST_PIXELS:
+            raise SequenceError(f"{path}: frames of more than {MOST_PIXELS} pixels are not read")
+        yield capture
+    finally:
+        with quiet_libraries():
+            capture.release()
+
+
+def _describe(path: Path) -> tuple[int, float, np.ndarray]:
+    """Number of frames, frame rate [1/s] and first image of a video; frames are counted where it does not say."""
+    import cv2
+
+    with _open(path) as video:
+        claimed, rate = video.get(cv2.CAP_PROP_FRAME_COUNT), float(video.get(cv2.CAP_PROP_FPS))
+        count = int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 0
+        first = read_image(video) if video.grab() else None
+        if first is None:
+            raise SequenceError(f"{path}: no frame of the video can be decoded")
+        if count <= 0:
+            count = 1
+            with quiet_libraries():
+                while count < _MOST_FRAMES and video.grab():
+                    count += 1
+    return count, rate, first
+
+
+_TIMEOUT = 5000  # [ms] for an answer from the network
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Keep OpenCV, and ffmpeg below it, from printing what is about to be reported as an error of ours."""
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    logging = cv2.utils.logging
+    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        logging.setLogLevel(before)
+
+
+def open_device(address: str, width: int | None = None, height: int | None = None, fps: float | None = None) -> Any:
+    """Open a camera as a ``cv2.VideoCapture``; SequenceError where it cannot be opened, or is a file.
+
+    Args:
+        address: a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address
+            of a network.
+        width: asked of the camera [px], as `height`, and `fps` [1/s]; None for its own choice.
+        height: the same.
+        fps: the same.
+    """
+    import cv2
+
+    if "!" not in address and "://" not in address and os.path.isfile(address):  # noqa: PTH113 unlike Path's, no errors
+        hint = f"with both images side by side it is run as '{address}?layout=sbs', at its own rate with --live"
+        raise SequenceError(f"camera:{address}: a file, not a camera; {hint}")
+    with quiet_libraries():
+        if address.isdecimal() and len(address) < 4:
+            capture = cv2.VideoCapture(int(address))
+        elif "!" in address:
+            capture = cv2.VideoCapture(address, cv2.CAP_GSTREAMER)
+        elif "://" in address:
+            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT]
+            capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG, limits)
+        else:
+            capture = cv2.VideoCapture(address)
+        if not capture.isOpened():
+            raise SequenceError(f"camera:{without_password(address)}: cannot be opened{_hint(address)}")
+        wanted = ((cv2.CAP_PROP_FRAME_WIDTH, width), (cv2.CAP_PROP_FRAME_HEIGHT, height), (cv2.CAP_PROP_FPS, fps))
+        for name, value in wanted:
+            if value is not None:
+                capture.set(name, value)
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # images that wait in a queue are old
+    return capture
+
+
+def read_image(device: Any) -> np.ndarray | None:
+    """The grabbed image in grey (H, W), as stored in 8 or 16 bits; None where there is none."""
+    import cv2
+
+    try:
+        with quiet_libraries():
+            good, image = device.retrieve()
+    except cv2.error:
+        return None
+    if not good or image is None or image.size == 0:
+        return None
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+
+
+def without_password(address: str) -> str:
+    """An address as it may be shown."""
+    scheme, mark, rest = address.partition("://")
+    return f"{scheme}{mark}{rest.rpartition('@')[2]}" if mark else address
+
+
+def _hint(address: str) -> str:
+    """What may be the reason."""
+    import cv2
+
+    if address.isdecimal():
+        there = sorted(str(path) for path in Path("/dev").glob("video*"))
+        return f": there are {', '.join(there)}" if there else ": this machine shows no camera (/dev/video*)"
+    if "!" in address:
+        there = cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER)
+        return "" if there else ": this OpenCV was built without GStreamer"
+    return "" if "://" in address or Path(address).exists() else ": there is no such file or device"
