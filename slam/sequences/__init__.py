@@ -128,7 +128,7 @@ def _open_camera(text: str) -> Sequence:
     if not mark or ("://" in name and not set(options) <= camera.OPTIONS):
         name, options = text, {}
     check_options("camera", options, camera.OPTIONS)
-    return camera.open_camera(name, options)
+    return camera.CameraSequence(name, options)
 
 
 def _exists(text: str) -> bool:

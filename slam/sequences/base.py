@@ -181,18 +181,16 @@ def read_masks(text: str | None, folder: Path, rig: StereoRig) -> Masks:
     names = text.split(",")
     if len(names) > 2 or not any(names):
         raise ConfigurationError(f"mask must be one image, or two joined by a comma, got {text!r}")
-    masks = [_read_mask(folder / expanded(name), rig) if name else None for name in names]
+    masks: list[np.ndarray | None] = [None] * len(names)
+    for at, path in ((at, folder / expanded(name)) for at, name in enumerate(names) if name):
+        try:
+            mask = np.rot90(read_image(path) > 0, rig.turns)
+        except SequenceError as error:
+            raise SequenceError(f"mask: {error}") from error
+        if mask.shape != (rig.height, rig.width):
+            size = size_text(recorded_size(rig))
+            raise ConfigurationError(f"mask {path}: images are {size}, the mask is of another size")
+        if not mask.any():
+            raise ConfigurationError(f"mask {path}: it is black all over, so that nothing is left of the images")
+        masks[at] = mask
     return masks[0], masks[-1]
-
-
-def _read_mask(path: Path, rig: StereoRig) -> np.ndarray:
-    try:
-        mask = np.rot90(read_image(path) > 0, rig.turns)
-    except SequenceError as error:
-        raise SequenceError(f"mask: {error}") from error
-    if mask.shape != (rig.height, rig.width):
-        size = size_text(recorded_size(rig))
-        raise ConfigurationError(f"mask {path}: images are {size}, the mask is of another size")
-    if not mask.any():
-        raise ConfigurationError(f"mask {path}: it is black all over, so that nothing is left of the images")
-    return mask

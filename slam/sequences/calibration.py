@@ -212,7 +212,7 @@ def _read_depthai(root: Mapping[str, Any]) -> dict[str, Any]:
         pair = root.get("stereoRectificationData")
         pair = pair if isinstance(pair, Mapping) else {}
         sockets = [int(pair.get(f"{side}CameraSocket", default)) for side, default in (("left", 1), ("right", 2))]
-        for side, own, other in (("left", *sockets), ("right", *sockets[::-1])):
+        for side, (own, other) in (("left", sockets), ("right", sockets[::-1])):
             camera, extrinsics = cameras[own], cameras[own]["extrinsics"]
             named[side] = {key: camera.get(key) for key in ("intrinsicMatrix", "distortionCoeff", "width", "height")}
             named[side]["camera_model"] = "fisheye" if camera.get("cameraType") == "1" else "pinhole"

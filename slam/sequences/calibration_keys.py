@@ -191,8 +191,10 @@ def _extrinsics(entries: Entries, unit: float) -> Array | None:
     if entries.both("P"):
         P_left, P_right = _projections(entries, unit)
         offset = projection_offset(P_right) - projection_offset(P_left)
-    elif (baseline := _baseline(entries, unit)) is not None:
-        offset = np.array([-baseline, 0.0, 0.0])
+    elif (baseline := entries.find("baseline")) is not None:
+        offset = np.array([-unit * _number(baseline), 0.0, 0.0])
+    elif (product := entries.find("bf")) is not None and (focal := entries.find("fx")) is not None:
+        offset = np.array([-unit * _number(product) / _number(focal), 0.0, 0.0])
     return None if left is None or right is None or offset is None else pose(right.T @ left, right.T @ offset)
 
 
@@ -204,14 +206,6 @@ def _projections(entries: Entries, unit: float) -> tuple[Array, Array]:
         raise CalibrationError("the cameras are not calibrated as a pair: P of the right one holds no baseline")
     scale = np.array([1, 1, 1, unit])
     return left * scale, right * scale
-
-
-def _baseline(entries: Entries, unit: float) -> float | None:
-    """The baseline [m], perhaps by its product with the focal length; None where there is none."""
-    if (found := entries.find("baseline")) is not None:
-        return unit * _number(found)
-    product, focal = entries.find("bf"), entries.find("fx")
-    return None if product is None or focal is None else unit * _number(product) / _number(focal)
 
 
 def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:

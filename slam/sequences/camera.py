@@ -17,7 +17,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.sequences import captures as devices
 from slam.sequences.base import as_used, read_masks
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import CALIBRATION_OPTIONS, flag, number
+from slam.sequences.given import CALIBRATION_OPTIONS, FASTEST, SLOWEST, flag, number
 from slam.sequences.images import halves, recorded_size, require_same_size, size_text
 from slam.sequences.rigs import calibration_files, read_rig
 
@@ -42,26 +42,36 @@ class CameraSequence:
     that waited in a queue until then are old.
 
     Args:
-        addresses: one device or two, see `slam.sequences.captures.open_device`.
+        text: the address, or two joined by a comma, see `slam.sequences.captures.open_device`; empty where the options
+            ``left`` and ``right`` name them.
         options: those of `OPTIONS` that are given.
 
     Raises:
         SequenceError: a camera cannot be opened, gives no image, or one of another size than the calibration is for.
         CalibrationError: the calibration is missing, unreadable or impossible.
-        ConfigurationError: an option has an impossible value.
+        ConfigurationError: an option has an impossible value; no camera is named, or more than two.
     """
 
     format = "camera"
     ground_truth: Trajectory | None = None
     live = True
 
-    def __init__(self, addresses: list[str], options: Mapping[str, str]) -> None:
+    def __init__(self, text: str, options: Mapping[str, str]) -> None:
+        addresses = [text] if "!" in text else [part.strip() for part in text.split(",")]
+        if "left" in options or "right" in options:
+            if text or not ("left" in options and "right" in options):
+                raise ConfigurationError("camera: name both left=… and right=…, and no other address")
+            addresses = [options["left"], options["right"]]
+        if len(addresses) > 2 or not all(addresses):
+            hint = "name one device with both images side by side (camera:0), or two (camera:0,1)"
+            raise ConfigurationError(f"camera: {hint}")
+        addresses = [a if a.isdecimal() or "!" in a or "://" in a else str(expanded(a)) for a in addresses]
         self.name = "camera:" + ",".join(devices.without_password(a) for a in addresses)
         self.kind = options.get("kind", "handheld")
         self.warnings: list[str] = []
         self._addresses, self._swap = addresses, flag(options, "swap")
-        sides = [number(options, name, 1, _WIDEST) for name in ("width", "height")]
-        self._wanted = *(None if side is None else int(side) for side in sides), number(options, "fps", 1e-3, 1e5)
+        wanted = [number(options, name, 1, _WIDEST) for name in ("width", "height")]
+        self._wanted = *wanted, number(options, "fps", SLOWEST, FASTEST)
         wait = number(options, "wait", 0.0, _LONGEST_WAIT)
         self._wait = WAIT if wait is None else wait
         self._origin = time.time() - time.monotonic()  # since 1970 when the monotonic clock was zero [s]
@@ -167,20 +177,3 @@ class CameraSequence:
 def _release(opened: list[Any]) -> None:
     for device in opened:
         device.release()
-
-
-def open_camera(text: str, options: Mapping[str, str]) -> CameraSequence:
-    """Open one camera or two: the address, or two joined by a comma; none where the options left and right name them.
-
-    Raises as `CameraSequence`, and ConfigurationError where no camera is named, or more than two.
-    """
-    addresses = [text] if "!" in text else [part.strip() for part in text.split(",")]
-    if "left" in options or "right" in options:
-        if text or not ("left" in options and "right" in options):
-            raise ConfigurationError("camera: name both left=… and right=…, and no other address")
-        addresses = [options["left"], options["right"]]
-    if len(addresses) > 2 or not all(addresses):
-        hint = "name one device with both images side by side (camera:0), or two (camera:0,1)"
-        raise ConfigurationError(f"camera: {hint}")
-    plain = [a if a.isdecimal() or "!" in a or "://" in a else str(expanded(a)) for a in addresses]
-    return CameraSequence(plain, options)

@@ -129,7 +129,7 @@ def quiet_libraries() -> Iterator[None]:
         logging.setLogLevel(before)
 
 
-def open_device(address: str, width: int | None = None, height: int | None = None, fps: float | None = None) -> Any:
+def open_device(address: str, width: float | None = None, height: float | None = None, fps: float | None = None) -> Any:
     """Open a camera as a ``cv2.VideoCapture``; SequenceError where it cannot be opened, or is a file.
 
     Args:
@@ -192,6 +192,6 @@ def _hint(address: str) -> str:
         there = sorted(str(path) for path in Path("/dev").glob("video*"))
         return f": there are {', '.join(there)}" if there else ": this machine shows no camera (/dev/video*)"
     if "!" in address:
-        there = cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER)
-        return "" if there else ": this OpenCV was built without GStreamer"
+        known = cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER)
+        return "" if known else ": this OpenCV was built without GStreamer"
     return "" if "://" in address or Path(address).exists() else ": there is no such file or device"

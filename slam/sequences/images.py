@@ -64,7 +64,6 @@ def decode_image(data: bytes, what: str, size: Size | None = None) -> np.ndarray
         raise SequenceError(f"{what}: at most {MOST_PIXELS} pixels are read") from None
     except _DAMAGED as error:
         raise SequenceError(f"{what}: the image is cut off or damaged: {one_line(str(error))}") from error
-    # Pillow has no colours of 16 bits, and scales the grey values of PGM.
     return _by_opencv(data, image.size, what) if unknown else _grey(image, what)
 
 
@@ -83,7 +82,7 @@ def _grey(image: Any, what: str) -> np.ndarray:
 
 
 def _by_opencv(data: bytes, size: Size, what: str) -> np.ndarray:
-    """The pixels (H, W) of an image that is whole."""
+    """The pixels (H, W) of a whole image of which Pillow scales the grey values (PGM), or has no colours of 16 bits."""
     import cv2
 
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)

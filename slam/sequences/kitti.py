@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -187,7 +188,8 @@ def _truth(
         world = drive.parent.parent / "data_poses" / drive.name / "cam0_to_world.txt"
         grey = where.cameras[0] == "00"
         if world.is_file() and grey:
-            rows = [row for row in read_rows(world, _pose_row, faults) if row and row[0] in by_number]
+            found = read_rows(world, partial(numbers, count=17, what="a frame and its pose"), faults)
+            rows = [row for row in found if row and row[0] in by_number]
             table = np.array(sorted(rows)).reshape(-1, 17)
             times = np.array([by_number[int(number)] for number in table[:, 0]])
             return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), world)
@@ -252,11 +254,6 @@ def imu_poses(records: Array) -> Array:
     north = scale * np.log(np.tan(np.radians(90 + latitude) / 2))
     position = np.stack([east, north, altitude], axis=1)
     return pose(about(yaw, 2) @ about(pitch, 1) @ about(roll, 0), position - position[0])
-
-
-def _pose_row(text: str) -> list[float]:
-    """Frame number, and the 16 numbers of a pose."""
-    return numbers(text, 17, "a frame and its pose", exactly=True)
 
 
 def _record(text: str) -> list[float]:

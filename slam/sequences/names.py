@@ -116,18 +116,15 @@ def _dates(names: Sequence[str]) -> IntArray | None:
     rest = [int(match[7] or 0) for match in found.values()]
     if rest == sorted(rest) and len({match[6] for match in found.values()}) > 1 and any(rest):
         return None  # it counts on when the second is over: no fraction
+    moments, fractions = [], []
+    for year, month, day, hour, minute, second, fraction in (found[name].groups() for name in names):
+        moments.append(f"{year}-{month}-{day}T{hour}:{minute}:{second}")
+        fractions.append(int((fraction or "0").ljust(9, "0")))
     try:
-        keys = [_date(found[name]) for name in names]
-    except ValueError:
+        keys = np.array(moments, "datetime64[ns]").astype(np.int64) + np.array(fractions)
+    except ValueError:  # no date
         return None
-    return np.array(keys, np.int64) if len(set(keys)) == len(names) else None
-
-
-def _date(match: re.Match[str]) -> int:
-    """Nanoseconds since 1970."""
-    year, month, day, hour, minute, second, fraction = match.groups()
-    time = np.datetime64(f"{year}-{month}-{day}T{hour}:{minute}:{second}", "ns").astype(np.int64)
-    return int(time) + int((fraction or "0").ljust(9, "0"))
+    return keys if len(np.unique(keys)) == len(names) else None
 
 
 def _numbers(sides: Sequence[Sequence[str]]) -> tuple[list[IntArray], bool, str] | None:

@@ -5,7 +5,6 @@ They are read by the package rosbags (``pip install 'surf-stereo-slam[ros]'``), 
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -55,11 +54,10 @@ def open_folder(path: Path, options: Given, faults: FaultLog) -> RecordedSequenc
         image = _first_image(bag, topics.left)
     left, *right = _in_time(messages, faults)
     pairs = distinct(pair_up(left, right[0] if right else None, options, faults), faults)
-    size = image.shape[1], image.shape[0]
-    rig = _rig(path, topics, size if right else halves(image, topics.left)[0].shape[::-1], options)
-    columns = [pairs.left.names, pairs.partners][: len(messages)]
-    rows = np.array([[-1 if row is None else int(row) for row in column] for column in columns]).T
-    source = RosPairs(pairs.stamps, path, messages, rows, size)
+    one = image if right else halves(image, topics.left)[0]
+    rig = _rig(path, topics, (one.shape[1], one.shape[0]), options)
+    rows = np.array([[-1 if row is None else int(row) for row in n] for n in (pairs.left.names, pairs.partners)])
+    source = RosPairs(pairs.stamps, path, messages, rows[: len(messages)].T, (image.shape[1], image.shape[0]))
     return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source)
 
 
@@ -88,7 +86,11 @@ class RosPairs:
         ]
         wanted = {place for frame in frames for place in frame}
         ahead: dict[tuple[str, int], Message] = {}  # read before their turn, where messages are out of order
-        since, counts = self._seek(wanted)
+        recorded = {m.topic: m.recorded for m in self.topics}
+        since, counts = None, dict.fromkeys(recorded, 0)  # where to begin, and each topic's first row there
+        if all((np.diff(times) >= 0).all() for times in recorded.values()):
+            since = min(int(recorded[topic][row]) for topic, row in wanted)
+            counts = {topic: int(np.searchsorted(times, since)) for topic, times in recorded.items()}
         with open_bag(self.path) as bag:
             messages = bag.messages(counts, since)
             for frame in frames:
@@ -104,14 +106,6 @@ class RosPairs:
                 if len(self.topics) == 1 and isinstance(images[0], np.ndarray):
                     images = list(halves(images[0], self.topics[0].topic))
                 yield images[0], images[1] if len(images) > 1 else None
-
-    def _seek(self, wanted: set[tuple[str, int]]) -> tuple[int | None, Counter[str]]:
-        """The time from which on to read for some messages, and each topic's first row that comes then."""
-        if any((np.diff(m.recorded) < 0).any() for m in self.topics):
-            return None, Counter({m.topic: 0 for m in self.topics})
-        recorded = {m.topic: m.recorded for m in self.topics}
-        since = min(int(recorded[topic][row]) for topic, row in wanted)
-        return since, Counter({topic: int(np.searchsorted(times, since)) for topic, times in recorded.items()})
 
     def _image(self, bag: Bag, message: Message, place: tuple[str, int]) -> np.ndarray | SequenceError:
         try:

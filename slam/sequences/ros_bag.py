@@ -145,22 +145,15 @@ def open_bag(path: Path) -> Iterator[Bag]:
         raise SequenceError(f"{path}: {line}") from None
     with naming_recording(path), ExitStack() as stack:
         if path.name.lower().endswith(".zstd"):
-            path = _unpacked(path, Path(stack.enter_context(TemporaryDirectory())))
+            from backports import zstd  # by which rosbags decompresses, too
+
+            target = Path(stack.enter_context(TemporaryDirectory())) / path.stem
+            with zstd.open(path, "rb") as packed, target.open("wb") as file:
+                shutil.copyfileobj(packed, file)
+            path = target
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         stack.enter_context(reader)
         yield Bag(path, reader)
-
-
-def _unpacked(path: Path, folder: Path) -> Path:
-    """A compressed file, decompressed into a folder, by what rosbags does it with."""
-    try:
-        from compression import zstd  # type: ignore[import-not-found, unused-ignore]
-    except ImportError:
-        from backports import zstd
-    target = folder / path.stem
-    with zstd.open(path, "rb") as packed, target.open("wb") as file:
-        shutil.copyfileobj(packed, file)
-    return target
 
 
 _INFO = "sensor_msgs/msg/CameraInfo"

@@ -84,14 +84,13 @@ def date_time(text: str) -> int:
         raise ValueError(f"{shorten(text)} is not a date and time") from None
 
 
-def numbers(text: str, count: int, what: str, separator: str | None = None, exactly: bool = False) -> list[float]:
-    """The first finite numbers of a row, so many; `what` it should be is said where it is not, or not `exactly`."""
-    words = text.split(separator)
+def numbers(text: str, count: int, what: str) -> list[float]:
+    """The first finite numbers of a row, so many; `what` it should be is said where it is not."""
     try:
-        row = [float(word) for word in words[:count]]
+        row = [float(word) for word in text.split()[:count]]
     except ValueError:
         raise ValueError(f"{shorten(text)} is not a row of numbers") from None
-    if len(row) < count or not np.isfinite(row).all() or (exactly and len(words) > count):
+    if len(row) < count or not np.isfinite(row).all():
         raise ValueError(f"{shorten(text)} is not {what}")
     return row
 

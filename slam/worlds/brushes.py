@@ -38,6 +38,14 @@ def tinted(light: np.ndarray, colour: Colour) -> np.ndarray:
     return np.asarray(cv2.merge([cv2.convertScaleAbs(light, alpha=float(c)) for c in colour]))
 
 
+def mottled(size: Size, rng: Rng, density: float, colour: Colour, *spots: tuple[float, float, int]) -> np.ndarray:
+    """A colour under uneven light: of each sort of `spots` how strong, how wide at most [m], and how many octaves."""
+    light: np.ndarray | int = 1
+    for strength, wide, octaves in spots:
+        light = light + strength * clouds(size, rng, wide * density, octaves)
+    return tinted(np.asarray(light), colour)
+
+
 def wood(size: Size, rng: Rng, density: float, colour: Colour = (105.0, 150.0, 190.0)) -> np.ndarray:
     """Wood with its grain along the rows, `density` texels per metre."""
     fine = grain(size, rng, (0.08 * density, 0.0022 * density))

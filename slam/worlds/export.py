@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ OBJECT_COLUMNS = (
     "stamp", "id", "x", "y", "z", "roll", "pitch", "yaw",
     "motion_x", "motion_y", "motion_z", "motion_roll", "motion_pitch", "motion_yaw",
 )  # fmt: skip
+LANDMARK_COLUMNS = ("id", "x", "y", "z", "object", "size")
 
 
 def write_euroc(
@@ -85,8 +86,19 @@ def _write_tables(sequence: WorldSequence, root: Path, frames: range) -> None:
     (root / "state_groundtruth_estimate0").mkdir()
     path = Trajectory(truth.stamps[list(frames)], truth.poses[list(frames)])
     path.write_euroc(root / "state_groundtruth_estimate0" / "data.csv")
-    _write_table(root / "objects.csv", OBJECT_COLUMNS, _object_rows(sequence, frames))
-    _write_table(root / "landmarks.csv", ("id", "x", "y", "z", "object", "size"), _landmark_rows(sequence, frames[0]))
+    objects, marks, landmarks = [], [], sequence.landmarks
+    for k in frames:
+        now, before = sequence.objects(k), sequence.objects(max(k - 1, frames[0]))
+        for i, T, T_before in zip(now.ids, now.T_world_object, before.T_world_object):
+            motion = T @ inverse(T_before)
+            values = (*T[:3, 3], *angles(T[:3, :3]), *motion[:3, 3], *angles(motion[:3, :3]))
+            objects.append([f"{sequence.stamps[k]:.9f}", str(int(i)), *(f"{v:.9g}" for v in values)])
+    places = landmarks.world_positions(sequence.world.T_world_body(sequence.source(frames[0])))
+    for i, (place, body, size) in enumerate(zip(places, landmarks.object, landmarks.size)):
+        marks.append([str(i), *(f"{x:.9g}" for x in place), str(int(body)), f"{size:.6g}"])
+    for name, columns, rows in (("objects", OBJECT_COLUMNS, objects), ("landmarks", LANDMARK_COLUMNS, marks)):
+        with (root / f"{name}.csv").open("w", encoding="ascii", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([columns, *rows])
     (root / "world.txt").write_text(f"synthetic:{sequence.name}\n", encoding="utf-8")
 
 
@@ -106,10 +118,8 @@ def _write_images(
             images, nanoseconds = [frame.left, frame.right], round(frame.stamp * 1e9)
             if truth_images:
                 depth = np.rint(sequence.depth(k) * steps)
-                images += [
-                    np.where(depth < 65536, depth, 0).astype(np.uint16),
-                    sequence.object_ids(k).astype(np.uint16),
-                ]
+                images.append(np.where(depth < 65536, depth, 0).astype(np.uint16))
+                images.append(sequence.object_ids(k).astype(np.uint16))
             for name, table, image in zip(names, tables, images):
                 if image is not None:
                     write_png(root / name / "data" / f"{nanoseconds}.png", image)
@@ -132,27 +142,3 @@ def _camera_node(camera: PinholeCamera, T_body_camera: Array, rate: float) -> di
         "distortion_model": "equidistant" if camera.model == "equidistant" else "radial-tangential",
         "distortion_coefficients": [float(x) for x in camera.distortion or (0.0, 0.0, 0.0, 0.0)],
     }
-
-
-def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file."""
-    with path.open("w", encoding="ascii", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
-
-
-def _object_rows(sequence: WorldSequence, frames: range) -> Iterable[list[str]]:
-    """Stamp, id, pose and motion of every object in every frame."""
-    for k in frames:
-        now, before = sequence.objects(k), sequence.objects(max(k - 1, frames[0]))
-        for i, T, T_before in zip(now.ids, now.T_world_object, before.T_world_object):
-            motion = T @ inverse(T_before)
-            values = (*T[:3, 3], *angles(T[:3, :3]), *motion[:3, 3], *angles(motion[:3, :3]))
-            yield [f"{sequence.stamps[k]:.9f}", str(int(i)), *(f"{v:.9g}" for v in values)]
-
-
-def _landmark_rows(sequence: WorldSequence, frame: int) -> Iterable[list[str]]:
-    """Id, place in the world, object and size of every landmark."""
-    landmarks = sequence.landmarks
-    places = landmarks.world_positions(sequence.world.T_world_body(sequence.source(frame)))
-    for i, (place, body, size) in enumerate(zip(places, landmarks.object, landmarks.size)):
-        yield [str(i), *(f"{x:.9g}" for x in place), str(int(body)), f"{size:.6g}"]

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.books import Shelves
 from slam.worlds.geometry import BACK, DOWN, FACES, FORWARD, LEFT, RIGHT, Parts, Rectangle, crate, cuboid, rectangle
 from slam.worlds.paths import camera_poses, carried, clock, placed, sway, through, watching, yaw_pitch_roll
-from slam.worlds.surfaces import Material, Signs
+from slam.worlds.surfaces import Material, Shelves, Signs
 
 
 def carton(size: Array, lowest: Array, body: int, seed: int) -> list[Rectangle]:

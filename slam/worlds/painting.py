@@ -10,15 +10,23 @@ import numpy as np
 
 from slam.errors import UnknownNameError
 from slam.worlds import streetside
-from slam.worlds.books import Bay
-from slam.worlds.brushes import Box, Colour, Page, Rng, Size, clouds, grain, tinted, wood, words
+from slam.worlds.brushes import Box, Colour, Page, Rng, Size, clouds, grain, mottled, tinted, wood, words
 from slam.worlds.geometry import Texture
 from slam.worlds.shelves import paint_bay
 from slam.worlds.streetside import paint_facade
-from slam.worlds.surfaces import Facade, Material, Signs
+from slam.worlds.surfaces import Bay, Facade, Material, Signs
 
 _INKS = ((25, 30, 40), (235, 240, 240), (40, 40, 170), (150, 70, 30))
 _DARK = (30.0, 30.0, 40.0)
+
+
+def _even(colour: Colour, *spots: tuple[float, float, int]) -> Callable[[Size, Rng, float], np.ndarray]:
+    """A painter of a surface with nothing on it, see `slam.worlds.brushes.mottled`."""
+    return lambda size, rng, density: mottled(size, rng, density, colour, *spots)
+
+
+_BOARD = _even((205.0, 212.0, 215.0), (0.01, 0.2, 3))
+_PLASTER = _even((200.0, 212.0, 218.0), (0.012, 0.6, 3), (0.006, 0.01, 2))  # nearly nothing to see
 
 
 def paint(texture: Texture, density: float) -> np.ndarray:
@@ -62,7 +70,7 @@ def _sheet(page: Page, box: Box) -> None:
 
 def _pinboard(size: Size, rng: Rng, density: float) -> np.ndarray:
     """A cork board with papers pinned to it."""
-    page = Page(tinted(1 + 0.12 * clouds(size, rng, 0.006 * density, 2), (95.0, 135.0, 170.0)), rng)
+    page = Page(mottled(size, rng, density, (95.0, 135.0, 170.0), (0.12, 0.006, 2)), rng)
     height, width = size
     x = 0.04 * density
     while x < width - 0.25 * density:
@@ -154,7 +162,7 @@ def _paper(size: Size, rng: Rng, density: float) -> np.ndarray:
 def _poster(size: Size, rng: Rng, density: float) -> np.ndarray:
     """A poster: heading, shapes, print."""
     ground = rng.uniform(120, 240, 3)
-    page = Page(tinted(1 + 0.02 * clouds(size, rng, 0.1 * density), ground), rng)
+    page = Page(mottled(size, rng, density, ground, (0.02, 0.1, 3)), rng)
     page.title(7, page.part(0.08, 0.04, 0.84, 0.14), _DARK)
     for _ in range(9):
         x, y = rng.uniform(0.15, 0.85) * page.width, rng.uniform(0.27, 0.6) * page.height
@@ -168,26 +176,9 @@ def _poster(size: Size, rng: Rng, density: float) -> np.ndarray:
     return page.picture
 
 
-def _board(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A white board."""
-    return tinted(1 + 0.01 * clouds(size, rng, 0.2 * density), (205.0, 212.0, 215.0))
-
-
-def _plaster(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A painted wall: nearly nothing to see."""
-    light = 1 + 0.012 * clouds(size, rng, 0.6 * density) + 0.006 * clouds(size, rng, 0.01 * density, 2)
-    return tinted(light, (200.0, 212.0, 218.0))
-
-
-def _carpet(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A carpet of short loops."""
-    light = 1 + 0.10 * clouds(size, rng, 0.008 * density, 2) + 0.05 * clouds(size, rng, 0.15 * density)
-    return tinted(light, (105.0, 85.0, 75.0))
-
-
 def _ceiling(size: Size, rng: Rng, density: float) -> np.ndarray:
     """Ceiling panels with lamps."""
-    page = Page(tinted(1 + 0.01 * clouds(size, rng, 0.05 * density), (205.0, 210.0, 212.0)), rng)
+    page = Page(mottled(size, rng, density, (205.0, 210.0, 212.0), (0.01, 0.05, 3)), rng)
     step, joint = 0.6 * density, 0.012 * density
     for x in np.arange(0, page.width, step):
         page.bar((x - joint / 2, 0, joint, page.height), (150.0, 155.0, 158.0))
@@ -200,7 +191,7 @@ def _ceiling(size: Size, rng: Rng, density: float) -> np.ndarray:
 
 def _door_wall(size: Size, rng: Rng, density: float) -> np.ndarray:
     """A wall with a door and notices."""
-    page = Page(_plaster(size, rng, density), rng)
+    page = Page(_PLASTER(size, rng, density), rng)
     height, width = size
     wide, high = 0.9 * density, 2.05 * density
     left = (width - wide) / 2
@@ -235,7 +226,8 @@ def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
 def _paint_signs(board: Signs, density: float) -> np.ndarray:
     """A white board with signs: discs and squares with a pattern of their own around and on them."""
     rng = np.random.default_rng([board.seed, 65])
-    page = Page(_board((round(board.height * density), round(board.width * density)), rng, density), rng)
+    size = round(board.height * density), round(board.width * density)
+    page = Page(_BOARD(size, rng, density), rng)
     for x, y, diameter in board.marks() * density:
         dark = rng.random() < 0.7
         ground, ink = ((215.0,) * 3, (30.0,) * 3) if dark else ((45.0,) * 3, (225.0,) * 3)
@@ -279,12 +271,12 @@ class Recipe(NamedTuple):
 
 
 RECIPES = {
-    "plaster": Recipe(_plaster, _fleck, 0.25),
-    "carpet": Recipe(_carpet, _fleck, 0.5),
+    "plaster": Recipe(_PLASTER, _fleck, 0.25),
+    "carpet": Recipe(_even((105.0, 85.0, 75.0), (0.10, 0.008, 2), (0.05, 0.15, 3)), _fleck, 0.5),
     "ceiling": Recipe(_ceiling, None, 0.5),
     "door_wall": Recipe(_door_wall, _fleck),
     "carton": Recipe(_carton, _print),
-    "board": Recipe(_board, _print),
+    "board": Recipe(_BOARD, _print),
     "wood": Recipe(wood, _fleck),
     "pinboard": Recipe(_pinboard),
     "cover": Recipe(_cover, _print),

@@ -17,8 +17,7 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, exp, inverse, log
 from slam.worlds.faults import Faults, in_hand
 from slam.worlds.painting import paint
-from slam.worlds.placing import NEAR, View, place
-from slam.worlds.raster import Ripmap, draw
+from slam.worlds.raster import NEAR, Ripmap, View, draw, place
 from slam.worlds.world import World
 
 _PAINTED = 1500  # textures that are kept

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from slam.worlds.books import BOARD, ROW, UPRIGHT, Bay, books_of
 from slam.worlds.brushes import Colour, Page, Rng, clouds, tinted, wood, words
+from slam.worlds.surfaces import BOARD, ROW, UPRIGHT, Bay, books_of
 
 _WOOD = (110.0, 150.0, 190.0)
 _BLACK, _CONTRAST = 14, 1.25  # so that a detector finds about as many features as in photographs of shelves

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from slam.worlds.brushes import Box, Colour, Page, Rng, Size, clouds, tinted
+from slam.worlds.brushes import Box, Colour, Page, Rng, Size, clouds, mottled, tinted
 from slam.worlds.surfaces import Facade
 
 _WALLS = ((150, 190, 215), (120, 140, 185), (190, 205, 215), (110, 120, 150), (160, 175, 180), (120, 165, 200))
@@ -152,8 +152,7 @@ END_PANES = (
 
 def field(size: Size, rng: Rng, density: float) -> np.ndarray:
     """A robots' playing field: green carpet with white lines."""
-    light = 1 + 0.09 * clouds(size, rng, 0.012 * density, 2) + 0.05 * clouds(size, rng, 0.3 * density)
-    page = Page(tinted(light, (60.0, 125.0, 55.0)), rng)
+    page = Page(mottled(size, rng, density, (60.0, 125.0, 55.0), (0.09, 0.012, 2), (0.05, 0.3, 3)), rng)
     (height, width), line, edge = size, 0.05 * density, 0.35 * density
     for box in (
         (edge, edge, width - 2 * edge, line),

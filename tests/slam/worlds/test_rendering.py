@@ -7,7 +7,7 @@ import pytest
 from slam.worlds import open_world
 from slam.worlds.geometry import RectangleArrays, rectangle
 from slam.worlds.observe import visible_landmarks
-from slam.worlds.placing import View, place, shown
+from slam.worlds.raster import View, place, shown
 from slam.worlds.surfaces import Material
 
 
