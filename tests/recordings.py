@@ -9,6 +9,9 @@ import numpy as np
 
 WIDTH, HEIGHT = 64, 48
 
+#: The calibration of a rectified rig.
+FIVE = "fx: 50\nfy: 50\ncx: 31.5\ncy: 23.5\nbaseline: 0.2\n"
+
 SENSOR = """%YAML:1.0
 sensor_type: camera
 T_BS:
@@ -31,6 +34,21 @@ def picture(seed: int, width: int = WIDTH, height: int = HEIGHT, depth: type = n
     """A picture that is told from others by its mean."""
     noise = np.random.default_rng(seed).integers(0, 4, (height, width))
     return (10 * (seed + 1) + noise).astype(depth)
+
+
+def seeds(sequence) -> list[tuple[int | None, int | None]]:
+    """Which pictures the frames show: the seeds that `picture` drew left and right with."""
+
+    def seed(image: np.ndarray | None) -> int | None:
+        return None if image is None else round((float(image.mean()) - 1.5) / 10) - 1
+
+    return [(seed(f.left), seed(f.right)) for f in sequence]
+
+
+def rename(folder: Path, name) -> None:
+    """Give the files of a folder other names, by their numbers in order."""
+    for i, path in enumerate(sorted(folder.iterdir())):
+        path.rename(folder / name(i))
 
 
 def write_image(path: Path, seed: int, width: int = WIDTH, height: int = HEIGHT, depth: type = np.uint8) -> None:

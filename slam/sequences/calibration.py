@@ -23,6 +23,10 @@ from slam.sequences.images import Size, size_text
 #: What making an array of numbers raises where the values are none: text, ragged lists, numbers of 400 digits.
 NO_NUMBERS = (ValueError, TypeError, OverflowError)
 
+_ZED_SIZES = {"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200), "HD": (1280, 720), "SVGA": (960, 600),
+              "VGA": (672, 376)}  # fmt: skip
+_KITTI = re.compile(r"^(P|P_rect_0)0[: ]", re.MULTILINE)
+_DEEPEST = 32  # of nested entries
 _MOST = 1e9  # numbers of a calibration are smaller than this; larger ones overflow in what is made of them
 _LIMIT = 4 * 2**20  # most bytes of a file: OpenCV's sample programs keep all corners of all images in it
 
@@ -106,12 +110,6 @@ def projection_offset(P: Array) -> Array:
     if not (K[0, 0] > 0 and K[1, 1] > 0) or K[2, 2] != 1 or zeros > 0:
         raise CalibrationError(f"not a rectified projection matrix: {P.tolist()}")
     return np.asarray(np.linalg.solve(K, P[:, 3]), np.float64)
-
-
-_ZED_SIZES = {"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200), "HD": (1280, 720), "SVGA": (960, 600),
-              "VGA": (672, 376)}  # fmt: skip
-_KITTI = re.compile(r"^(P|P_rect_0)0[: ]", re.MULTILINE)
-_DEEPEST = 32  # of nested entries
 
 
 def read_form(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:

@@ -22,6 +22,7 @@ from slam.sequences.images import MOST_PIXELS, Size, halves, require_same_size
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
 
+_TIMEOUT = 5000  # [ms] for an answer from the network
 _MOST_FRAMES = 10_000_000  # of a video, four days of it: what a header says may be anything
 
 
@@ -110,9 +111,6 @@ def _describe(path: Path) -> tuple[int, float, np.ndarray]:
                 while count < _MOST_FRAMES and video.grab():
                     count += 1
     return count, rate, first
-
-
-_TIMEOUT = 5000  # [ms] for an answer from the network
 
 
 @contextmanager

@@ -32,6 +32,8 @@ OXTS_NOISE = TruthNoise(rotation=float(np.radians(0.03)), translation=0.02, moun
 #: Synchronised drives have one of a hundred OXTS records a second for each frame, the nearest one [s].
 _OXTS_TIME = 0.01 / np.sqrt(12)
 
+_EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
+_OXTS = "latitude, longitude, altitude, roll, pitch, yaw"
 _PAIRS = (("0", "1"), ("2", "3"))  # grey first, colour where there is no grey
 
 
@@ -167,10 +169,6 @@ def _require_rectified(rows: dict[str, Array], size: Size, camera: str) -> None:
         if tuple(rows.get(f"S_{camera}", ())) == size:
             text += ": this is an unrectified (extract) drive, take the rectified (sync) one"
         raise CalibrationError(text)
-
-
-_EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
-_OXTS = "latitude, longitude, altitude, roll, pitch, yaw"
 
 
 def _truth(

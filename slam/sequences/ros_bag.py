@@ -24,6 +24,10 @@ from slam.sequences.names import SIDES
 
 #: Types of messages that hold an image.
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_INFO = "sensor_msgs/msg/CameraInfo"
+_IMAGES = (RAW, COMPRESSED)
+_SAME_PLACE = 1e-6  # [m] from a pair's left camera
+_LISTED = 12  # topics named in a message
 
 #: Encodings of depth images, in ROS's convention (REP 118): no picture of a camera.
 DEPTH = frozenset({"16UC1", "32FC1"})
@@ -154,12 +158,6 @@ def open_bag(path: Path) -> Iterator[Bag]:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         stack.enter_context(reader)
         yield Bag(path, reader)
-
-
-_INFO = "sensor_msgs/msg/CameraInfo"
-_IMAGES = (RAW, COMPRESSED)
-_SAME_PLACE = 1e-6  # [m] from a pair's left camera
-_LISTED = 12  # topics named in a message
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,11 @@ _MARGIN = 2.0  # no feature so near to the image's border [px]
 _SMALLEST = 9.0  # no feature is smaller: SURF's first filter [px]
 _KEPT = 20_000  # frames whose visible landmarks are kept; fewer in a world of many landmarks
 _USUAL = 2000  # landmarks of a world that is small enough for that
+_VISIT = 60.0  # landmarks that change do so after as long a time [s]
+_POOL = 4096  # errors of descriptors that are drawn beforehand
+_COMMON = 1.2  # what all descriptors have in common, over what is each one's own
+_DIRECTIONS = 6.0  # each further direction of descriptors that drift varies less, by 1 / e over so many
+_DRIFTING = 0.6  # share of the variance of descriptors that changes with the direction of view
 _FALSE = -1
 
 
@@ -211,13 +216,6 @@ def _inside(rig: StereoRig, uv: Array) -> BoolArray:
     """Which pixels (N, 2) lie in an image; NaN does not."""
     x, y = uv[:, 0], uv[:, 1]
     return (x >= 0) & (y >= 0) & (x <= rig.width - 1) & (y <= rig.height - 1)
-
-
-_VISIT = 60.0  # landmarks that change do so after as long a time [s]
-_POOL = 4096  # errors of descriptors that are drawn beforehand
-_COMMON = 1.2  # what all descriptors have in common, over what is each one's own
-_DIRECTIONS = 6.0  # each further direction of descriptors that drift varies less, by 1 / e over so many
-_DRIFTING = 0.6  # share of the variance of descriptors that changes with the direction of view
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,8 @@ import numpy as np
 from slam.geometry.se3 import Array
 from slam.worlds.geometry import RectangleArrays
 
+NEAR = 0.02  #: what is nearer than this is not drawn [m]
+_REACH = 1e-4  # rectangles reach over their edges by this share, so that no sample falls between two that meet
 _BLOCK = 160  # usual largest side of a block [samples]
 _SMALLEST = 32  # no block is made smaller than this because the distance changes [samples]
 _OVERLAP = 16  # width of the passage from one block to the next [samples]
@@ -179,10 +181,6 @@ def _to_texels(Q: Array, boxes: np.ndarray, shapes: np.ndarray) -> Array:
     return M
 
 
-NEAR = 0.02  #: what is nearer than this is not drawn [m]
-_OVERLAP = 1e-4  # rectangles reach over their edges by this share, so that no sample falls between two that meet
-
-
 class View(NamedTuple):
     """An undistorted view to draw: camera matrix (3, 3) in samples, and size in samples."""
 
@@ -275,7 +273,7 @@ def _corners_before(H: Array) -> Array:
 def _covered(Q: Array, rows: np.ndarray, start: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     """First and last sample covered in each row of each rectangle (sum of rows,) int16; last < first where none."""
     s, t, n = Q[:, 0], Q[:, 1], Q[:, 2]
-    edges = np.stack([s, n - s, t, n - t], axis=0) + _OVERLAP * n
+    edges = np.stack([s, n - s, t, n - t], axis=0) + _REACH * n
     a, b, c = np.moveaxis(edges, 2, 0)  # inside, a·x + b·y + c ≥ 0 for all four
     a = np.where(a == 0, 1e-300, a)
     begins = a > 0

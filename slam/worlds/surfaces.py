@@ -9,6 +9,11 @@ import numpy as np
 
 from slam.geometry.se3 import Array
 
+BAY = 0.9  #: width of a bay of shelves [m]
+UPRIGHT = 0.03  #: thickness of the uprights between bays [m]
+BOARD = 0.025  #: thickness of the boards [m]
+ROW = 0.34  #: height from board to board [m]
+
 
 @dataclass(frozen=True)
 class Material:
@@ -74,12 +79,6 @@ class Signs:
         place = np.stack([x.ravel() * self.width, y.ravel() * self.height], axis=1)
         place += rng.uniform(-0.015, 0.015, place.shape)
         return np.column_stack([place, rng.uniform(0.03, 0.05, len(place))])
-
-
-BAY = 0.9  #: width of a bay of shelves [m]
-UPRIGHT = 0.03  #: thickness of the uprights between bays [m]
-BOARD = 0.025  #: thickness of the boards [m]
-ROW = 0.34  #: height from board to board [m]
 
 
 @dataclass(frozen=True)

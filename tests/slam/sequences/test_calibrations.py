@@ -44,18 +44,15 @@ def test_the_rig_projects_as_opencv_does(two_folders: Path, build: SimpleNamespa
     assert np.allclose(right, expected_right, atol=1e-9)
 
 
-# ------------------------------------------------------------------------------------------------ OpenCV's
-
-
 def test_opencv_s_entries_by_all_their_names(tmp_path: Path, build: SimpleNamespace) -> None:
     """OpenCV's sample writes M1, D1, M2, D2 to intrinsics.yml and R, T to extrinsics.yml."""
     e = build.stereo_entries()
     build.write_storage(tmp_path / "all.xml", e)
     build.write_storage(tmp_path / "intrinsics.yml", {"M1": e["K1"], "D1": e["D1"], "M2": e["K2"], "D2": e["D2"]})
     build.write_storage(tmp_path / "extrinsics.yml", {"R": e["R"], "T": e["T"], "Q": np.eye(4)})
-    words = {"camera_matrix_left": e["K1"], "dist_coeffs_left": e["D1"], "camera_matrix_right": e["K2"]}
-    words |= {"dist_coeffs_right": e["D2"], "R": cv2.Rodrigues(e["R"])[0], "T": e["T"] * 1000}
-    build.write_storage(tmp_path / "words.json", words)
+    words = {f"camera_matrix_{side}": e[f"K{i}"] for i, side in ((1, "left"), (2, "right"))}
+    words |= {f"dist_coeffs_{side}": e[f"D{i}"] for i, side in ((1, "left"), (2, "right"))}
+    build.write_storage(tmp_path / "words.json", words | {"R": cv2.Rodrigues(e["R"])[0], "T": e["T"] * 1000})
     rig = slam.StereoRig.from_pinhole(e["K1"], e["K2"], D_left=e["D1"], D_right=e["D2"], R=e["R"], T=e["T"], size=SIZE)
     assert same(slam.load_rig(tmp_path / "all.xml", size=SIZE), rig)
     assert same(slam.load_rig(tmp_path / "intrinsics.yml", tmp_path / "extrinsics.yml", size=SIZE), rig)
@@ -64,12 +61,11 @@ def test_opencv_s_entries_by_all_their_names(tmp_path: Path, build: SimpleNamesp
 
 def test_rectified_images_take_the_projection_matrices(tmp_path: Path, build: SimpleNamespace) -> None:
     e = build.stereo_entries()
-    T = np.array(e["T"])
-    R1, R2, P1, P2 = cv2.stereoRectify(np.array(e["K1"]), e["D1"], e["K2"], e["D2"], SIZE, e["R"], T)[:4]
+    R1, R2, P1, P2 = cv2.stereoRectify(e["K1"], e["D1"], e["K2"], e["D2"], SIZE, e["R"], e["T"])[:4]
     build.write_storage(tmp_path / "a.yml", {**e, "R1": R1, "R2": R2, "P1": P1, "P2": P2})
     build.write_storage(tmp_path / "p.yml", {"P1": P1, "P2": P2})
     rig = slam.load_rig(tmp_path / "a.yml", size=SIZE, rectified=True)
-    assert rig.is_rectified and rig.baseline == pytest.approx(np.linalg.norm(T), rel=1e-9)
+    assert rig.is_rectified and rig.baseline == pytest.approx(np.linalg.norm(e["T"]), rel=1e-9)
     assert same(slam.load_rig(tmp_path / "p.yml", size=SIZE), rig)
     assert not slam.load_rig(tmp_path / "a.yml", size=SIZE).is_rectified
 
@@ -81,11 +77,10 @@ def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNames
     points = np.array([[[0.1, -0.2, 2.0], [0.5, 0.3, 1.0]]])
     expected = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), e["K1"], e["D1"])[0][0]
     assert np.allclose(slam.load_rig(file, size=SIZE, fisheye=True).left.project(points[0]), expected, atol=1e-9)
-    assert slam.load_rig(file, size=SIZE).left.model == "radtan"
-    for count, kept in ((0, 0), (4, 4), (5, 5), (8, 8), (12, 8), (14, 8)):
-        D = np.zeros((1, max(count, 1)))
+    for count, kept in ((4, 4), (5, 5), (8, 8), (14, 8)):
+        D = np.zeros((1, count))
         D[0, : min(count, 8)] = 0.01
-        build.write_storage(file, e | {"D1": D, "D2": D} if count else {k: v for k, v in e.items() if k[0] != "D"})
+        build.write_storage(file, e | {"D1": D, "D2": D})
         assert len(slam.load_rig(file, size=SIZE).left.distortion) == kept
     D[0, 9] = 0.1
     build.write_storage(file, {**e, "D1": D})
@@ -114,25 +109,17 @@ def test_faulty_entries(tmp_path: Path, build: SimpleNamespace, change: dict, te
     assert str(tmp_path / "a.yml") in str(error.value)
 
 
-def test_a_rectified_pair_by_five_numbers(tmp_path: Path) -> None:
+def test_a_rectified_pair_by_five_numbers_and_all_that_is_wrong_with_them(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     file.write_text("fx: 500\nfy: 501\ncx: 31.5\ncy: 23.5\nbaseline: 120.0\n")
     rig = slam.load_rig(file, size=SIZE, unit="mm")
     assert (rig.left.fu, rig.left.fv, rig.left.u0, rig.left.v0) == (500, 501, 31.5, 23.5)
-    assert rig.left == rig.right
-    assert np.allclose(rig.b, [-0.12, 0, 0])
-
-
-def test_all_that_is_wrong_with_five_numbers_is_said_at_once(tmp_path: Path) -> None:
-    file = tmp_path / "calibration.yaml"
-    file.write_text("fx: 500\ncx: wide\ncy: .inf\nbaseline: -0.12\n")
+    assert rig.left == rig.right and np.allclose(rig.b, [-0.12, 0, 0])
+    file.write_text("fx: true\ncx: wide\ncy: .inf\nbaseline: -0.12\n")
     with pytest.raises(CalibrationError) as error:
         slam.load_rig(file, size=SIZE)
-    for part in ("fy is missing", "cx is no number", "cy is not finite", "baseline is -0.12, which must be positive"):
+    for part in ("fx is no number", "fy is missing", "cx is no number", "cy is not finite", "baseline is -0.12, which"):
         assert part in str(error.value)
-    file.write_text("fx: 500\nfy: 500\ncx: true\ncy: 24\nbaseline: 0.12\n")
-    with pytest.raises(CalibrationError, match="cx is no number"):
-        slam.load_rig(file, size=SIZE)
 
 
 CAMCHAIN = """cam0:
@@ -178,12 +165,8 @@ def test_kalibr(two_folders: Path) -> None:
         ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),
         ("cam1:", "cam7:", "K2, R, T are missing (it looks like Kalibr's)"),
-        ("T_cn_cnm1:", "T_cm_cnm1:", "R, T are missing"),
         ("[0.0, 0.0, 1.0, 0.002]", "[0.0, 0.0, 2.0, 0.002]", "T_cn_cnm1 is not a rigid motion"),
-        ("[0.0, 0.0, 1.0, 0.002]", "[0.0, 0.0, 1.0]", "cam1/T_cn_cnm1 is no matrix of shape (4, 4)"),
         ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "intrinsics is no matrix of shape (3, 3)"),
-        ("intrinsics: [50.0", "intrinsics: [.nan", "intrinsics is not finite"),
-        ("intrinsics: [50.0", "intrinsics: [-50.0", "focal lengths must be positive"),
         ("2e-4, 1e-5]", "2e-4]", "takes 4 coefficients or more, got 3"),
         ("resolution: [64, 48]", "resolution: [64]", "resolution is no matrix of shape (2,)"),
         ("cam0:", "cam0: [", "no valid YAML"),
@@ -199,9 +182,6 @@ def test_faulty_kalibr_files(two_folders: Path, old: str, new: str, text: str) -
     assert text in str(error.value)
     assert str(chain) in str(error.value)
     assert "\n" not in str(error.value)
-
-
-# ------------------------------------------------------------------------------------------------ other programs'
 
 
 def camera_yaml(tx: float, D: str = "0.1, 0, 0, 0, 0") -> str:
@@ -361,23 +341,15 @@ def test_what_is_no_calibration_is_one_line(tmp_path: Path, two_folders: Path, k
     for file in (two_folders / "calibration.yaml", kitti / "calib.txt"):
         with pytest.raises(CalibrationError, match=rf"{file.name}: names no image size: give size=\(width, height\)"):
             slam.load_rig(file)
+    camera = "T_BS: [1,0,0,{x}, 0,1,0,0, 0,0,1,0, 0,0,0,1]\nresolution: [64, 48]\nintrinsics: [50, 50, 31, 23]\n"
+    for name, x in (("a", 0.0), ("b", 0.1)):
+        (tmp_path / f"{name}.yaml").write_text(camera.format(x=x))
     with pytest.raises(SequenceError, match=r"images are 32x24, but .* is for 64x48"):
-        load_euroc_as(tmp_path, (32, 24))
+        slam.load_rig(tmp_path / "a.yaml", tmp_path / "b.yaml", size=(32, 24))
     with pytest.raises(ConfigurationError, match="unit must be one of m, cm, mm"):
         slam.load_rig(two_folders, size=(64, 48), unit="inch")
     with pytest.raises(CalibrationError, match="no calibration is named"):
         slam.load_rig()
-
-
-def test_two_equal_cameras_side_by_side() -> None:
-    rig = slam.StereoRig.from_pinhole(K.tolist(), baseline=0.12, size=(64, 48), D_left=[0.1, 0, 0, 0])
-    assert rig.left == rig.right
-    assert rig.left.model == "radtan"
-    assert np.array_equal(rig.b, [-0.12, 0, 0])
-    fisheye = slam.StereoRig.from_pinhole(K, baseline=0.12, size=(64, 48), D_left=[0.1, 0, 0, 0], fisheye=True)
-    points = np.array([[0.3, -0.2, 1.0]])
-    pixel = cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), K, np.array([0.1, 0, 0, 0]))[0][0]
-    assert np.allclose(fisheye.left.project(points), pixel)
 
 
 @pytest.mark.parametrize(
@@ -398,11 +370,3 @@ def test_two_equal_cameras_side_by_side() -> None:
 def test_impossible_rigs_are_refused(change: dict, words: str) -> None:
     with pytest.raises(CalibrationError, match=words):
         slam.StereoRig.from_pinhole(**{"K_left": K, "baseline": 0.1, "size": (64, 48), **change})
-
-
-def load_euroc_as(folder: Path, size: tuple[int, int]) -> None:
-    camera = "T_BS: [1,0,0,{x}, 0,1,0,0, 0,0,1,0, 0,0,0,1]\nresolution: [64, 48]\nintrinsics: [50, 50, 31, 23]\n"
-    files = [folder / name for name in ("a.yaml", "b.yaml")]
-    for file, x in zip(files, (0.0, 0.1)):
-        file.write_text(camera.format(x=x))
-    slam.load_rig(*files, size=size)

@@ -1,4 +1,4 @@
-"""Two folders or two videos, with OpenCV's and Kalibr's calibrations."""
+"""Two folders or videos and what people bring: names of images, layouts, tolerances, masks, rigs of any stand."""
 
 from __future__ import annotations
 
@@ -11,33 +11,111 @@ import cv2
 import numpy as np
 import pytest
 
+import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
-from slam.sequences import open_sequence
+from slam.input.features import outside_masks
+from slam.sequences import open_sequence, with_mask
 from slam.sequences.faults import said_before
+from slam.sequences.names import keys_of, of_sides
+from tests.recordings import FIVE, rename, seeds
 
-SIZE = (64, 48)
+PAIRS = [(i, i + 10) for i in range(6)]
+
+NAMES = {  # of the left and the right images, and the stamps that they say; plain numbers count frames at 10 Hz
+    "nanoseconds": ("{}", "{}", lambda i: 1_403_715_273_000_000_000 + i * 50_000_000, 1_403_715_273, 0.05),
+    "microseconds": ("{}", "{}", lambda i: 1_403_715_273_000_000 + i * 50_000, 1_403_715_273, 0.05),
+    "milliseconds": ("{}", "{}", lambda i: 1_403_715_273_000 + i * 50, 1_403_715_273, 0.05),
+    "since a start": ("{}", "{}", lambda i: 2_000_000_000 * (i + 1), 2.0, 2.0),
+    "seconds": ("1403715273.{:02d}", "1403715273.{:02d}", lambda i: 5 * i, 1_403_715_273, 0.05),
+    "seconds since a start": ("{:.3f}", "{:.3f}", lambda i: 9.95 + 0.05 * i, 9.95, 0.05),
+    "unpadded": ("c-1700000000.{}", "c-1700000000.{}", lambda i: 97000 + 1500 * i, 1.7e9 + 0.097, 0.0015),
+    "inside": ("l_{}_a", "r_{}", lambda i: 10**18 + i * 10**8, 1e9, 0.1),
+    "malaga": ("img_C1_{:.6f}_left", "img_C1_{:.6f}_right", lambda i: 1261228749.91 + 0.04 * i, 1261228749.91, 0.04),
+    "date": ("20230405_120000_{:03d}", "20230405_120000_{:03d}", lambda i: 90 * i, 1680696000, 0.09),
+    "numbers": ("frame{:04d}", "frame{:04d}", lambda i: 3 + i, 0.0, 0.1),
+    "unpadded numbers": ("{}_cam0", "{}_cam1", lambda i: 7 + i, 0.0, 0.1),
+    "size in name": ("frame{}_1226x370", "frame{}_1226x370", lambda i: 7 + i, 0.0, 0.1),
+    "last number is none": ("{:06d}_x0", "{:06d}_x0", lambda i: i, 0.0, 0.1),
+    "letters": ("{}", "{}", "abcdef".__getitem__, 0.0, 0.1),
+    "two numbers": ("seq{0[0]}_{0[1]}", "seq{0[0]}_{0[1]}", lambda i: (1 + i // 4, i % 4), 0.0, 0.1),
+    "date and count": ("2023-04-05-12-00-{0[0]:02d}_{0[1]}",) * 2 + (lambda i: (i // 2, i), 0.0, 0.1),
+}
 
 
-# ------------------------------------------------------------------------------------------------ names, stamps
+@pytest.mark.parametrize("name", NAMES)
+def test_names_are_read_as_numbers_and_stamps(two_folders: Path, name: str) -> None:
+    left, right, number, first, step = NAMES[name]
+    for side, form in (("left", left), ("right", right)):
+        rename(two_folders / side, lambda i, form=form: form.format(number(i)) + ".png")
+    sequence = open_sequence(two_folders)
+    assert seeds(sequence) == PAIRS
+    assert np.allclose(sequence.stamps, first + step * np.arange(6), atol=2e-6, rtol=0)
+    assert any("10 frames per second assumed" in w for w in sequence.warnings) == (first == 0)
+
+
+def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
+    for form, words in (
+        (lambda i, _: f"img_{i:03d}_{9 - i}", "numbers in the names disagree"),
+        (lambda i, side: "abcdef"[i] + side, "their order does"),
+        (lambda i, _: f"x_{1_700_000_000 + i}.500000", "is taken as 1700000000.500000 s"),
+    ):
+        for side in ("left", "right"):
+            rename(two_folders / side, lambda i, form=form, side=side: form(i, side[::2]) + ".png")
+        assert any(words in line for line in open_sequence(f"{two_folders}?kind=driving").warnings)
+
+
+def test_equal_counts_with_other_stamps_are_not_paired_by_order(two_folders: Path) -> None:
+    """The left camera lost one image, the right one another: as many, but not the same."""
+    kept = {"left": [0, 1, 3, 4, 5, 6], "right": [0, 1, 2, 3, 4, 6]}
+    for side, numbers in kept.items():
+        rename(two_folders / side, lambda i, numbers=numbers: f"{10**18 + numbers[i] * 10**8}.png")
+    (two_folders / "t.txt").write_text("".join(f"{i}\n" for i in range(6)))
+    for query in ("", "?fps=10", "?times=t.txt"):
+        frames = list(open_sequence(f"{two_folders}{query}"))
+        assert [f.right is None for f in frames] == [False, False, False, False, True, False], query
+    rename(two_folders / "right", lambda i: f"{2 * 10**18 + i * 10**8}.png")
+    with pytest.raises(SequenceError, match="the clocks of the cameras differ"):
+        open_sequence(f"{two_folders}?fps=10")
+
+
+def test_a_tolerance_and_a_rate_go_with_every_format(two_folders: Path, euroc: Path, kitti: Path) -> None:
+    for side, late in (("left", 0), ("right", 8_000_000)):
+        rename(two_folders / side, lambda i, late=late: f"{10**18 + i * 10**8 + late}.png")
+    for query, allowed in (("", "5 ms"), ("?tolerance=0.001", "1 ms")):
+        with pytest.raises(SequenceError, match=rf"nearest two are 8 ms apart, {allowed} are allowed; see tolerance="):
+            open_sequence(f"{two_folders}{query}")
+    assert seeds(open_sequence(f"{two_folders}?tolerance=0.02")) == PAIRS
+    assert np.allclose(open_sequence(f"{two_folders}?fps=10").stamps, 0.1 * np.arange(6))
+    assert len(open_sequence(f"{euroc}?tolerance=0")) == 6
+    for folder in (kitti, euroc):
+        assert np.allclose(open_sequence(f"{folder}?fps=5").stamps, 0.2 * np.arange(6))
+
+
+def test_words_for_left_and_right() -> None:
+    assert of_sides(["left_01.png", "right_01.png"]) == (["left_01.png"], ["right_01.png"])
+    assert of_sides(["0_cam0.png", "0_cam1.png", "0_cam10.png"]) == (["0_cam0.png"], ["0_cam1.png"])
+    assert of_sides(["L01.png", "R01.png"]) == (["L01.png"], ["R01.png"])
+    assert of_sides(["brightness.png", "leftover.png"]) is None
+    assert keys_of([["a.png", "b.png"]]) is None
 
 
 def test_times_and_rate_can_be_told(two_folders: Path) -> None:
     assert np.allclose(open_sequence(f"{two_folders}?fps=20").stamps, 0.05 * np.arange(6))
     (two_folders / "t.txt").write_text("".join(f"{7 + 0.3 * i}\n" for i in range(6)))
     sequence = open_sequence(f"{two_folders}?times=t.txt")
-    assert np.allclose(sequence.stamps, 7 + 0.3 * np.arange(6))
-    assert sequence.warnings == []
+    assert np.allclose(sequence.stamps, 7 + 0.3 * np.arange(6)) and sequence.warnings == []
     (two_folders / "t.txt").rename(two_folders / "times.txt")
-    assert np.allclose(open_sequence(two_folders).stamps, 7 + 0.3 * np.arange(6))
+    (two_folders / "right" / "right_000.png").unlink()  # the times are those of the left images
+    assert np.allclose(open_sequence(two_folders).stamps, 7 + 0.3 * np.arange(1, 6))
 
 
-def test_an_assumed_rate_is_said_once_and_not_above_an_error(
+def test_what_is_assumed_is_said_once_and_not_above_an_error(
     two_folders: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    said = [open_sequence(two_folders).warnings]
-    assert [record.getMessage() for record in caplog.records] == said[0]
+    said = open_sequence(two_folders).warnings
+    assert [record.getMessage() for record in caplog.records] == said
     with said_before():
-        assert open_sequence(two_folders).warnings == said[0]
+        assert open_sequence(two_folders).warnings == said
     assert len(caplog.records) == 1
     next(two_folders.glob("*.y*ml")).write_text("")
     with pytest.raises(CalibrationError):
@@ -68,74 +146,164 @@ def test_kitti_s_calib_txt_beside_the_images_is_read_and_another_one_named(two_f
         open_sequence(two_folders)
 
 
-def test_times_belong_to_the_left_images_in_order(two_folders: Path) -> None:
-    (two_folders / "right" / "right_000.png").unlink()
-    (two_folders / "times.txt").write_text("".join(f"{7 + i}\n" for i in range(6)))
-    assert np.allclose(open_sequence(two_folders).stamps, [8, 9, 10, 11, 12])
+# ------------------------------------------------------------------------------------------------ layouts
 
 
-def test_sides_can_be_told_also_as_patterns(two_folders: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    for path in [*(two_folders / "left").iterdir(), *(two_folders / "right").iterdir()]:
-        path.rename(other / path.name)
-    (two_folders / "calibration.yaml").rename(other / "c.yml")
-    sequence = open_sequence(f"{other}?left=left_*.png&right=right_*.png&calibration=c.yml&fps=5")
-    assert len(list(sequence)) == 6
-    assert sequence.warnings == []
-    nested = open_sequence(f"{tmp_path}?left=other/left_*.png&right=other/right_*.png&calibration={other / 'c.yml'}")
-    assert len(nested) == 6
+@pytest.mark.parametrize("names", [("image_left", "image_right"), ("camera0", "camera1"), ("infra1", "infra2")])
+def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str]) -> None:
+    for usual, name in zip(("left", "right"), names):
+        (two_folders / usual).rename(two_folders / name)
+    assert seeds(open_sequence(two_folders)) == PAIRS
+
+
+def test_one_folder_with_both_cameras_in_it_and_patterns(two_folders: Path) -> None:
+    for side in ("left", "right"):
+        for path in (two_folders / side).iterdir():
+            path.rename(two_folders / path.name)
+        (two_folders / side).rmdir()
+    assert seeds(open_sequence(two_folders)) == PAIRS
+    calibration = (two_folders / "calibration.yaml").rename(two_folders / "c.yml")
+    patterns = "left=left_*.png&right=right_*.png&calibration=c.yml&fps=5"
+    assert open_sequence(f"{two_folders}?{patterns}").warnings == []
+    inside = f"left={two_folders.name}/left_*.png&right={two_folders.name}/right_*.png&calibration={calibration}"
+    assert len(open_sequence(f"{two_folders.parent}?{inside}")) == 6
+
+
+def test_images_and_videos_side_by_side(two_folders: Path, tmp_path: Path, build: SimpleNamespace) -> None:
+    folder, film = tmp_path / "double", tmp_path / "walk.avi"
+    folder.mkdir()
+    pairs = [sorted((two_folders / side).iterdir()) for side in ("left", "right")]
+    images = [np.hstack([cv2.imread(str(path), 0) for path in pair]) for pair in zip(*pairs)]
+    for i, image in enumerate(images):
+        cv2.imwrite(str(folder / f"{i}.png"), image)
+    write_video(film, images)
+    for where in (folder, tmp_path):
+        (where / "calibration.yaml").write_text(FIVE)
+    with pytest.raises(SequenceError, match=r"walk\.avi\?layout=sbs"):
+        open_sequence(film)
+    for path, name, step in ((f"{folder}?layout=sbs&fps=10", "double", 0.1), (f"{film}?layout=sbs", "walk", 0.04)):
+        sequence = open_sequence(path)
+        assert seeds(sequence) == PAIRS
+        assert (sequence.name, len(sequence), sequence.rig.width) == (name, 6, 64)
+        assert np.allclose(sequence.stamps, step * np.arange(6))
+    build.write_image(folder / "3.png", 3, 131)
+    assert [f.index for f in open_sequence(f"{folder}?layout=sbs")] == [0, 1, 2, 4, 5]
+
+
+@pytest.mark.parametrize("clockwise", [1, -1])
+def test_cameras_above_each_other_are_turned(two_folders: Path, build: SimpleNamespace, clockwise: int) -> None:
+    """A rig turned by a quarter, and its images with it, gives the frames and the rig of the upright one."""
+    upright = open_sequence(two_folders)
+    turned = [camera.turned(-clockwise) for camera in (upright.rig.left, upright.rig.right)]
+    axes = np.linalg.matrix_power(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), -clockwise % 4)
+    R, b = axes @ upright.rig.R @ axes.T, axes @ upright.rig.b
+    frames = list(upright)
+    for side in ("left", "right"):
+        for path in (two_folders / side).iterdir():
+            cv2.imwrite(str(path), np.rot90(cv2.imread(str(path), 0), -clockwise))
+    entries = {f"K{i}": c.K for i, c in enumerate(turned, 1)} | {"R": R, "T": R @ b}
+    entries |= {f"D{i}": np.array([c.distortion]) for i, c in enumerate(turned, 1)}
+    build.write_storage(two_folders / "calibration.yaml", entries)
+    sequence = open_sequence(two_folders)
+    assert sequence.rig.turns % 4 == clockwise % 4
+    for a, c in ((sequence.rig.left, upright.rig.left), (sequence.rig.right, upright.rig.right)):
+        assert np.allclose([a.fu, a.fv, a.u0, a.v0, *a.distortion], [c.fu, c.fv, c.u0, c.v0, *c.distortion])
+    assert np.allclose(sequence.rig.R, upright.rig.R) and np.allclose(sequence.rig.b, upright.rig.b)
+    for frame, expected in zip(sequence, frames, strict=True):
+        assert np.array_equal(frame.left, expected.left) and np.array_equal(frame.right, expected.right)
+    with pytest.raises(CalibrationError, match="turn both images by 90 degrees"):
+        slam.load_rig(two_folders, size=(48, 64))
+
+
+def test_the_truth_of_cameras_above_each_other_is_the_turned_camera_s(euroc: Path, build: SimpleNamespace) -> None:
+    upright = open_sequence(euroc).ground_truth
+    sensor = euroc / "mav0" / "cam1" / "sensor.yaml"
+    build.write_sensor(sensor, 0.0)
+    T = build.T_body_camera.copy()
+    T[:3, 3] += 0.11 * T[:3, 1]  # the right camera stands below the left one
+    text = sensor.read_text()
+    numbers = ", ".join(map(str, build.T_body_camera.ravel()))
+    sensor.write_text(text.replace(numbers, ", ".join(map(str, T.ravel()))))
+    sequence = open_sequence(euroc)
+    turn = np.linalg.inv(upright.poses[0]) @ sequence.ground_truth.poses[0]
+    assert sequence.rig.turns == 1 and np.allclose(turn[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+def test_a_turned_camera_sees_turned_pixels() -> None:
+    K = [[50.0, 0, 30], [0, 52, 20], [0, 0, 1]]
+    camera = slam.StereoRig.from_pinhole(K, baseline=0.1, size=(64, 48), D_left=[-0.2, 0.05, 0.01, -0.02]).left
+    points = np.array([[0.1, -0.2, 1.0], [0.3, 0.2, 2.0]])
+    turned = camera.turned(1).project(np.stack([points[:, 1], -points[:, 0], points[:, 2]], axis=1))
+    pixels = camera.project(points)
+    assert np.allclose(turned, np.stack([pixels[:, 1], 63 - pixels[:, 0]], axis=1))
+    assert camera.turned(4) == camera.turned(-1).turned(1) == camera
+
+
+def test_features_under_a_mask_are_not_used(tmp_path: Path, two_folders: Path) -> None:
+    mask = np.full((240, 320), 255, np.uint8)
+    cv2.imwrite(str(tmp_path / "all.png"), mask)
+    mask[:, :160] = 0
+    cv2.imwrite(str(tmp_path / "left half.png"), mask)
+    text = "synthetic:desk?frames=3"
+    sequence = open_sequence(with_mask(text, f"{tmp_path / 'left half.png'},{tmp_path / 'all.png'}"))
+    system = slam.StereoSlam(sequence.rig)
+    for frame in sequence:
+        assert frame.left_mask is not None and frame.right_mask.all()
+        features = system.frontend.extract(frame)
+        assert len(features) > 50 and features.uv_left[:, 0].min() >= 150
+        assert outside_masks(features, frame).uv_left[:, 0].min() >= 159.5
+        system.process(frame)
+    right = open_sequence(with_mask(text, f",{tmp_path / 'left half.png'}"))
+    frame = next(iter(right))
+    features = outside_masks(slam.StereoSlam(right.rig).frontend.extract(frame), frame)
+    assert features.uv_left[:, 0].min() < 100
+    assert np.nanmin(features.uv_right[:, 0]) >= 159.5
+    cv2.imwrite(str(two_folders / "m.png"), np.eye(48, 64, dtype=np.uint8))
+    frame = next(iter(open_sequence(f"{two_folders}?mask=m.png")))
+    assert frame.left_mask is frame.right_mask and frame.left_mask.sum() == 48
 
 
 # ------------------------------------------------------------------------------------------------ videos
 
 
-def write_video(path: Path, first: int, count: int = 12, size: tuple[int, int] = SIZE) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 25, size)  # lossless
-    assert writer.isOpened()
-    for i in range(count):
-        writer.write(np.full((*size[::-1], 3), first + 5 * i, np.uint8))
+def write_video(path: Path, images: list[np.ndarray], codec: str = "FFV1") -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, images[0].shape[::-1])
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     writer.release()
+
+
+def grey(first: int, count: int = 12, size: tuple[int, int] = (64, 48)) -> list[np.ndarray]:
+    return [np.full(size[::-1], first + 5 * i, np.uint8) for i in range(count)]
 
 
 @pytest.fixture
 def videos(tmp_path: Path, build: SimpleNamespace) -> Path:
     folder = tmp_path / "films"
     build.write_storage(folder / "calib.yml", build.stereo_entries())
-    write_video(folder / "left.avi", 10)
-    write_video(folder / "right.avi", 100)
+    write_video(folder / "left.avi", grey(10))
+    write_video(folder / "right.avi", grey(100))
     return folder
 
 
 def test_two_videos(videos: Path) -> None:
     sequence = open_sequence(videos)
     assert (sequence.format, len(sequence)) == ("folders", 12)
-    frames = list(sequence)
-    assert np.allclose([f.stamp for f in frames], np.arange(12) / 25)
-    assert [round(f.left.mean()) for f in frames] == [10 + 5 * i for i in range(12)]
-    assert [round(f.right.mean()) for f in frames] == [100 + 5 * i for i in range(12)]
-    assert frames[0].left.shape == SIZE[::-1]
-    part = list(sequence.frames(4, 7))
-    assert [f.index for f in part] == [4, 5, 6]
-    assert [round(f.left.mean()) for f in part] == [30, 35, 40]
+    found = [(round(f.left.mean()), round(f.right.mean())) for f in sequence]
+    assert found == [(10 + 5 * i, 100 + 5 * i) for i in range(12)]
+    assert np.allclose(sequence.stamps, np.arange(12) / 25)
+    assert [(f.index, round(f.left.mean())) for f in sequence.frames(4, 7)] == [(4, 30), (5, 35), (6, 40)]
     assert np.allclose(open_sequence(f"{videos}?fps=10").stamps, np.arange(12) / 10)
-    named = open_sequence(f"{videos}?left=left.avi&right=right.avi&calibration=calib.yml")
-    assert len(named) == 12
+    assert len(open_sequence(f"{videos}?left=left.avi&right=right.avi&calibration=calib.yml")) == 12
     assert sequence.warnings == []
-
-
-def test_videos_of_unequal_length(videos: Path) -> None:
-    write_video(videos / "right.avi", 100, 9)
+    write_video(videos / "right.avi", grey(100, 9))
     sequence = open_sequence(videos)
-    assert len(list(sequence)) == 9
-    assert "has 12 frames, " in sequence.warnings[0]
+    assert len(list(sequence)) == 9 and "has 12 frames, " in sequence.warnings[0]
 
 
 def test_a_video_that_ends_too_early(videos: Path, build: SimpleNamespace) -> None:
-    writer = cv2.VideoWriter(str(videos / "left.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25, SIZE)
-    for i in range(12):  # noise, so that the frames are most of the file
-        writer.write(np.random.default_rng(i).integers(0, 255, (*SIZE[::-1], 3)).astype(np.uint8))
-    writer.release()
+    noise = [np.random.default_rng(i).integers(0, 255, (48, 64)).astype(np.uint8) for i in range(12)]
+    write_video(videos / "left.avi", noise, "MJPG")  # so that the frames are most of the file
     build.cut(videos / "left.avi", 0.7)
     sequence = open_sequence(videos)
     frames = list(sequence)
@@ -148,18 +316,17 @@ def test_a_video_that_ends_too_early(videos: Path, build: SimpleNamespace) -> No
 
 
 def test_faulty_videos(videos: Path, build: SimpleNamespace) -> None:
-    write_video(videos / "right.avi", 100, size=(32, 48))
-    with pytest.raises(SequenceError, match=r"differ in size: .*left\.avi is 64x48, .*right\.avi is 32x48"):
-        open_sequence(videos)
+    def refused(words: str, query: str = "", error: type[Exception] = SequenceError) -> None:
+        with pytest.raises(error, match=words):
+            open_sequence(f"{videos}{query}")
+
+    write_video(videos / "right.avi", grey(100, size=(32, 48)))
+    refused(r"differ in size: .*left\.avi is 64x48, .*right\.avi is 32x48")
     (videos / "right.avi").write_bytes(b"hello" * 100)
-    with pytest.raises(SequenceError, match=r"right\.avi: not a readable video"):
-        open_sequence(videos)
+    refused(r"right\.avi: not a readable video")
     (videos / "right.avi").unlink()
-    with pytest.raises(SequenceError, match="two cameras are needed, but there is no right one"):
-        open_sequence(videos)
+    refused("two cameras are needed, but there is no right one")
     build.write_image(videos / "right" / "0.png", 0)
-    with pytest.raises(SequenceError, match="one is a video and the other is not"):
-        open_sequence(videos)
-    write_video(videos / "other.avi", 1)
-    with pytest.raises(ConfigurationError, match="option 'times' does nothing here"):
-        open_sequence(f"{videos}?right=other.avi&times=t.txt")
+    refused("one is a video and the other is not")
+    write_video(videos / "other.avi", grey(1))
+    refused("option 'times' does nothing here", "?right=other.avi&times=t.txt", ConfigurationError)

@@ -1,4 +1,4 @@
-"""Every format, found out by itself, read right; small sequences of known content."""
+"""EuRoC's and KITTI's data sets, found out by themselves and read right; small sequences of known content."""
 
 from __future__ import annotations
 
@@ -10,19 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import slam
 from slam.errors import CalibrationError, SequenceError
+from slam.evaluation.metrics import absolute_errors
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.se3 import pose
 from slam.sequences import Sequence, formats, open_sequence
 from slam.sequences.kitti import imu_poses
-
-
-def levels(sequence: Sequence) -> list[tuple[int, int]]:
-    """Which pictures the frames show: the seeds that `picture` drew left and right with."""
-
-    def seed(image: np.ndarray) -> int:
-        return round((float(image.mean()) - 1.5) / 10) - 1
-
-    return [(seed(f.left), seed(f.right)) for f in sequence if f.right is not None]
-
+from tests.recordings import projection_row, seeds
 
 PAIRS = [(i, i + 10) for i in range(6)]
 
@@ -45,11 +40,10 @@ def test_each_format_is_found_out_and_yields_its_frames_in_order(
     assert (sequence.format, sequence.kind, sequence.name, len(sequence)) == (format, kind, folder.name, 6)
     assert format in formats()
     assert (sequence.rig.width, sequence.rig.height) == build.size
-    assert levels(sequence) == PAIRS
+    assert seeds(sequence) == PAIRS
     assert [f.index for f in sequence] == list(range(6))  # a second pass is as good as the first
     stamps = np.array([f.stamp for f in sequence])
-    assert (np.diff(stamps) > 0).all()
-    assert np.array_equal(stamps, sequence.stamps)
+    assert (np.diff(stamps) > 0).all() and np.array_equal(stamps, sequence.stamps)
     assert open_sequence(str(folder), format=format).format == format
 
 
@@ -57,47 +51,21 @@ def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path, buil
     for name in ("000001.png", "000005.png"):  # would be reported if they were decoded
         build.cut(kitti / "image_0" / name)
     sequence = open_sequence(kitti)
-    assert [f.index for f in sequence.frames(2, 5)] == [2, 3, 4]
-    assert [f.index for f in sequence.frames(4)] == [4]
-    assert [f.index for f in sequence.frames(3, 4)] == [3]
+    for start, stop, found in ((2, 5, [2, 3, 4]), (4, None, [4]), (3, 4, [3])):
+        assert [f.index for f in sequence.frames(start, stop)] == found
     assert len(sequence.warnings) == 1
     for start, stop in ((-1, 3), (6, None), (3, 3), (4, 2)):
         with pytest.raises(SequenceError, match=r"has frames 0:6|end is not after the start"):
             sequence.frames(start, stop)
 
 
-def test_the_home_folder_is_expanded(kitti: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_folders(kitti: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(kitti.parent))
     monkeypatch.setenv("USERPROFILE", str(kitti.parent))
     assert len(open_sequence("~/03")) == 6
-
-
-def test_a_question_mark_may_be_part_of_a_folder_name(kitti: Path) -> None:
     odd = kitti.rename(kitti.parent / "what?")
     assert open_sequence(odd).name == "what?"
     assert open_sequence(f"{odd}?kind=handheld").kind == "handheld"
-
-
-# ------------------------------------------------------------------------------------------------ images
-
-
-@pytest.mark.parametrize("depth", [np.uint8, np.uint16])
-def test_grey_images_keep_their_depth(kitti: Path, build: SimpleNamespace, depth: type) -> None:
-    for number in (0, 1):
-        for i in range(6):
-            build.write_image(kitti / f"image_{number}" / f"{i:06d}.png", i, depth=depth)
-    frame = next(iter(open_sequence(kitti)))
-    assert frame.left.dtype == depth
-    assert np.array_equal(frame.left, build.picture(0, depth=depth))
-
-
-def test_colour_images_become_grey(kitti: Path, build: SimpleNamespace) -> None:
-    colours = np.zeros((*build.size[::-1], 3), np.uint8)
-    colours[:] = (0, 0, 200)  # red: 0.299 of it is its grey
-    cv2.imwrite(str(kitti / "image_0" / "000000.png"), colours)
-    frame = next(iter(open_sequence(kitti)))
-    assert frame.left.shape == build.size[::-1]
-    assert abs(int(frame.left[0, 0]) - 0.299 * 200) <= 1
 
 
 # ------------------------------------------------------------------------------------------------ EuRoC
@@ -106,69 +74,111 @@ def test_colour_images_become_grey(kitti: Path, build: SimpleNamespace) -> None:
 def test_euroc_rig_and_truth(euroc: Path, build: SimpleNamespace) -> None:
     sequence = open_sequence(euroc / "mav0")
     assert sequence.name == "V0_01"
-    assert np.allclose(sequence.rig.R, np.eye(3), atol=1e-12)
-    assert np.allclose(sequence.rig.b, [-0.11, 0, 0], atol=1e-12)
-    assert sequence.rig.left.model == "radtan"
+    assert np.allclose(sequence.rig.R, np.eye(3), atol=1e-12) and np.allclose(sequence.rig.b, [-0.11, 0, 0], atol=1e-12)
     assert sequence.rig.left.distortion == (-0.28, 0.07, 0.0002, 1.8e-05)
     truth = sequence.ground_truth
-    assert truth is not None
     assert len(truth) == 24  # denser than the frames, and not thinned
     assert np.allclose(truth.poses[:, :3, :3], build.T_body_camera[:3, :3])
     assert np.allclose(truth.positions[3], np.array([0.3, 0, 1]) + build.T_body_camera[:3, 3])
     assert truth.stamps[4] == sequence.stamps[1] == pytest.approx((build.T0 + build.STEP) / 1e9, abs=1e-6)
 
 
-def test_euroc_listed_as_png_but_stored_as_jpeg(euroc: Path, build: SimpleNamespace) -> None:
-    for path in euroc.glob("mav0/cam*/data/*.png"):
-        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path), 0), [cv2.IMWRITE_JPEG_QUALITY, 100])
-        path.unlink()
-    assert levels(open_sequence(euroc)) == PAIRS
-
-
-def test_euroc_without_lists_goes_by_file_names(euroc: Path) -> None:
-    for cam in ("cam0", "cam1"):
-        (euroc / "mav0" / cam / "data.csv").unlink()
-    assert levels(open_sequence(euroc)) == PAIRS
-
-
-def test_euroc_list_with_windows_line_ends_and_spaces(euroc: Path) -> None:
+def test_euroc_lists_of_other_kinds(euroc: Path) -> None:
     table = euroc / "mav0" / "cam0" / "data.csv"
     text = table.read_text().replace(",", " , ").replace("\n", "\r\n")
     table.write_bytes(b"\xef\xbb\xbf" + text.encode())
-    assert levels(open_sequence(euroc)) == PAIRS
+    for path in euroc.glob("mav0/cam*/data/*.png"):
+        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path), 0), [cv2.IMWRITE_JPEG_QUALITY, 100])
+        path.unlink()
+    assert seeds(open_sequence(euroc)) == PAIRS  # listed as PNG, stored as JPEG
+    for cam in ("cam0", "cam1"):
+        (euroc / "mav0" / cam / "data.csv").unlink()
+    assert seeds(open_sequence(euroc)) == PAIRS  # by the names
 
 
-# ------------------------------------------------------------------------------------------------ KITTI odometry
+def test_own_images_in_euroc_s_tree(euroc: Path, build: SimpleNamespace) -> None:
+    for cam in ("cam0", "cam1"):
+        camera = euroc / "mav0" / cam
+        (camera / "data.csv").unlink()
+        build.rename(camera / "data", lambda i: f"{i:06d}.png")
+    sequence = open_sequence(euroc)
+    assert np.allclose(sequence.stamps, 0.1 * np.arange(6))
+    assert any("10 frames per second assumed" in line for line in sequence.warnings)
+    for cam in ("cam0", "cam1"):
+        (euroc / "mav0" / cam / "sensor.yaml").unlink()
+    with pytest.raises(CalibrationError, match="add calibration=FILE"):
+        open_sequence(f"{euroc}?fps=10")
+    (euroc / "own.yaml").write_text(build.FIVE)
+    sequence = open_sequence(f"{euroc}?fps=20&calibration=own.yaml")
+    assert seeds(sequence) == PAIRS and np.allclose(sequence.stamps, 0.05 * np.arange(6))
+    assert sequence.rig.baseline == pytest.approx(0.2)
+
+
+SIZE, STEP, T0 = 256, 50_000_000, 1_520_530_308_199_447_626
+D = (0.0034823894, 0.0007150348, -0.0020532361, 0.0002029367)  # of a lens of TUM-VI's
+CAMERA = PinholeCamera(150.0, 150.0, 127.5, 127.5, SIZE, SIZE, "equidistant", D)
+T_CAM0_IMU = pose(Rotation.from_euler("xyz", [0.1, -0.2, 1.5]).as_matrix(), np.array([0.04, -0.02, 0.01]))
+
+
+def test_tum_vi_is_read_and_run(tmp_path: Path) -> None:
+    """Six frames of a world by equidistant cameras, in 16 bits, Kalibr's calibration in dso, truth in mocap0."""
+    folder, world = tmp_path / "dataset-room1_512_16", slam.open_sequence("synthetic:desk?frames=6")
+    v, u = np.mgrid[:SIZE, :SIZE]
+    xy = CAMERA.normalise(np.stack([u.ravel(), v.ravel()], axis=1).astype(float))
+    view = world.rig.left.project(np.concatenate([xy, np.ones((len(xy), 1))], axis=1))
+    view = np.nan_to_num(view, nan=-1.0).astype(np.float32).reshape(SIZE, SIZE, 2)
+    rows, names = [], [f"{T0 + k * STEP}.png" for k in range(6)]
+    chain = ""
+    for cam, shift in (("cam0", 0.0), ("cam1", -world.rig.baseline)):
+        T = T_CAM0_IMU.copy()
+        T[0, 3] += shift
+        chain += f"{cam}:\n  T_cam_imu:\n" + "".join(f"  - {row}\n" for row in T.tolist())
+        chain += f"  camera_model: pinhole\n  distortion_coeffs: {list(D)}\n  distortion_model: equidistant\n"
+        chain += f"  intrinsics: [150.0, 150.0, 127.5, 127.5]\n  resolution: [{SIZE}, {SIZE}]\n"
+        (folder / "mav0" / cam / "data").mkdir(parents=True)
+        (folder / "mav0" / cam / "data.csv").write_text("#t,name\n" + "".join(f"{n[:-4]},{n}\n" for n in names))
+    for frame, name, T in zip(world, names, world.ground_truth.poses @ T_CAM0_IMU):
+        for cam, image in (("cam0", frame.left), ("cam1", frame.right)):
+            seen = cv2.remap(image, view[..., 0], view[..., 1], cv2.INTER_LINEAR)
+            cv2.imwrite(str(folder / "mav0" / cam / "data" / name), 257 * seen.astype(np.uint16))
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        rows.append(",".join(str(value) for value in (name[:-4], *T[:3, 3], w, x, y, z)))
+    for path, text in (("mav0/mocap0/data.csv", "\n".join(rows)), ("dso/camchain.yaml", chain)):
+        (folder / path).parent.mkdir()
+        (folder / path).write_text(text)
+    sequence = slam.open_sequence(folder)
+    assert (sequence.format, len(sequence), sequence.rig.left) == ("euroc", 6, CAMERA)
+    assert np.allclose(sequence.rig.b, [-0.12, 0, 0])
+    system = slam.StereoSlam(sequence.rig, backend="ekf", kind=sequence.kind)
+    results = [system.process(frame) for frame in sequence]
+    assert next(iter(sequence)).left.dtype == np.uint16
+    assert [result.status.value for result in results[1:]] == ["tracked"] * 5
+    errors = absolute_errors(system.trajectory(), sequence.ground_truth)
+    assert errors.translation_statistics.rmse < 0.01  # 3 mm are measured, on a path of 9 cm
+
+
+# ------------------------------------------------------------------------------------------------ KITTI
 
 
 def test_kitti_rig_and_truth(kitti: Path) -> None:
     sequence = open_sequence(kitti)
-    assert sequence.rig.is_rectified
-    assert sequence.rig.baseline == pytest.approx(0.5, abs=1e-12)
-    truth = sequence.ground_truth
-    assert truth is not None
-    assert np.allclose(truth.positions, [[0, 0, 1.5 * i] for i in range(6)])
-    assert np.allclose(truth.stamps, 0.1 * np.arange(6))
-
-
-def test_kitti_calibration_of_two_lines_and_poses_inside(kitti: Path) -> None:
+    assert sequence.rig.is_rectified and sequence.rig.baseline == pytest.approx(0.5, abs=1e-12)
+    assert np.allclose(sequence.ground_truth.positions, [[0, 0, 1.5 * i] for i in range(6)])
+    assert np.allclose(sequence.ground_truth.stamps, 0.1 * np.arange(6))
     lines = (kitti / "calib.txt").read_text().splitlines()
     (kitti / "calib.txt").write_text("\n".join(lines[:2]))
     (kitti.parent.parent / "poses" / "03.txt").rename(kitti / "poses.txt")
     sequence = open_sequence(kitti)
-    assert sequence.rig.baseline == pytest.approx(0.5, abs=1e-12)
-    assert sequence.ground_truth is not None
+    assert sequence.rig.baseline == pytest.approx(0.5, abs=1e-12) and sequence.ground_truth is not None
 
 
 def test_kitti_colour_where_there_is_no_grey(kitti: Path) -> None:
     (kitti / "image_0").rename(kitti / "image_2")
     (kitti / "image_1").rename(kitti / "image_3")
     sequence = open_sequence(kitti)
-    assert levels(sequence) == PAIRS
+    assert seeds(sequence) == PAIRS
     assert sequence.rig.baseline == pytest.approx(0.5, abs=1e-12)
-    truth = sequence.ground_truth
-    assert truth is not None
-    assert np.allclose(truth.positions[0], [-3 / 50, 0, 0])  # the poses are camera 0's: camera 2 stands left of it
+    assert np.allclose(sequence.ground_truth.positions[0], [-3 / 50, 0, 0])  # camera 2 stands left of camera 0
 
 
 def test_kitti_part_of_a_sequence_keeps_its_times_and_poses(kitti: Path) -> None:
@@ -176,37 +186,21 @@ def test_kitti_part_of_a_sequence_keeps_its_times_and_poses(kitti: Path) -> None
         for i in (0, 1, 5):
             (kitti / f"image_{number}" / f"{i:06d}.png").unlink()
     sequence = open_sequence(kitti)
-    assert levels(sequence) == PAIRS[2:5]
+    assert seeds(sequence) == PAIRS[2:5]
     assert np.allclose(sequence.stamps, [0.2, 0.3, 0.4])
-    truth = sequence.ground_truth
-    assert truth is not None
-    assert np.allclose(truth.positions[:, 2], [3.0, 4.5, 6.0])
+    assert np.allclose(sequence.ground_truth.positions[:, 2], [3.0, 4.5, 6.0])
     assert sequence.warnings == [f"{kitti / 'times.txt'}: the last 1 rows have no image"]
-
-
-def test_kitti_without_times_runs_at_ten_hertz_and_says_so(kitti: Path) -> None:
     (kitti / "times.txt").unlink()
     sequence = open_sequence(kitti)
-    assert np.allclose(sequence.stamps, 0.1 * np.arange(6))
+    assert np.allclose(sequence.stamps, [0.2, 0.3, 0.4])
     assert sequence.warnings == [f"{kitti / 'image_0'}: no times, 10 frames per second assumed (see fps=…)"]
-
-
-# ------------------------------------------------------------------------------------------------ KITTI raw
-
-
-def test_kitti_raw_rig_and_times(raw: Path) -> None:
-    sequence = open_sequence(raw)
-    assert sequence.rig.baseline == pytest.approx(0.5, abs=1e-12)
-    assert np.allclose(sequence.stamps, 0.1 * np.arange(6), atol=1e-9)
-    assert sequence.ground_truth is None
 
 
 def write_oxts(drive: Path, records: list[str]) -> None:
     (drive / "oxts" / "data").mkdir(parents=True)
     for i, record in enumerate(records):
         (drive / "oxts" / "data" / f"{i:010d}.txt").write_text(record + " 0" * 24 + "\n")
-    times = (drive / "image_00" / "timestamps.txt").read_text()
-    (drive / "oxts" / "timestamps.txt").write_text(times)
+    (drive / "oxts" / "timestamps.txt").write_text((drive / "image_00" / "timestamps.txt").read_text())
     # camera z is the IMU's x (ahead), camera x minus its y, camera y minus its z
     turn = "R: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 -0.5\n"
     (drive.parent / "calib_velo_to_cam.txt").write_text("calib_time: 15-Mar-2012\n" + turn)
@@ -215,11 +209,12 @@ def write_oxts(drive: Path, records: list[str]) -> None:
 
 def test_kitti_raw_truth_of_oxts_records(raw: Path) -> None:
     """East at 1 m a frame: straight ahead for the camera. Then a turn to the left on the spot about the IMU."""
+    sequence = open_sequence(raw)
+    assert sequence.rig.baseline == pytest.approx(0.5, abs=1e-12) and sequence.ground_truth is None
     metre = np.degrees(1 / (6378137.0 * np.cos(np.radians(49))))
     ahead = [f"49 {8 + i * metre:.15f} 110 0 0 0" for i in range(5)]
     write_oxts(raw, [*ahead, f"49 {8 + 4 * metre:.15f} 110 0 0 {np.pi / 2}"])
     truth = open_sequence(raw).ground_truth
-    assert truth is not None
     assert np.allclose(truth.poses[0], np.eye(4), atol=1e-9)
     assert np.allclose(truth.positions[:5], [[0, 0, i] for i in range(5)], atol=1e-6)
     # the camera stands 0.5 m before the IMU, so the turn swings it to the left
@@ -245,83 +240,88 @@ def test_kitti_raw_truth_keeps_a_fixed_point_where_it_is(raw: Path, colour: bool
     if colour:
         for grey, camera in (("00", "02"), ("01", "03")):
             (raw / f"image_{grey}").rename(raw / f"image_{camera}")
-        text = (
-            text.replace("P_rect_00", "P_rect_02").replace("P_rect_01", "P_rect_03").replace("S_rect_00", "S_rect_02")
-        )
+            text = text.replace(f"P_rect_{grey}", f"P_rect_{camera}").replace(f"S_rect_{grey}", f"S_rect_{camera}")
         text = text.replace("3.150000e+01 0.000000e+00", "3.150000e+01 3.000000e+00")
         offset[0] = 3 / 50
     cam_to_cam.write_text(text)
     sequence = open_sequence(raw)
     assert sequence.warnings == []
-    truth = sequence.ground_truth
-    assert truth is not None
     point = np.array([3.0, -7.0, 2.0])  # in the IMU's world
     seen = []
     for T in imu_poses(np.array([[float(w) for w in r.split()] for r in records])):
         velo = chain[0] @ (T[:3, :3].T @ (point - T[:3, 3])) + shifts[0]
         seen.append(chain[2] @ (chain[1] @ velo + shifts[1]) + offset)
-    world = [T[:3, :3] @ x + T[:3, 3] for T, x in zip(truth.poses, seen)]
+    world = [T[:3, :3] @ x + T[:3, 3] for T, x in zip(sequence.ground_truth.poses, seen)]
     assert np.allclose(world, seen[0], atol=1e-9)
     assert not np.allclose(seen[1], seen[0], atol=0.1)
 
 
-def test_kitti_raw_truth_with_a_broken_record(raw: Path) -> None:
+def test_kitti_raw_with_damaged_files(raw: Path) -> None:
     write_oxts(raw, ["49 8 110 0 0 0", "49 8 110 0 0 abc", "49 8.00001 110 0 0 0"])
     sequence = open_sequence(raw)
-    assert sequence.ground_truth is not None
-    assert len(sequence.ground_truth) == 2
-    assert len(sequence.warnings) == 1
+    assert len(sequence.ground_truth) == 2 and len(sequence.warnings) == 1
     assert "0000000001.txt, row 1" in sequence.warnings[0]
-
-
-def test_kitti_raw_truth_needs_its_calibration(raw: Path) -> None:
-    write_oxts(raw, ["49 8 110 0 0 0"])
     (raw.parent / "calib_imu_to_velo.txt").unlink()
     sequence = open_sequence(raw)
     assert sequence.ground_truth is None
     assert "calib_imu_to_velo.txt: the calibration is missing; there is no ground truth" in sequence.warnings[0]
-
-
-def test_kitti_raw_with_a_reflected_rectification(raw: Path) -> None:
     calibration = raw.parent / "calib_cam_to_cam.txt"
     calibration.write_text(calibration.read_text().replace("R_rect_00: 1 0 0", "R_rect_00: -1 0 0"))
     with pytest.raises(CalibrationError, match="not a rigid motion"):
         open_sequence(raw)
 
 
-# ------------------------------------------------------------------------------------------------ real data
+def test_kitti_tracking_as_downloaded(tmp_path: Path, build: SimpleNamespace) -> None:
+    root = tmp_path / "training"
+    for camera, first in (("image_02", 0), ("image_03", 10)):
+        for i in range(6):
+            build.write_image(root / camera / "0003" / f"{i:06d}.png", first + i)
+    with pytest.raises(SequenceError, match="below it are image_02/0003"):
+        open_sequence(root)
+    with pytest.raises(CalibrationError, match="add calibration=FILE"):
+        open_sequence(root / "image_02" / "0003")
+    rows = [projection_row("P2", 3), projection_row("P3", -22), "R_rect 1 0 0 0 1 0 0 0 1"]
+    (root / "calib").mkdir()
+    (root / "calib" / "0003.txt").write_text("\n".join(rows))
+    sequence = open_sequence(root / "image_02" / "0003")
+    assert (sequence.name, sequence.format, sequence.kind) == ("0003", "kitti", "driving")
+    assert seeds(sequence) == PAIRS and sequence.rig.baseline == pytest.approx(0.5)
 
 
-def test_real_kitti_06(slam_data: Path) -> None:
-    sequence = open_sequence(slam_data / "kitti_odometry" / "sequences" / "06")
-    assert (len(sequence), sequence.rig.width, sequence.rig.height) == (51, 1226, 370)
-    assert sequence.rig.baseline == pytest.approx(0.53715, abs=1e-5)
-    assert sequence.ground_truth is not None
-    assert sequence.ground_truth.length == pytest.approx(59.86, abs=0.005)
-    assert sequence.warnings == []
-    assert sum(f.right is not None for f in sequence.frames(48)) == 3
-
-
-def test_real_kitti_raw_0013(slam_data: Path) -> None:
-    drive = slam_data / "kitti_raw" / "2011_09_26" / "2011_09_26_drive_0013_sync"
+def test_kitti_360_as_downloaded(tmp_path: Path, build: SimpleNamespace) -> None:
+    drive = tmp_path / "data_2d_raw" / "2013_05_28_drive_0000_sync"
+    for camera, first in (("image_00", 0), ("image_01", 10)):
+        for i in range(6):
+            build.write_image(drive / camera / "data_rect" / f"{i:010d}.png", first + i)
+        times = [f"2013-05-28 08:46:{2 + 0.1 * i:012.9f}\n" for i in range(6)]
+        (drive / camera / "timestamps.txt").write_text("".join(times))
+    rows = ["S_rect_00: 64 48", "R_rect_00: 1 0 0 0 1 0 0 0 1", "S_rect_01: 64 48"]
+    rows += [projection_row("P_rect_00", 0), projection_row("P_rect_01", -25)]
+    (tmp_path / "calibration").mkdir()
+    (tmp_path / "calibration" / "perspective.txt").write_text("\n".join(rows))
+    poses = tmp_path / "data_poses" / drive.name / "cam0_to_world.txt"
+    poses.parent.mkdir(parents=True)
+    poses.write_text("".join(f"{i} 1 0 0 {i} 0 1 0 0 0 0 1 0 0 0 0 1 \n" for i in (1, 2, 5, 9)))
     sequence = open_sequence(drive)
-    assert (len(sequence), sequence.rig.width, sequence.rig.height) == (144, 1242, 375)
-    assert sequence.warnings == []
-    if not (drive / "poses_cam0_oxts.txt").exists():
-        pytest.skip("this copy of the drive has no poses of camera 0")
-    assert len(sequence.ground_truth) == 144
-    assert sequence.ground_truth.length == pytest.approx(173, abs=1.5)
-    assert sequence.truth_noise.translation == 0.02
+    assert seeds(sequence) == PAIRS and sequence.rig.baseline == pytest.approx(0.5)
+    assert np.allclose(sequence.ground_truth.stamps, [0.1, 0.2, 0.5])
+    assert np.allclose(sequence.ground_truth.positions[:, 0], [1, 2, 5])
 
 
-def test_real_euroc_keyframes(slam_data: Path) -> None:
-    sequence = open_sequence(slam_data / "euroc" / "V1_01_keyframes_a")
-    assert len(sequence) == len(list(sequence)) == 20
-    assert sequence.rig.baseline == pytest.approx(0.11008, abs=1e-5)
-    assert sequence.rig.rectified.rig.left.fu == pytest.approx(436.2, abs=0.5)
-    assert not sequence.rig.is_rectified
+@pytest.mark.parametrize(
+    ("path", "frames", "size", "baseline", "length"),
+    [
+        ("kitti_odometry/sequences/06", 51, (1226, 370), 0.53715, 59.86),
+        ("kitti_raw/2011_09_26/2011_09_26_drive_0013_sync", 144, (1242, 375), 0.53715, 173),
+        ("euroc/V1_01_keyframes_a", 20, (752, 480), 0.11008, None),
+    ],
+)
+def test_real_recordings(slam_data: Path, path: str, frames: int, size, baseline: float, length: float | None) -> None:
+    sequence = open_sequence(slam_data / path)
+    assert (len(sequence), sequence.rig.width, sequence.rig.height) == (frames, *size)
+    assert sequence.rig.baseline == pytest.approx(baseline, abs=2e-5)
+    assert sequence.warnings == [] and sum(f.right is not None for f in sequence.frames(frames - 3)) == 3
     truth = sequence.ground_truth
-    assert truth is not None
-    at_frames = np.abs(truth.stamps[:, None] - sequence.stamps).min(axis=0)
-    assert at_frames.max() < 1e-3
-    assert sequence.warnings == []
+    if length is not None:
+        assert len(truth) == frames and truth.length == pytest.approx(length, rel=0.01)
+    assert np.abs(truth.stamps[:, None] - sequence.stamps).min(axis=0).max() < 1e-3

@@ -1,11 +1,14 @@
-"""Whole sequences that cannot be read, also ones made on purpose: one clear line each, and no more cost than size."""
+"""Sequences that are damaged, also on purpose: refused in one line, or single rows and pairs left out."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -48,12 +51,8 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
     here = tmp_path / "here"
     for name in ("empty", "corridor", "text", "pair/cam_l", "pair/cam_r", "pair/run"):
         (here / name).mkdir(parents=True)
-    for name in (
-        "text/a.txt",
-        "both.mp4",
-        "pair/run/summary.png",
-        *(f"pair/cam_{s}/{k}.png" for s in "lr" for k in "01"),
-    ):
+    images = [f"pair/cam_{side}/{k}.png" for side in "lr" for k in "01"]
+    for name in ("text/a.txt", "both.mp4", "pair/run/summary.png", *images):
         (here / name).write_text("x")
     for path, words in {
         "nowhere": "nowhere: there is no such folder",
@@ -90,7 +89,6 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
         ("tolerance=0.1", ConfigurationError, "'tolerance' does nothing here"),
         ("fps=0", ConfigurationError, "fps must be a number from 0.001"),
         ("fps=fast", ConfigurationError, "got 'fast'"),
-        ("fps=1e308", ConfigurationError, None),
         ("unit=feet", ConfigurationError, "unit must be one of m, cm, mm"),
         ("rectified=maybe", ConfigurationError, "rectified must be yes or no"),
         ("rectified=yes", CalibrationError, "P1, P2 are missing"),
@@ -146,13 +144,10 @@ def test_a_calibration_that_is_none(fixture, request):
         path.write_bytes(content)
         assert path.name in refused(folder, CalibrationError)
     number = next(n for n in ("50.0,", "5.000000e+01", "50.") if n in text)
-    yaml, comma = path.suffix == ".yaml", "," * number.endswith(",")
-    for word in (".nan", ".inf") if yaml else ("nan", "inf"):
+    dot, comma = "." * (path.suffix == ".yaml"), "," * number.endswith(",")
+    for word in (f"{dot}nan", f"{dot}inf", "9" * 400, "9" * 5000, "1e400", "1e300"):
         path.write_text(text.replace(number, word + comma, 1))
-        assert path.name in refused(folder, CalibrationError, "not finite")
-    for word in ("9" * 400, "9" * 5000, "1e400", "1e300"):
-        path.write_text(text.replace(number, word + comma, 1))
-        assert path.name in refused(folder, CalibrationError)
+        assert path.name in refused(folder, CalibrationError, "not finite|impossibly large")
     path.unlink()
     assert str(folder.parent) in refused(folder, CalibrationError, "calibration is missing")
 
@@ -202,17 +197,14 @@ def test_lists_that_are_none_are_named_with_the_row(euroc, kitti, raw, two_folde
 
 
 def test_images_that_never_pair(euroc, kitti, two_folders, build):
-    table = euroc / "mav0" / "cam1" / "data.csv"
-    table.write_text(
-        "".join(f"{s + 20_000_000},{s}.png\n" for s in range(build.T0, build.T0 + 6 * build.STEP, build.STEP))
-    )
+    rows = [f"{build.T0 + i * build.STEP + 20_000_000},{build.T0 + i * build.STEP}.png\n" for i in range(6)]
+    (euroc / "mav0" / "cam1" / "data.csv").write_text("".join(rows))
     refused(euroc, SequenceError, "the nearest two are 20 ms apart, 5 ms are allowed; see tolerance=")
     for path in (kitti / "image_1").iterdir():
         build.cut(path)
     refused(kitti, SequenceError, r"no pair of images can be read: .*cut off or damaged")
     for side in ("left", "right"):
-        for path, name in zip(sorted((two_folders / side).iterdir()), "abcdef"):
-            path.rename(path.with_name(f"{name}.png"))
+        build.rename(two_folders / side, lambda i: f"{'abcdef'[i]}.png")
     (two_folders / "left" / "c.png").unlink()
     refused(two_folders, SequenceError, r"left has 5 images and .*right has 6")
 
@@ -249,7 +241,7 @@ def test_a_huge_frame_number_without_times_asks_for_no_memory(fixture, request):
 
 
 @pytest.mark.parametrize("name", ["calib.txt", "times.txt", "image_0/000002.png", "../../poses/03.txt"])
-@pytest.mark.parametrize("what", ["pipe", "/dev/zero", "folder", "loop"])
+@pytest.mark.parametrize("what", ["pipe", "/dev/zero", "folder"])
 def test_what_is_no_regular_file_is_never_waited_for(kitti, name, what):
     path = kitti / name
     path.unlink()
@@ -258,17 +250,13 @@ def test_what_is_no_regular_file_is_never_waited_for(kitti, name, what):
     elif what == "folder":
         path.mkdir()
     else:
-        path.symlink_to(path if what == "loop" else what)
-    started = time.monotonic()
+        path.symlink_to(what)
     try:
-        sequence = open_sequence(kitti)
-        frames = len(list(sequence))
+        frames = len(list(open_sequence(kitti)))
     except SlamError as error:
         assert str(path.name) in str(error)
     else:
         assert frames == (5 if name.endswith(".png") else 6)
-        assert name == "../../poses/03.txt" or sequence.warnings
-    assert time.monotonic() - started < 20
 
 
 @pytest.mark.parametrize("what", ["pipe", "/dev/zero", "/proc/self/status", "no UTF-8"])
@@ -288,19 +276,15 @@ def test_what_is_no_video(two_folders, what):
 LAUGHS = "a: &a [1,1,1,1,1,1,1,1]\n" + "".join(
     f"a{k}: &a{k} [{','.join([f'*a{k - 1}' if k else '*a'] * 8)}]\n" for k in range(12)
 )
+YAML = [LAUGHS, "a: &a {x: 1}\nb: {<<: [*a, *a]}", "x: &x [*x]", "x: " + "[" * 10_000, "? {a: 1}\n: 2", "- 1"]
+XML = ['<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "<a>" * 10_000, '<?xml version="1.0" encoding="x"?><a/>']
 
 
-@pytest.mark.parametrize(
-    "text",
-    [LAUGHS, "a: &a {x: 1}\nb: {<<: [*a, *a]}", "x: &x [*x]", "x: " + "[" * 10_000, "? {a: 1}\n: 2", "- 1"],
-)  # fmt: skip
-def test_hostile_yaml(tmp_path, text):
-    (tmp_path / "a.yaml").write_text(text)
-    started = time.process_time()
-    with pytest.raises(CalibrationError, match=r"a\.yaml") as caught:
-        read_yaml(tmp_path / "a.yaml")
-    assert "\n" not in str(caught.value)
-    assert time.process_time() - started < 2.0
+@pytest.mark.parametrize(("ending", "text"), [*(("yaml", t) for t in YAML), *(("xml", t) for t in XML)])
+def test_hostile_calibrations(two_folders, ending, text):
+    (two_folders / "calibration.yaml").unlink()
+    (two_folders / f"calibration.{ending}").write_text(text)
+    refused(two_folders, CalibrationError, f"calibration.{ending}", 2.0)
 
 
 def test_yaml_names_the_row_that_an_editor_shows_and_nothing_is_executed(tmp_path):
@@ -313,10 +297,107 @@ def test_yaml_names_the_row_that_an_editor_shows_and_nothing_is_executed(tmp_pat
     assert not (tmp_path / "made").exists()
 
 
+# ------------------------------------------------------------------------------------------------ single rows and pairs
+
+
+def test_rows_that_are_no_stamps_or_in_wrong_order_cost_their_frames(euroc, kitti):
+    table = euroc / "mav0" / "cam0" / "data.csv"
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join([*lines[:3], "abc", *lines[4:]]))
+    sequence = open_sequence(euroc)
+    assert len(sequence) == 5
+    assert "cam0/data.csv, row 4: 'abc' is not a time in whole nanoseconds; row left out" in sequence.warnings[0]
+    table.write_text("\n".join([*lines[:4], lines[3], lines[1], *lines[4:]]))
+    sequence = open_sequence(euroc)
+    assert len(sequence) == 6 and "2 of 8 stamps stand twice or run backwards" in sequence.warnings[0]
+    for text, stamps, words in (
+        ("0\n0.1\nabc\n0.3\n0.4\n0.5\n", [0, 0.1, 0.3, 0.4, 0.5], "row 3: 'abc' is not a time in seconds; row left"),
+        ("0\n0.1\n99\n0.1\n0.3\n0.4\n", [0, 0.1, 0.3, 0.4], "2 times stand twice or run backwards"),  # one leap ahead
+    ):
+        (kitti / "times.txt").write_text(text)
+        sequence = open_sequence(kitti)
+        assert np.allclose(sequence.stamps, stamps) and words in sequence.warnings[0]
+
+
+def test_one_camera_ahead_of_the_other(euroc: Path, kitti: Path, build: SimpleNamespace) -> None:
+    stamps = [build.T0 + i * build.STEP for i in range(6)]
+    build.write_csv(euroc / "mav0" / "cam1", stamps[2:])
+    build.write_csv(euroc / "mav0" / "cam0", stamps[:5])
+    for name in ("image_1/000000.png", "image_1/000001.png", "image_0/000005.png"):
+        (kitti / name).unlink()
+    for folder in (euroc, kitti):
+        sequence = open_sequence(folder)
+        assert [f.right is not None for f in sequence] == [True] * 3
+        text = "\n".join(sequence.warnings)
+        assert "2 images before the first pair and 0 after the last are left out" in text
+        assert "1 images have no partner" in text
+    assert np.allclose(sequence.stamps, [0.2, 0.3, 0.4])
+    assert np.allclose(sequence.ground_truth.positions[:, 2], [3, 4.5, 6])
+
+
+def test_listed_images_that_are_missing_and_stamps_that_differ_a_little(euroc: Path, build: SimpleNamespace) -> None:
+    stamps = [build.T0 + i * build.STEP for i in range(6)]
+    rows = [f"{s + (-1) ** i * 4_000_000},{s}.png\n" for i, s in enumerate(stamps)]
+    (euroc / "mav0" / "cam1" / "data.csv").write_text("".join(rows))
+    assert [f.right is not None for f in open_sequence(euroc)] == [True] * 6
+    for cam, i in (("cam0", 1), ("cam1", 3)):
+        (euroc / "mav0" / cam / "data" / f"{stamps[i]}.png").unlink()
+    sequence = open_sequence(euroc)
+    assert [f.right is not None for f in sequence] == [True, True, False, True, True]
+    text = "\n".join(sequence.warnings)
+    for cam, i in (("cam0", 1), ("cam1", 3)):
+        assert f"{cam}/data.csv: 1 of 6 listed images are missing (first: {stamps[i]}.png)" in text
+    assert f"1 images have no partner in {euroc / 'mav0' / 'cam1' / 'data'} (first: {stamps[3]}.png)" in text
+
+
+def test_a_long_sequence_is_opened_and_read_in_constant_memory(kitti: Path) -> None:
+    """300 images of 0.5 MB, linked to one file: the peak while iterating stays far below their sum."""
+    big = kitti.parent / "big.png"
+    cv2.imwrite(str(big), np.random.default_rng(0).integers(0, 255, (700, 700)).astype(np.uint8))
+    for number in (0, 1):
+        for i in range(300):
+            path = kitti / f"image_{number}" / f"{i:06d}.png"
+            path.unlink(missing_ok=True)
+            os.link(big, path)
+    (kitti / "times.txt").write_text("".join(f"{0.1 * i}\n" for i in range(300)))
+    code = (
+        "import resource, sys; from slam.sequences import open_sequence; import cv2\n"
+        "sequence = open_sequence(sys.argv[1])\n"
+        "for frame in sequence.frames(0, 3): pass\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "for frame in sequence.frames(0, 60): pass\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
+    )
+    pytest.importorskip("resource")
+    run = subprocess.run([sys.executable, "-c", code, str(kitti)], capture_output=True, text=True, check=True)
+    assert int(run.stdout) < 15_000  # kilobytes; 60 frames more of two images each would be 58 000
+
+
 @pytest.mark.parametrize(
-    "text", ['<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "<a>" * 10_000, '<?xml version="1.0" encoding="x"?><a/>']
-)
-def test_hostile_xml(two_folders, text):
-    (two_folders / "calibration.yaml").unlink()
-    (two_folders / "calibration.xml").write_text(text)
-    refused(two_folders, CalibrationError, "calibration.xml")
+    ("R", "t", "words"),
+    [
+        (np.zeros((3, 3)), np.zeros(3), "rotation of pose 0 is none"),
+        (np.diag([1.0, 1, -1]), np.ones(3), "rotation of pose 0 is none"),
+        (np.diag([1.0, 1, 1e308]), np.ones(3), "rotation of pose 0 is none"),
+        (np.eye(3), np.array([1e308, 0, 0]), "beyond the Earth"),
+        (np.eye(3), np.zeros(3), "every position is zero"),
+    ],
+)  # fmt: skip
+def test_ground_truth_that_cannot_be_true_is_left_out(kitti, R, t, words):
+    row = " ".join(str(x) for x in np.column_stack([R, t]).ravel()) + "\n"
+    path = kitti.parent.parent / "poses" / "03.txt"
+    path.write_text(row * 6)
+    sequence = open_sequence(kitti)
+    assert sequence.ground_truth is None
+    assert any(words in line and "there is no ground truth" in line for line in sequence.warnings)
+    path.write_text("1 0 0 0 0 1 0 0 0 0 1 1\n" * 4)
+    sequence = open_sequence(kitti)
+    assert len(sequence.ground_truth) == 4 and "4 poses, 2 frames are beyond them" in sequence.warnings[0]
+
+
+@pytest.mark.parametrize("row", ["1e308,0,0,1,0,0,0", "0,1,0,1e308,0,0,0", "x"])
+def test_ground_truth_of_euroc_that_cannot_be_true(euroc, build, row):
+    path = euroc / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    path.write_text("".join(f"{build.T0 + k * build.STEP},{row}\n" for k in range(6)))
+    sequence = open_sequence(euroc)
+    assert sequence.ground_truth is None and "there is no ground truth" in sequence.warnings[-1]
