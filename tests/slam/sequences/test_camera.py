@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -87,9 +89,6 @@ def write_video(path: Path, images: list[np.ndarray], rate: float = 50.0) -> Non
     writer.release()
 
 
-# ------------------------------------------------------------------------------------------------ what is given
-
-
 def test_two_devices_and_one_with_both_images_give_the_same(rig_here, played):
     left, right = [grey(10 * k) for k in range(1, 5)], [grey(10 * k + 5) for k in range(1, 5)]
     both = [np.hstack(pair) for pair in zip(left, right)]
@@ -126,9 +125,6 @@ def test_a_video_is_no_camera_but_runs_live(rig_here, scene, tmp_path):
     assert time.monotonic() - began > 0.14
     assert frames[0].left.shape == (HEIGHT, WIDTH)
     assert [np.abs(f.left.astype(float) - s.left).mean() < 5 for f, s in zip(frames, scene)] == [True] * 4
-
-
-# ------------------------------------------------------------------------------------------------ faults
 
 
 def test_a_camera_that_stops_and_comes_back_is_waited_for(rig_here, played, caplog):
@@ -206,53 +202,36 @@ def test_a_missing_device_is_one_line(rig_here):
         assert "secret" not in str(error.value)
 
 
-# ------------------------------------------------------------------------------------------------ the command
-
-
-class Watched:
-    """A camera that gives the same scene until rows are written; then it sends Ctrl-C and is stuck."""
-
-    sent, free = threading.Event(), threading.Event()
-
-    def __init__(self, image: np.ndarray, rows: Path) -> None:
-        self.image, self.rows, self.taken = image, rows, 0
-
-    def grab(self) -> bool:
-        time.sleep(0.01)
-        if self.sent.is_set():
-            return False
-        if self.rows.exists() and self.rows.read_text().count("\n") >= 4:
-            self.sent.set()
-            os.kill(os.getpid(), signal.SIGINT)
-            self.free.wait(20)
-            return False
-        return True
-
-    def retrieve(self) -> tuple[bool, np.ndarray]:
-        self.taken += 1
-        return True, self.image ^ np.uint8(self.taken % 2)  # noise: equal images would be no measurement
-
-    def release(self) -> None:
-        pass
-
-
 @pytest.mark.slow
 def test_ctrl_c_ends_a_run_from_a_stuck_camera_with_all_its_files(rig_here, scene, slam_command, tmp_path, monkeypatch):
+    """A camera gives the same scene until rows are written; then Ctrl-C comes and it is stuck."""
     image, out = np.hstack([scene[0].left, scene[0].right]), tmp_path / "out"
-    monkeypatch.setattr(devices, "open_device", lambda *_: Watched(image, out / "frames.csv"))
-    Watched.free.clear()
-    Watched.sent.clear()
+    sent, free, taken = threading.Event(), threading.Event(), itertools.count()
+
+    def grab() -> bool:
+        time.sleep(0.01)
+        rows = out / "frames.csv"
+        if not sent.is_set() and rows.exists() and rows.read_text().count("\n") >= 4:
+            sent.set()
+            os.kill(os.getpid(), signal.SIGINT)
+            free.wait(20)
+        return not sent.is_set()
+
+    def retrieve() -> tuple[bool, np.ndarray]:
+        return True, image ^ np.uint8(next(taken) % 2)  # noise: equal images would be no measurement
+
+    watched = SimpleNamespace(grab=grab, retrieve=retrieve, release=lambda: None)
+    monkeypatch.setattr(devices, "open_device", lambda *_: watched)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has its background jobs ignore it
     try:
         done = slam_command("run", "camera:0?wait=0", "--out", out, "--no-picture")
     finally:
-        Watched.free.set()
+        free.set()
         signal.signal(signal.SIGINT, before)
     assert done.returncode == 0, done.stderr
     assert "frames dropped" in done.stdout
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["ended"] == "ended by the user"
-    assert summary["frames"] >= 3
+    assert summary["ended"] == "ended by the user" and summary["frames"] >= 3
     assert summary["live"]["milliseconds behind"]["median"] > 0
     assert (out / "trajectory_final.txt").read_text().count("\n") == summary["frames"]
     config = json.loads((out / "config.json").read_text())
