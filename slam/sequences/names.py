@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from itertools import pairwise
+from statistics import median
 
 import numpy as np
 
@@ -15,6 +18,7 @@ MOST_FRAMES = 10**12
 
 _SHORTEST = 10**6  # [ns] between frames: no camera is faster, and no count of frames has such steps
 _LONGEST = 10**11  # [ns] between frames: a hundred seconds
+_SHORTEST_MICRO = 10**4  # [µs] between frames: a hundred a second; no count of frames has such steps, either
 _FIRST = 10**8  # [s] since 1970 of a stamp with a fraction in a longer name: the year 1973
 
 #: Words for the left and the right camera, in names of folders, videos and topics.
@@ -25,7 +29,7 @@ _DATE = re.compile(
     r"(?:[-_.s]?(\d{1,9}))?(?!\d)",
     re.ASCII,
 )
-_STAMP = re.compile(r"(?<!\d)(?:(\d{9,10})[._](\d{1,9})|(\d{18,19})|(\d{16})|(\d{13}))(?!\d)", re.ASCII)
+_STAMP = re.compile(r"(?<!\d)(?:(\d{9,10})[._](\d{1,9})|(\d{18,19})|(\d{16})|(\d{13})|([12]\d{9}))(?!\d)", re.ASCII)
 _SECONDS = re.compile(r"\d{1,10}\.\d{1,9}", re.ASCII)  # a whole name, perhaps since a start
 _NUMBER = re.compile(r"\d+", re.ASCII)
 
@@ -59,9 +63,9 @@ def of_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
 def keys_of(sides: Sequence[Sequence[str]]) -> tuple[list[IntArray], bool, str] | None:
     """What pairs the images of cameras: stamps [ns], or else numbers of frames.
 
-    A stamp is 19 digits (nanoseconds), 16 (microseconds), 13 (milliseconds), seconds with a fraction, or a date with
-    the time, anywhere in the names; or whole names so far apart that they cannot count frames. A frame's number is
-    the one that differs from name to name; of several, those that both cameras share.
+    A stamp is 19 digits (nanoseconds), 16 (microseconds), 13 (milliseconds), 10 (seconds), seconds with a fraction, or
+    a date with the time, anywhere in the names; or numbers so far apart that they cannot count frames. A frame's number
+    is the one that differs from name to name; of several, those that both cameras share, and that count best.
 
     Returns:
         For each camera its keys (N,), whether these are stamps, and what was guessed, empty where nothing was. None
@@ -86,14 +90,13 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
     """A stamp [ns] that every name has and that tells the names apart."""
     whole = all(_is_stamp(stem(name)) for name in names)
     since_start = all(_SECONDS.fullmatch(stem(name)) for name in names)
-    rows = [[(*stem(n).split("."), "", "", "")] if since_start else _STAMP.findall(stem(n)) for n in names]
+    rows = [[(*stem(n).split("."), "", "", "", "")] if since_start else _STAMP.findall(stem(n)) for n in names]
     for parts in zip(*rows):
-        fractions = [part[1] for part in parts if part[1]]
-        # Fractions of unequal length that end in zeros are whole microseconds or nanoseconds, printed without padding.
-        unpadded = len(set(map(len, fractions))) > 1 and any(len(f) > 1 and f.endswith("0") for f in fractions)
-        width = 0 if not unpadded else 6 if max(map(len, fractions)) <= 6 else 9
-        keys = [_nanoseconds(part, width) for part in parts]
-        far = _median_step(np.array([min(k, MOST_NANOSECONDS) for k in keys])) > _LONGEST
+        # Fractions of unequal length have lost zeros at their ends, or those in front: then steps are uneven.
+        lengths = {len(part[1]) for part in parts}
+        widths = (0, 6 if max(lengths) <= 6 else 9) if len(lengths) > 1 else (0,)
+        keys = min(([_nanoseconds(part, width) for part in parts] for width in widths), key=_unevenness)
+        far = len(keys) > 1 and median(_steps(keys)) > _LONGEST
         possible = all(k <= MOST_NANOSECONDS and (whole or k >= _FIRST * 10**9) for k in keys)
         if possible and not far and len(set(keys)) == len(keys):  # far apart: a clock from its start, in a finer unit
             return np.array(keys, np.int64)
@@ -102,9 +105,9 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
 
 def _nanoseconds(part: tuple[str, ...], width: int) -> int:
     """Of the digits of a stamp; its fraction filled up in front to `width`, if not zero."""
-    seconds, fraction, nano, micro, milli = part
-    if seconds:
-        return int(seconds) * 10**9 + int(fraction.rjust(width, "0").ljust(9, "0"))
+    seconds, fraction, nano, micro, milli, whole = part
+    if seconds or whole:
+        return int(seconds or whole) * 10**9 + int(fraction.rjust(width, "0").ljust(9, "0"))
     return int(nano) if nano else int(micro) * 10**3 if micro else int(milli) * 10**6
 
 
@@ -114,8 +117,8 @@ def _dates(names: Sequence[str]) -> IntArray | None:
     if len(found) < len(set(names)):
         return None
     rest = [int(match[7] or 0) for match in found.values()]
-    if rest == sorted(rest) and len({match[6] for match in found.values()}) > 1 and any(rest):
-        return None  # it counts on when the second is over: no fraction
+    if len(rest) > 1 and set(np.diff(rest).tolist()) == {1}:
+        return None  # it counts frames, also beyond the end of a second: no fraction
     moments, fractions = [], []
     for year, month, day, hour, minute, second, fraction in (found[name].groups() for name in names):
         moments.append(f"{year}-{month}-{day}T{hour}:{minute}:{second}")
@@ -135,20 +138,27 @@ def _numbers(sides: Sequence[Sequence[str]]) -> tuple[list[IntArray], bool, str]
     told = [[c for c in table if len(set(c)) == len(c) and max(c) <= MOST_NANOSECONDS] for table in tables]
     if not all(told):
         return _ranks([list(zip(*table)) for table in tables])
-    best, chosen = -1, [columns[-1] for columns in told]
+    best, chosen = (-1, 0), [columns[-1] for columns in told]
     for column in told[0]:
         others = [max(columns, key=lambda c, column=column: len(set(c) & set(column))) for columns in told[1:]]  # type: ignore[misc]
         common = min((len(set(column) & set(c)) for c in others), default=0)
-        if common >= best:
-            best, chosen = common, [column, *others]
+        found = common, -max(_steps(column), default=0)
+        if found >= best:
+            best, chosen = found, [column, *others]
     guess = ""
     for names, columns, column in zip(sides, told, chosen):
         first, *order = np.argsort(column, kind="stable").tolist()
         if any(np.argsort(c, kind="stable").tolist() != [first, *order] for c in columns):
             guess = f"numbers in the names disagree; of {names[first]} the {column[first]} is taken as frame number"
     keys = [np.array(column, np.int64) for column in chosen]
-    stamped = all(_median_step(k) >= _SHORTEST for k in keys)
-    return None if not stamped and max(k.max() for k in keys) > MOST_FRAMES else (keys, stamped, guess)
+    step = min(median(_steps(k.tolist()) or [0]) for k in keys)
+    if step >= _SHORTEST or max(k.max() for k in keys) > MOST_FRAMES:
+        return (keys, True, guess) if step >= _SHORTEST else None
+    if step >= _SHORTEST_MICRO:
+        return [1000 * k for k in keys], True, f"numbers in the names, {step:g} apart, are taken as microseconds"
+    if step > 1 and not guess:
+        guess = f"numbers in the names are {step:g} apart and taken as frame numbers; if they are times, see times=…"
+    return keys, False, guess
 
 
 def _columns(names: Sequence[str]) -> list[list[int]] | None:
@@ -169,6 +179,18 @@ def _ranks(rows: Sequence[Sequence[tuple[int, ...]]]) -> tuple[list[IntArray], b
     return [np.array([rank[row] for row in own], np.int64) for own in rows], False, guess
 
 
-def _median_step(numbers: np.ndarray) -> float:
-    """How far numbers are apart; zero for a single one."""
-    return float(np.median(np.diff(np.sort(numbers)))) if len(numbers) > 1 else 0.0
+def _steps(numbers: Sequence[int]) -> list[int]:
+    return [b - a for a, b in pairwise(sorted(numbers))]
+
+
+def _unevenness(numbers: Sequence[int]) -> float:
+    """The largest step of sorted numbers over the usual one: near 1 for the times of a camera."""
+    steps = _steps(numbers)
+    return max(steps) / max(median(steps), 1e-9) if steps else 0.0
+
+
+def odd_ones(names: Sequence[str]) -> list[str]:
+    """Names unlike those of the others but for numbers, where most are alike: thumbnails and the like."""
+    forms = [re.sub(r"\d+", "0", stem(name)) for name in names]
+    usual, count = Counter(forms).most_common(1)[0] if forms else ("", 0)
+    return [name for name, form in zip(names, forms) if form != usual] if 2 * count > len(forms) else []

@@ -16,7 +16,7 @@ from slam.sequences.base import Images
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import WIDEST_TOLERANCE, Given
 from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, require_same_size
-from slam.sequences.names import MOST_FRAMES, keys_of, natural, same_order, stem
+from slam.sequences.names import MOST_FRAMES, keys_of, natural, odd_ones, same_order, stem
 from slam.sequences.tables import read_rows, seconds
 
 #: Frames per second of images that say nothing of time.
@@ -146,6 +146,11 @@ def by_names(folders: list[Path], names: list[list[str]], faults: FaultLog) -> l
 
     SequenceError where only their order is left, and the cameras have unequally many.
     """
+    for at, own in enumerate(names):
+        if odd := odd_ones(own):
+            line = f"{folders[at]}: {len(odd)} of {len(own)} images are named unlike the others (first: {odd[0]})"
+            faults.report("images", f"{line}; left out")
+            names[at] = [name for name in own if name not in odd]
     found = keys_of(names)
     if found is None:
         if len({len(own) for own in names}) > 1:

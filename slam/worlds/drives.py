@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from slam.data import BoolArray
 from slam.errors import SequenceError, TrajectoryError
 from slam.files import expanded, read_text
 from slam.geometry.se3 import Array, pose
@@ -39,64 +37,44 @@ def read_path(text: str) -> Trajectory:
         raise SequenceError("no path is named: drive?path=FILE, poses in the form of KITTI or TUM")
     file = expanded(text)
     try:
-        if _columns(file) == 12:
-            path = Trajectory.read_kitti(file)
-            path = Trajectory(path.stamps / _FILE_RATE, path.poses)
-        else:
-            path = Trajectory.read_tum(file)
-            path = Trajectory(path.stamps - path.stamps[0], path.poses)
+        rows = (line.partition("#")[0].split() for line in read_text(file, error=TrajectoryError).splitlines())
+        of_kitti = len(next(filter(None, rows), [])) == 12
+        path = Trajectory.read_kitti(file) if of_kitti else Trajectory.read_tum(file)
     except TrajectoryError as error:
         raise SequenceError(str(error)) from error
-    _require_drive(file, path)
-    return path
-
-
-def _columns(file: Path) -> int:
-    """Numbers in the first row of a table."""
-    lines = (line.partition("#")[0].split() for line in read_text(file, error=TrajectoryError).splitlines())
-    return len(next(filter(None, lines), []))
-
-
-def _require_drive(file: Path, path: Trajectory) -> None:
-    """Refuse what is no path of a vehicle."""
-    R = path.poses[:, :3, :3]
+    path = Trajectory(path.stamps / _FILE_RATE if of_kitti else path.stamps - path.stamps[0], path.poses)
+    R, steps = path.poses[:, :3, :3], np.diff(path.positions, axis=0)
     wrong = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) > 1e-3
     wrong |= np.linalg.det(R) < 0
     if wrong.any():
         raise SequenceError(f"{file}: the pose of row {int(np.argmax(wrong))} has no rotation")
-    down = path.poses[:, :3, 1].mean(axis=0)
-    if np.linalg.norm(down) < 0.5 or abs(path.poses[0, :3, 2] @ down) > 0.9 * np.linalg.norm(down):
+    down = R[:, :, 1].mean(axis=0)
+    if np.linalg.norm(down) < 0.5 or abs(R[0, :, 2] @ down) > 0.9 * np.linalg.norm(down):
         raise SequenceError(f"{file}: no path of a vehicle: the camera's y axis must point downwards")
-    steps = np.diff(path.positions, axis=0)
-    long = np.linalg.norm(steps, axis=1)
     length = float(np.linalg.norm((steps @ level(path).T)[:, :2], axis=1).sum())
     if not _SHORTEST <= length <= _LONGEST:
         limits = f"{_SHORTEST:.0f} m to {_LONGEST / 1000:.0f} km"
         raise SequenceError(f"{file}: a path of {length:.1f} m in {len(path)} poses; a drive needs {limits}")
+    long = np.linalg.norm(steps, axis=1)
     if long.max() > _LONGEST_STEP:
         row = int(np.argmax(long)) + 1
         raise SequenceError(f"{file}: row {row} is {long.max():.0f} m from the one before: no path of a vehicle")
+    return path
 
 
 def sampled(path: Trajectory, values: Mapping[str, Any]) -> Trajectory:
     """The path at the frames of the options `rate`, `speed` and `frames`; poses of the path stay as they are."""
     count = int(path.stamps[-1] * values["rate"] / values["speed"] + 1e-6) + 1
-    count = min(count, values["frames"] or count)
-    stamps = np.arange(count) / values["rate"]
+    stamps = np.arange(min(count, values["frames"] or count)) / values["rate"]
     times = np.minimum(stamps * values["speed"], path.stamps[-1])
-    nearest = _nearest(path, times)
+    after = np.clip(np.searchsorted(path.stamps, times), 1, len(path) - 1)
+    nearest = after - (times - path.stamps[after - 1] < path.stamps[after] - times)
     positions = np.stack([np.interp(times, path.stamps, x) for x in path.positions.T], axis=1)
     turns = Slerp(path.stamps, Rotation.from_matrix(path.poses[:, :3, :3]))(times)
     poses = pose(turns.as_matrix(), positions)
     exact = np.abs(path.stamps[nearest] - times) < 1e-6
     poses[exact] = path.poses[nearest[exact]]
     return Trajectory(stamps, poses)
-
-
-def _nearest(path: Trajectory, times: Array) -> np.ndarray:
-    """Rows of the path nearest in time (N,)."""
-    after = np.clip(np.searchsorted(path.stamps, times), 1, len(path) - 1)
-    return after - (times - path.stamps[after - 1] < path.stamps[after] - times)
 
 
 def level(path: Trajectory) -> Array:
@@ -127,8 +105,11 @@ class Road:
         way, course = _course(positions)
         heading = np.gradient(course[:, :2], axis=0)
         heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-9)
-        new = _new_road(course[:, :2], way)
         left = np.stack([-heading[:, 1], heading[:, 0]], axis=1)
+        new = np.zeros(len(way), bool)  # what is not within `SAME_ROAD` of an earlier road
+        for i, near in enumerate(cKDTree(course[:, :2]).query_ball_point(course[:, :2], SAME_ROAD)):
+            others = np.array(near)
+            new[i] = not (new[others] & (way[others] < way[i] - _TURNED)).any()
         return cls(course[new, :2], left[new], way[new], course)
 
 
@@ -141,27 +122,12 @@ def _course(positions: Array) -> tuple[Array, Array]:
     course = np.stack([np.interp(even, way, x) for x in positions[moved].T], axis=1)
     course = gaussian_filter1d(course, _SMOOTHED / STEP, axis=0, mode="nearest")
     beyond = np.arange(STEP, _BEYOND, STEP)
-    span = min(round(4 / STEP), len(course) - 1)
-    ends = [(course[0], course[0] - course[span]), (course[-1], course[-1] - course[-1 - span])]
-    before, after = (start + beyond[:, None] * _level_unit(step) for start, step in ends)
+    span, ends = min(round(4 / STEP), len(course) - 1), []
+    for start, inner in ((0, span), (-1, -1 - span)):
+        ahead = (course[start] - course[inner]) * (1, 1, 0)  # level
+        ends.append(course[start] + beyond[:, None] * (ahead / max(float(np.linalg.norm(ahead)), 1e-9)))
     way = np.concatenate([-beyond[::-1], even, even[-1] + beyond])
-    return way, np.concatenate([before[::-1], course, after])
-
-
-def _level_unit(step: Array) -> Array:
-    """A level unit vector (3,) along a step (3,)."""
-    flat = np.array([step[0], step[1], 0.0])
-    return flat / max(float(np.linalg.norm(flat)), 1e-9)
-
-
-def _new_road(xy: Array, way: Array) -> BoolArray:
-    """Which samples (N,) are not within `SAME_ROAD` of an earlier road."""
-    near = cKDTree(xy).query_ball_point(xy, SAME_ROAD)
-    new = np.zeros(len(xy), bool)
-    for i, rows in enumerate(near):
-        others = np.array(rows)
-        new[i] = not (new[others] & (way[others] < way[i] - _TURNED)).any()
-    return new
+    return way, np.concatenate([ends[0][::-1], course, ends[1]])
 
 
 PACE = 8.0  #: driving speed of the built-in drive [m/s]
@@ -196,7 +162,13 @@ def around_blocks(layout: int) -> Trajectory:
 
 def _way() -> Array:
     """Places (N, 2) [m] along the drive in equal steps: in the right lane, with rounded corners."""
-    corners = _in_lane(np.array(CORNERS, float))
+    corners = np.array(CORNERS, float)
+    ahead = np.diff(corners, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    right = _LANE * np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)  # from the middle of each street
+    straight = (ahead[1:] * ahead[:-1]).sum(axis=1) > 0.9
+    middle = np.where(straight[:, None], right[1:], right[1:] + right[:-1])
+    corners += np.concatenate([right[:1], middle, right[-1:]])
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     fine = np.arange(0.0, length[-1], _STEP)
     polygon = np.stack([np.interp(fine, length, x) for x in corners.T], axis=1)
@@ -204,13 +176,3 @@ def _way() -> Array:
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
     even = np.arange(2 * _ROUND, run[-1] - 2 * _ROUND, _STEP)
     return np.stack([np.interp(even, run, x) for x in smooth.T], axis=1)
-
-
-def _in_lane(corners: Array) -> Array:
-    """Corners (N, 2) of a polygon, moved to the right of both streets that meet in each."""
-    ahead = np.diff(corners, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    right = _LANE * np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
-    straight = (ahead[1:] * ahead[:-1]).sum(axis=1) > 0.9
-    middle = np.where(straight[:, None], right[1:], right[1:] + right[:-1])
-    return corners + np.concatenate([right[:1], middle, right[-1:]])

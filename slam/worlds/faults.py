@@ -27,18 +27,24 @@ class Faults:
 
     @classmethod
     def of(cls, values: Mapping[str, Any], frames: int, seed: int) -> Faults:
-        """Faults by the options' texts.
-
-        Raises:
-            ConfigurationError: a text cannot be read, or every frame is dropped.
-        """
+        """Faults by the options' texts; ConfigurationError where one cannot be read, or every frame is dropped."""
         chosen = {
             name: _frames(name, values[name], frames, np.random.default_rng([seed, 7, number]))
             for number, name in enumerate(_CHOSEN)
         }
         if chosen["drop"].all():
             raise ConfigurationError("drop: no frame is left")
-        return cls(chosen, _delay(values["jump"], frames))
+        delay = np.zeros(frames)
+        for part in filter(None, values["jump"].split(",")):
+            frame, _, seconds = part.partition(":")
+            try:
+                start, by = int(frame), float(seconds)
+            except ValueError:
+                raise ConfigurationError(f"jump must be FRAME:SECONDS, got {part!r}") from None
+            if start < 1 or not (np.isfinite(by) and by > 0):
+                raise ConfigurationError(f"jump must be from frame 1 on and ahead in time, got {part!r}")
+            delay[start:] += by
+        return cls(chosen, delay)
 
     def of_frame(self, frame: int) -> set[str]:
         """What a frame suffers from."""
@@ -85,19 +91,4 @@ def _frames(name: str, text: str, frames: int, rng: np.random.Generator) -> Bool
         except ValueError:
             line = f"{name} must be frames (100), ranges (100:110) or a chance (0.02), got {part!r}"
             raise ConfigurationError(line) from None
-    return out
-
-
-def _delay(text: str, frames: int) -> Array:
-    """What the clock has jumped ahead by in every frame [s]."""
-    out = np.zeros(frames)
-    for part in filter(None, text.split(",")):
-        frame, _, seconds = part.partition(":")
-        try:
-            start, by = int(frame), float(seconds)
-        except ValueError:
-            raise ConfigurationError(f"jump must be FRAME:SECONDS, got {part!r}") from None
-        if start < 1 or not (np.isfinite(by) and by > 0):
-            raise ConfigurationError(f"jump must be from frame 1 on and ahead in time, got {part!r}")
-        out[start:] += by
     return out

@@ -20,10 +20,7 @@ RIGHT, LEFT, FORWARD, BACK, UP, DOWN = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1
 
 
 class Texture(Protocol):
-    """What is painted on a rectangle, `width` by `height` [m], by `slam.worlds.painting.paint`.
-
-    Its layout is known without painting it.
-    """
+    """What `slam.worlds.painting.paint` paints on a rectangle, in metres; its layout is known without painting it."""
 
     @property
     def width(self) -> float: ...  # noqa: D102
@@ -55,9 +52,7 @@ class Rectangle:
 
     def parts(self) -> list[Rectangle]:
         """Parts beside each other, if its texture has any (`parts()`, from the left); else itself."""
-        parts: list[Texture] = getattr(self.texture, "parts", list)()
-        if not parts:
-            return [self]
+        parts: list[Texture] = getattr(self.texture, "parts", lambda: [self.texture])()
         left = np.cumsum([0.0, *(p.width for p in parts)]) / self.texture.width
         return [
             replace(self, origin=self.origin + a * self.along, along=(b - a) * self.along, texture=p)
@@ -259,7 +254,10 @@ def place_landmarks(
     rows, count = [], 0
     for index, r in enumerate(rectangles):
         if not alike or r.texture not in chosen:
-            chosen[r.texture] = _chosen_marks(r.texture, density, rng), count
+            marks, size = r.texture.marks(), (r.texture.width - 0.005, r.texture.height - 0.005)
+            marks = marks[((marks[:, :2] > 0.005) & (marks[:, :2] < size)).all(axis=1) & (marks[:, 2] > 1e-3)]
+            wanted = min(len(marks), round(density * r.texture.width * r.texture.height))
+            chosen[r.texture] = marks[np.sort(rng.permutation(len(marks))[:wanted])], count
         marks, first = chosen[r.texture]
         n = len(marks)
         along, down = (edge / np.linalg.norm(edge) for edge in (r.along, r.down))
@@ -268,12 +266,3 @@ def place_landmarks(
         rows.append((places, np.tile(r.normal, (n, 1)), np.full(n, index), np.full(n, r.body), marks[:, 2], looks))
         count += n
     return Landmarks(*(np.concatenate(column) for column in zip(*rows)))
-
-
-def _chosen_marks(texture: Texture, density: float, rng: np.random.Generator) -> Array:
-    """Marks (M, 3) of a texture that are landmarks."""
-    marks = texture.marks()
-    inside = (marks[:, :2] > 0.005).all(axis=1) & (marks[:, 0] < texture.width - 0.005)
-    marks = marks[inside & (marks[:, 1] < texture.height - 0.005) & (marks[:, 2] > 1e-3)]
-    wanted = min(len(marks), round(density * texture.width * texture.height))
-    return marks[np.sort(rng.permutation(len(marks))[:wanted])]

@@ -203,11 +203,9 @@ REST, MOVE = 2.0, 1.5  #: how long the box stands at a place, and is on its way 
 def box(values: Mapping[str, Any]) -> Parts:
     """Paper B, 4.4: a box that stands at the four places of Table 1, one after another, with beacons around it."""
     stamps, t = clock(values, 4 * REST + 3 * MOVE)
-    layout, size = (
-        values["layout"],
-        np.array([0.24, 0.16, 0.20]),
-    )  # its frame sits at the upper right corner of its front
-    rectangles = _laboratory(layout) + carton(size, np.array([-size[0], 0, -size[2]]), 1, 200 + layout)
+    layout, size = values["layout"], np.array([0.24, 0.16, 0.20])
+    lowest = np.array([-size[0], 0, -size[2]])  # its frame sits at the upper right corner of its front
+    rectangles = _laboratory(layout) + carton(size, lowest, 1, 200 + layout)
     times = [i * (REST + MOVE) + wait for i in range(len(PLACES)) for wait in (0.0, REST)]
     x, y, z, *turns = (through(t, times, column) for column in np.repeat(PLACES, 2, axis=0).T)
     poses = watching(t, stamps, values["camera"], np.random.default_rng([layout, 51]))

@@ -28,7 +28,12 @@ _BENT = 0.5  # most that the road turns along one front [rad]
 _FOUNDATION = 0.3  # of house fronts below the lowest ground before them [m]
 _EVEN = 0.2  # a town with no greater differences in height is level [m]
 _TREES, _CARS, _CABINETS = 4, 5, 2  # on each side of a stretch
-_BESIDE = {"trees": 7.6, "cabinets": 8.2, "cars": 6.2}  # from a road's middle [m]
+#: What stands beside a road: how far from its middle [m], and of a post its size [m], material and seed.
+_BESIDE: dict[str, tuple[float, tuple[float, float, float], str, int]] = {
+    "trees": (7.6, (0.35, 0.35, 4.0), "wood", 10),
+    "cabinets": (8.2, (1.0, 0.5, 1.4), "poster", 20),  # full of bills
+    "cars": (6.2, (0, 0, 0), "", 30),
+}
 _CLEAR = 2.6  # nothing stands so near to where the camera drives [m]
 _AROUND = 16  # samples ahead and behind between which a road is straight where something stands at its side
 _TILE = 12.0  # edges of the ground's parts [m]
@@ -77,15 +82,6 @@ def _plan(layout: int, stretch: int, side: int) -> Plan:
     heights = np.round(rng.uniform(7, 12, _HOUSES), 2)
     beside = {"trees": posts[:_TREES], "cabinets": posts[_TREES:], "cars": cars[rng.random(_CARS) < 0.7]}
     return Plan(np.diff(edges), heights, beside, int(rng.integers(1 << 24)) * 100)
-
-
-def _stand(what: str, T: Array, seed: int) -> list[Rectangle]:
-    """A tree's trunk, a switch cabinet full of bills, or a car."""
-    if what == "cars":
-        return car(T, seed + 30)
-    if what == "trees":
-        return post(T, (0.35, 0.35, 4.0), "wood", seed + 10)
-    return post(T, (1.0, 0.5, 1.4), "poster", seed + 20)
 
 
 class Streets:
@@ -179,8 +175,11 @@ class Streets:
                 for side in (1, -1):
                     plan = self._plan(stretch, side)
                     for number, along in enumerate(plan.beside[what].tolist()):
-                        T = self._pose(self._road.way[0] + stretch * STRETCH + along, side, _BESIDE[what])
-                        yield from () if T is None else _stand(what, T, plan.seed + number)
+                        aside, size, material, seed = _BESIDE[what]
+                        T = self._pose(self._road.way[0] + stretch * STRETCH + along, side, aside)
+                        seed += plan.seed + number
+                        if T is not None:
+                            yield from car(T, seed) if what == "cars" else post(T, size, material, seed)
 
     def _pose(self, way: float, side: int, aside: float) -> Array | None:
         """Pose (4, 4) on the ground at a road's side, y along the traffic there; None where it would be in the way."""

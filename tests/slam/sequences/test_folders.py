@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,10 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "seconds": ("1403715273.{:02d}", "1403715273.{:02d}", lambda i: 5 * i, 1_403_715_273, 0.05),
     "seconds since a start": ("{:.3f}", "{:.3f}", lambda i: 9.95 + 0.05 * i, 9.95, 0.05),
     "unpadded": ("c-1700000000.{}", "c-1700000000.{}", lambda i: 97000 + 1500 * i, 1.7e9 + 0.097, 0.0015),
+    "unpadded nanoseconds": ("{0[0]}.{0[1]}",) * 2 + (lambda i: (1_700_000_000, 33_333_333 * i), 1.7e9, 0.033333333),
+    "microseconds of a start": ("{}", "{}", lambda i: 12 + 33_333 * i, 12e-6, 0.033333),
+    "whole seconds": ("{}", "{}", lambda i: 1_600_000_000 + i, 1.6e9, 1.0),
+    "ISO": ("2023-04-05T12:00:{:02d}.250000Z",) * 2 + (lambda i: i, 1680696000.25, 1.0),
     "inside": ("l_{}_a", "r_{}", lambda i: 10**18 + i * 10**8, 1e9, 0.1),
     "malaga": ("img_C1_{:.6f}_left", "img_C1_{:.6f}_right", lambda i: 1261228749.91 + 0.04 * i, 1261228749.91, 0.04),
     "date": ("20230405_120000_{:03d}", "20230405_120000_{:03d}", lambda i: 90 * i, 1680696000, 0.09),
@@ -36,6 +41,8 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "unpadded numbers": ("{}_cam0", "{}_cam1", lambda i: 7 + i, 0.0, 0.1),
     "size in name": ("frame{}_1226x370", "frame{}_1226x370", lambda i: 7 + i, 0.0, 0.1),
     "last number is none": ("{:06d}_x0", "{:06d}_x0", lambda i: i, 0.0, 0.1),
+    "date of the session": ("20230405_120000_{:03d}", "20230405_120000_{:03d}", lambda i: i, 0.0, 0.1),
+    "exposure": ("{0[0]:05d}_{0[1]}", "{0[0]:05d}_{0[1]}", lambda i: (i, 90 - 13 * i), 0.0, 0.1),
     "letters": ("{}", "{}", "abcdef".__getitem__, 0.0, 0.1),
     "two numbers": ("seq{0[0]}_{0[1]}", "seq{0[0]}_{0[1]}", lambda i: (1 + i // 4, i % 4), 0.0, 0.1),
     "date and count": ("2023-04-05-12-00-{0[0]:02d}_{0[1]}",) * 2 + (lambda i: (i // 2, i), 0.0, 0.1),
@@ -58,10 +65,12 @@ def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
         (lambda i, _: f"img_{i:03d}_{9 - i}", "numbers in the names disagree"),
         (lambda i, side: "abcdef"[i] + side, "their order does"),
         (lambda i, _: f"x_{1_700_000_000 + i}.500000", "is taken as 1700000000.500000 s"),
+        (lambda i, _: f"{33 * i}", "33 apart and taken as frame numbers; if they are times, see times="),
+        (lambda i, _: "preview" if i == 5 else f"{i}", "1 of 6 images are named unlike the others .first: preview.png"),
     ):
         for side in ("left", "right"):
             rename(two_folders / side, lambda i, form=form, side=side: form(i, side[::2]) + ".png")
-        assert any(words in line for line in open_sequence(f"{two_folders}?kind=driving").warnings)
+        assert any(re.search(words, line) for line in open_sequence(two_folders).warnings), words
 
 
 def test_equal_counts_with_other_stamps_are_not_paired_by_order(two_folders: Path) -> None:

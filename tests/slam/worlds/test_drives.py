@@ -18,60 +18,48 @@ def straight(count: int, step: float = 1.0) -> Trajectory:
     return Trajectory(np.arange(count) / 10, camera_poses(positions, zero, zero, zero))
 
 
-@pytest.mark.parametrize("form", ["kitti", "tum"])
-def test_paths_are_read_in_the_forms_of_kitti_and_tum(tmp_path, form):
+def test_paths_are_read_in_the_forms_of_kitti_and_tum(tmp_path):
     path = straight(30)
-    file = tmp_path / "path.txt"
-    if form == "kitti":
-        path.write_kitti(file)
-    else:
-        Trajectory(path.stamps + 1e9, path.poses).write_tum(file)
-    found = read_path(str(file))
-    assert np.allclose(found.poses, path.poses, atol=1e-8)
-    assert np.allclose(found.stamps, path.stamps, atol=1e-6)
+    path.write_kitti(tmp_path / "kitti.txt")
+    Trajectory(path.stamps + 1e9, path.poses).write_tum(tmp_path / "tum.txt")
+    for name in ("kitti", "tum"):
+        found = read_path(str(tmp_path / f"{name}.txt"))
+        assert np.allclose(found.poses, path.poses, atol=1e-8)
+        assert np.allclose(found.stamps, path.stamps, atol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (None, "No such file"),
         ("", "has 8 columns, found"),
-        ("1 2 3\n", "has 8 columns, found"),
         ("hello\n", "cannot be read as a trajectory"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", r"a path of 0\.0 m in 1 poses; a drive needs 10 m to 100 km"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 99\n", "row 1 is 99 m from the one before"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 20 0 0 1 0\n", r"a path of 0\.0 m"),
         ("1 0 0 0 0 0 0 0 0 0 1 0\n", "the pose of row 0 has no rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n-1 0 0 0 0 -1 0 0 0 0 1 20\n", "y axis must point downwards"),
-        ("1 0 0 0 0 1 0 0 0 0 1 nan\n", "not finite"),
     ],
 )
 def test_what_is_no_path_is_refused_in_one_line(tmp_path, text, message):
     file = tmp_path / "path.txt"
-    file.write_text(text)
+    if text is not None:
+        file.write_text(text)
     with pytest.raises(SequenceError, match=message) as caught:
         open_sequence(f"synthetic:drive?path={file}")
-    assert str(file) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_drive_without_a_file_is_refused(tmp_path):
+    assert str(file) in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(SequenceError, match="no path is named"):
         open_sequence("synthetic:drive")
-    with pytest.raises(SequenceError, match=r"nowhere\.txt: No such file"):
-        open_sequence(f"synthetic:drive?path={tmp_path / 'nowhere.txt'}")
 
 
 def test_poses_stay_as_they_are_at_the_usual_rate_and_lie_between_them_at_another():
     path = straight(30)
     usual = {"rate": 10.0, "speed": 1.0, "frames": 0}
     assert np.array_equal(sampled(path, usual).poses, path.poses)
-    assert len(sampled(path, {**usual, "frames": 7})) == 7
-    assert len(sampled(path, {**usual, "frames": 700})) == 30
-    fine = sampled(path, {**usual, "rate": 20.0})
-    assert np.allclose(fine.positions[:, 1], np.arange(59) / 2)
+    assert [len(sampled(path, {**usual, "frames": n})) for n in (7, 700)] == [7, 30]
+    assert np.allclose(sampled(path, {**usual, "rate": 20.0}).positions[:, 1], np.arange(59) / 2)
     fast = sampled(path, {**usual, "speed": 2.0})
-    assert np.allclose(fast.stamps, np.arange(15) / 10)
-    assert np.allclose(fast.positions[:, 1], 2 * np.arange(15))
+    assert np.allclose(fast.stamps, np.arange(15) / 10) and np.allclose(fast.positions[:, 1], 2 * np.arange(15))
 
 
 def test_levelling_finds_upwards_in_any_axes():
@@ -84,11 +72,9 @@ def test_levelling_finds_upwards_in_any_axes():
 
 def test_a_road_driven_again_counts_once():
     there = np.column_stack([np.zeros(101), np.arange(101.0), np.zeros(101)])
-    back = np.add(there[::-1], (SAME_ROAD - 1, 0, 0))
-    aside = np.add(there, (2 * SAME_ROAD, 0, 0))
     once = Road.along(there)
     assert np.ptp(once.way) == pytest.approx(100 + 2 * 60, abs=3 * STEP)
-    again = Road.along(np.concatenate([there, back]))
-    assert len(again.xy) < 1.1 * len(once.xy) + 20
-    assert len(Road.along(np.concatenate([there, aside[::-1]])).xy) > 1.4 * len(once.xy)
     assert np.allclose(once.left[50], (-1, 0), atol=1e-6)
+    back, aside = (np.concatenate([there, np.add(there[::-1], (x, 0, 0))]) for x in (SAME_ROAD - 1, 2 * SAME_ROAD))
+    assert len(Road.along(back).xy) < 1.1 * len(once.xy) + 20
+    assert len(Road.along(aside).xy) > 1.4 * len(once.xy)

@@ -9,10 +9,12 @@ import yaml
 
 from slam.errors import SequenceError
 from slam.geometry.euler import rotation
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.se3 import pose
 from slam.sequences import open_sequence
 from slam.worlds import open_world
 from slam.worlds.export import DEPTH_STEPS, write_euroc
+
+WRITTEN = range(50, 58)
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +23,7 @@ def written(tmp_path_factory):
     sequence = open_world("box?frames=60&rig=toedin&dropright=53&drop=54&jump=56:0.5")
     folder = tmp_path_factory.mktemp("euroc") / "run"
     told = []
-    write_euroc(sequence, folder, 50, 58, told.append)
+    write_euroc(sequence, folder, WRITTEN.start, WRITTEN.stop, told.append)
     assert told == list(range(1, 9))
     return sequence, folder
 
@@ -32,75 +34,59 @@ def test_an_exported_world_is_read_back_as_it_was(written):
     read = open_sequence(folder)
     assert read.format == "euroc"
     assert read.rig.left == sequence.rig.left and read.rig.right == sequence.rig.right
-    assert np.allclose(read.rig.R, sequence.rig.R, atol=1e-15)
-    assert np.allclose(read.rig.b, sequence.rig.b, atol=1e-15)
-    assert np.allclose(read.ground_truth.poses, sequence.ground_truth.poses[50:58], atol=1e-8)
-    assert np.allclose(read.ground_truth.stamps, sequence.stamps[50:58], atol=1e-9)
-    frames = list(read)
-    assert len(frames) == 8
-    for frame, k in zip(frames, range(50, 58)):
+    assert np.allclose(read.rig.R, sequence.rig.R, atol=1e-15) and np.allclose(read.rig.b, sequence.rig.b, atol=1e-15)
+    assert np.allclose(read.ground_truth.poses, sequence.ground_truth.poses[WRITTEN], atol=1e-8)
+    assert np.allclose(read.ground_truth.stamps, sequence.stamps[WRITTEN], atol=1e-9)
+    for frame, k in zip(read, WRITTEN, strict=True):
         original = sequence.frame(k)
         assert frame.stamp == pytest.approx(original.stamp, abs=1e-9)
         assert np.array_equal(frame.left, original.left)
-        assert (frame.right is None) == (original.right is None)
-        assert frame.right is None or np.array_equal(frame.right, original.right)
+        assert np.array_equal(frame.right, original.right) or frame.right is original.right is None
 
 
-def test_depth_and_object_images_are_the_truth(written):
+def test_files_of_the_truth(written):
     sequence, folder = written
     k = 52
     name = f"{round(sequence.stamps[k] * 1e9)}.png"
     depth = cv2.imread(str(folder / "mav0/depth0/data" / name), cv2.IMREAD_UNCHANGED)
     steps = yaml.safe_load((folder / "mav0/depth0/sensor.yaml").read_text())["steps_per_metre"]
-    assert steps == DEPTH_STEPS["handheld"]
-    assert depth.dtype == np.uint16
+    assert steps == DEPTH_STEPS["handheld"] and depth.dtype == np.uint16
     assert np.abs(depth / steps - sequence.depth(k)).max() <= 0.5 / steps + 1e-6
     ids = cv2.imread(str(folder / "mav0/objects0/data" / name), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(ids, sequence.object_ids(k))
+    rows = np.loadtxt(folder / "mav0/landmarks.csv", delimiter=",", skiprows=1)
+    world = sequence.landmarks.world_positions(sequence.world.T_world_body(50))
+    assert np.allclose(rows[:, 1:4], world, atol=1e-8) and np.array_equal(rows[:, 4], sequence.landmarks.object)
+    assert (folder / "mav0/world.txt").read_text() == f"synthetic:{sequence.name}\n"
 
 
 def test_objects_csv_holds_poses_and_motions(written):
     sequence, folder = written
     with (folder / "mav0/objects.csv").open() as file:
         rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-    assert len(rows) == 8
-    poses = []
-    for row, k in zip(rows, range(50, 58)):
-        T = np.eye(4)
-        T[:3, :3] = rotation(np.array([row["roll"], row["pitch"], row["yaw"]]))
-        T[:3, 3] = row["x"], row["y"], row["z"]
+    before = None
+    for row, k in zip(rows, WRITTEN, strict=True):
+        T, motion = (
+            pose(rotation(np.array([row[f"{kind}{a}"] for a in ("roll", "pitch", "yaw")])),
+                 np.array([row[f"{kind}{a}"] for a in "xyz"]))
+            for kind in ("", "motion_")
+        )  # fmt: skip
         assert np.allclose(T, sequence.objects(k).T_world_object[0], atol=1e-8)
-        motion = np.eye(4)
-        motion[:3, :3] = rotation(np.array([row["motion_roll"], row["motion_pitch"], row["motion_yaw"]]))
-        motion[:3, 3] = row["motion_x"], row["motion_y"], row["motion_z"]
-        if poses:
-            assert np.allclose(motion @ poses[-1], T, atol=1e-8)
-        poses.append(T)
-
-
-def test_landmarks_and_ground_truth_files(written):
-    sequence, folder = written
-    rows = np.loadtxt(folder / "mav0/landmarks.csv", delimiter=",", skiprows=1)
-    world = sequence.landmarks.world_positions(sequence.world.T_world_body(50))
-    assert np.allclose(rows[:, 1:4], world, atol=1e-8)
-    assert np.array_equal(rows[:, 4], sequence.landmarks.object)
-    truth = Trajectory.read_euroc(folder / "mav0/state_groundtruth_estimate0/data.csv")
-    assert np.allclose(truth.poses, sequence.ground_truth.poses[50:58], atol=1e-8)
-    assert (folder / "mav0/world.txt").read_text() == f"synthetic:{sequence.name}\n"
+        assert before is None or np.allclose(motion @ before, T, atol=1e-8)
+        before = T
 
 
 def test_a_folder_is_not_overwritten_and_recordings_are_refused(written, tmp_path):
     sequence, folder = written
-    with pytest.raises(SequenceError, match="exists already"):
-        write_euroc(sequence, folder)
-    with pytest.raises(SequenceError, match="only synthetic worlds can be rendered"):
-        write_euroc(open_sequence(folder), tmp_path / "again")
-    with pytest.raises(SequenceError, match="frames 60: asked for"):
-        write_euroc(sequence, tmp_path / "late", 60)
-    file = tmp_path / "file"
-    file.write_text("")
-    with pytest.raises(SequenceError, match="cannot be written"):
-        write_euroc(sequence, file / "below", 0, 1)
+    (tmp_path / "file").write_text("")
+    for what, where, frames, words in (
+        (sequence, folder, (), "exists already"),
+        (open_sequence(folder), tmp_path / "again", (), "only synthetic worlds can be rendered"),
+        (sequence, tmp_path / "late", (60,), "frames 60: asked for"),
+        (sequence, tmp_path / "file" / "below", (0, 1), "cannot be written"),
+    ):
+        with pytest.raises(SequenceError, match=words):
+            write_euroc(what, where, *frames)
 
 
 def test_a_folder_whose_name_is_no_utf8(tmp_path):
