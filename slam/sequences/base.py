@@ -133,7 +133,11 @@ class RecordedSequence:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
         """Frames `start` up to, but without, `stop`; see `Sequence.frames`."""
-        return self._read(*frame_range(start, stop, len(self)))
+        first, last = frame_range(start, stop, len(self))
+        if stop is not None and stop > last:
+            with FaultLog(self.warnings) as faults:
+                faults.report("frames", f"{self.name}: frames {start}:{stop} asked for, it has {len(self)}")
+        return self._read(first, last)
 
     def _read(self, start: int, stop: int) -> Iterator[StereoFrame]:
         """Decode lazily and sum up repeated faults at the end, also where the caller stops early.

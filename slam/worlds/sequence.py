@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -51,7 +52,7 @@ class WorldSequence:
         stamps: times of the frames (N,) [s].
         landmarks: of the world; the row is the id.
         ground_truth: pose of the left camera at every frame.
-        warnings: always empty; recorded sequences have faults to report here.
+        warnings: lines of what was asked for beyond its end; recorded sequences have faults to report here, too.
         masks: of both cameras (H, W) bool, see `slam.data.StereoFrame`.
     """
 
@@ -89,6 +90,9 @@ class WorldSequence:
             SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
         """
         first, last = frame_range(start, stop, len(self))
+        if stop is not None and stop > last:
+            self.warnings.append(f"{self.name}: frames {start}:{stop} asked for, it has {len(self)}")
+            logging.getLogger("slam.worlds").warning("%s", self.warnings[-1])
         return (self.frame(k) for k in range(first, last))
 
     def frame(self, k: int) -> StereoFrame:

@@ -54,6 +54,8 @@ def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path, buil
     for start, stop, found in ((2, 5, [2, 3, 4]), (4, None, [4]), (3, 4, [3])):
         assert [f.index for f in sequence.frames(start, stop)] == found
     assert len(sequence.warnings) == 1
+    assert [f.index for f in sequence.frames(4, 80)] == [4]
+    assert f"{sequence.name}: frames 4:80 asked for, it has 6" in sequence.warnings
     for start, stop in ((-1, 3), (6, None), (3, 3), (4, 2)):
         with pytest.raises(SequenceError, match=r"has frames 0:6|end is not after the start"):
             sequence.frames(start, stop)

@@ -32,6 +32,8 @@ def test_what_is_asked_for_wrongly_is_refused_in_one_line(text, message):
 
 def test_frames_outside_the_recording_are_refused():
     sequence = worlds.open_world("box?frames=5")
+    assert len(list(sequence.frames(4, 9))) == 1
+    assert sequence.warnings == ["box?frames=5: frames 4:9 asked for, it has 5"]
     with pytest.raises(SequenceError, match="there is no frame 5; it has 5"):
         sequence.observations(5)
     with pytest.raises(SequenceError, match="frames 5: asked for"):
