@@ -154,26 +154,17 @@ def simulate(
     false = len(uv_left) - len(rows)
     source = np.concatenate([rows, np.full(false, _FALSE)])[order]
     false_stereo = np.concatenate([false_stereo, np.zeros(false, bool)])[order]
-    return _features(world, appearance, frame, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
-
-
-def _features(
-    world: World, appearance: Appearance, frame: int, stamp: float, seen: VisibleLandmarks, source: IdArray,
-    uv_left: Array, uv_right: Array, false_stereo: BoolArray, rng: np.random.Generator,
-) -> SimulatedFeatures:  # fmt: skip
-    """Features with the descriptors of their landmarks; `source` are their rows in `seen`, −1 for false ones."""
-    ids = np.append(seen.ids, _FALSE)[source]  # row −1 is the last one
-    size = np.append(seen.size, 12.0)[source]
-    false = np.flatnonzero(ids == _FALSE)
+    ids, size = np.append(seen.ids, _FALSE)[source], np.append(seen.size, 12.0)[source]  # row −1 is the last one
+    nothing = np.flatnonzero(ids == _FALSE)
     landmark = ids.copy()
-    landmark[false] = rng.integers(0, max(len(world.landmarks), 1), len(false))
+    landmark[nothing] = rng.integers(0, max(len(world.landmarks), 1), len(nothing))
     views = _views(world, frame, seen, source) if appearance.drifting else None
     descriptors = appearance.describe(landmark, views, float(world.stamps[frame]), rng)
-    descriptors[false] = appearance.of_nothing(len(false), rng)
+    descriptors[nothing] = appearance.of_nothing(len(nothing), rng)
     objects = world.landmarks.object[landmark]
-    objects[false] = _FALSE
+    objects[nothing] = _FALSE
     features = StereoFeatures(
-        stamp, uv_left, uv_right, size, np.zeros(len(ids)), appearance.response[landmark],
+        stamp, uv_left[order], uv_right[order], size, np.zeros(len(ids)), appearance.response[landmark],
         appearance.laplacian[landmark], unit(descriptors),
     )  # fmt: skip
     return SimulatedFeatures(features, ids, objects, false_stereo)

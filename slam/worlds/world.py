@@ -49,14 +49,10 @@ class World:
         return RectangleArrays.of(self.rectangles)
 
     @cached_property
-    def drawn(self) -> tuple[Rectangle, ...]:
+    def drawn(self) -> tuple[tuple[Rectangle, ...], RectangleArrays]:
         """The rectangles as they are drawn: some in parts, so that only what comes into view is painted."""
-        return tuple(piece for r in self.rectangles for piece in r.parts())
-
-    @cached_property
-    def drawn_arrays(self) -> RectangleArrays:
-        """`drawn` as arrays."""
-        return RectangleArrays.of(self.drawn)
+        pieces = tuple(piece for r in self.rectangles for piece in r.parts())
+        return pieces, RectangleArrays.of(pieces)
 
     @cached_property
     def occluders(self) -> RectangleArrays:

@@ -74,10 +74,3 @@ def _about(axis: int, angle: float) -> np.ndarray:
     R[[i, j], [i, j]] = np.cos(angle)
     R[i, j], R[j, i] = -np.sin(angle), np.sin(angle)
     return R
-
-
-def test_another_layout_is_another_world_and_the_same_layout_is_the_same():
-    a, b, c = (open_world(f"aisle?layout={n}") for n in (0, 0, 1))
-    assert np.array_equal(a.landmarks.positions, b.landmarks.positions)
-    assert a.landmarks.positions.shape != c.landmarks.positions.shape
-    assert not np.array_equal(a.ground_truth.poses, c.ground_truth.poses)
