@@ -79,9 +79,11 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
     folder, options = expanded(text).absolute(), dict[str, str]()
     if mark and not _exists(text):
         folder, options = expanded(name).absolute(), read_options(query)
-    if not (folder.is_file() and "layout" in options):
-        _require_recording(folder, text)
-    name = _detect(folder, options) if format is None else format
+    like = _format(folder, options, text)
+    name = like if format is None else format
+    if not name:
+        hint = hints.of_sequences_near(folder, _format_of)
+        raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
     if name not in _FORMATS:
         raise UnknownNameError(unknown("format", name, formats()))
     module_name, end, _ = _FORMATS[name]
@@ -139,28 +141,21 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _require_recording(folder: Path, text: str) -> None:
-    """Refuse what is neither a folder with something in it nor a ROS recording; `text` is what was asked for."""
+def _format(folder: Path, options: dict[str, str], text: str) -> str:
+    """The first format that a folder looks like; told where left and right are, it needs not look.
+
+    What is neither a folder with something in it nor a recording is refused; `text` is what was asked for.
+    """
     if _matches("ros", folder):
-        return
+        return "ros"
     if not folder.exists():
         what = "file or folder" if folder.suffix else "folder"
         raise SequenceError(f"{folder}: there is no such {what}{hints.near_name(folder, text)}")
-    if not folder.is_dir():
+    if not folder.is_dir() and "layout" not in options:
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hints.of_video(folder)}")
-    if not any(folder.iterdir()):
+    if folder.is_dir() and not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")
-
-
-def _detect(folder: Path, options: dict[str, str]) -> str:
-    """The first format that the folder looks like; told where left and right are, it needs not look."""
-    if options.keys() & {"left", "right", "layout"} and not _matches("ros", folder):
-        return "folders"
-    name = _format_of(folder)
-    if name is None:
-        hint = hints.of_sequences_near(folder, _format_of)
-        raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
-    return name
+    return "folders" if options.keys() & {"left", "right", "layout"} else _format_of(folder) or ""
 
 
 def _format_of(folder: Path) -> str | None:

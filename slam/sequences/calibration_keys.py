@@ -26,7 +26,7 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
     "D": ("d", "distcoeffs", "dist", "distortion", "distortioncoeffs", "distortioncoefficients", "distortioncoeff"),
     "P": ("p", "projectionmatrix", "projection"),
     "R_rect": ("r", "rectificationmatrix"),
-    "T_BS": ("tbs",),
+    "T_BS": ("tbs", "timucam"),
     "T_cam_imu": ("tcamimu",),
     "R": ("r", "rot", "rotation", "rotationmatrix", "stereor", "rstereo"),
     "T": ("t", "trans", "translation", "translationvector", "stereot", "tstereo"),

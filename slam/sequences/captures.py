@@ -62,15 +62,28 @@ def open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> Vide
 
     SequenceError where a file is no readable video, the frame sizes differ, or the frame rate is not known.
     """
-    found = [_describe(path) for path in paths]
-    counts, images = [count for count, _, _ in found], [image for *_, image in found]
+    import cv2
+
+    counts, images, rates = list[int](), list[np.ndarray](), list[float]()
+    for path in paths:
+        with _open(path) as video:
+            claimed = video.get(cv2.CAP_PROP_FRAME_COUNT)
+            rates.append(float(video.get(cv2.CAP_PROP_FPS)))
+            first = read_image(video) if video.grab() else None
+            if first is None:
+                raise SequenceError(f"{path}: no frame of the video can be decoded")
+            images.append(first)
+            counts.append(int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 1)
+            with quiet_libraries():
+                while claimed <= 0 and counts[-1] < _MOST_FRAMES and video.grab():  # it does not say
+                    counts[-1] += 1
     images = list(halves(images[0], paths[0])) if len(paths) == 1 else images
     size = images[0].shape[1], images[0].shape[0]
     require_same_size(size, images[1].shape[::-1], *paths)
     if counts[0] != counts[-1]:
         line = f"{paths[0]} has {counts[0]} frames, {paths[1]} has {counts[1]}: the surplus is left out"
         faults.report("videos", line)
-    rate = rate or found[0][1]
+    rate = rate or rates[0]
     if not SLOWEST <= rate <= FASTEST:
         raise SequenceError(f"{paths[0]}: the frame rate is not known, add fps=…")
     return VideoPairs(np.arange(min(counts)) / rate, paths, size)
@@ -93,24 +106,6 @@ def _open(path: Path) -> Iterator[Any]:
     finally:
         with quiet_libraries():
             capture.release()
-
-
-def _describe(path: Path) -> tuple[int, float, np.ndarray]:
-    """Number of frames, frame rate [1/s] and first image of a video; frames are counted where it does not say."""
-    import cv2
-
-    with _open(path) as video:
-        claimed, rate = video.get(cv2.CAP_PROP_FRAME_COUNT), float(video.get(cv2.CAP_PROP_FPS))
-        count = int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 0
-        first = read_image(video) if video.grab() else None
-        if first is None:
-            raise SequenceError(f"{path}: no frame of the video can be decoded")
-        if count <= 0:
-            count = 1
-            with quiet_libraries():
-                while count < _MOST_FRAMES and video.grab():
-                    count += 1
-    return count, rate, first
 
 
 @contextmanager

@@ -47,7 +47,9 @@ def open_folder(folder: Path, options: Given, faults: FaultLog) -> RecordedSeque
     root = _root(folder)
     left, right = _listings(root, faults)
     source = image_pairs(timed(left, right, options, faults, read_times(folder, options, faults)), right.folder)
-    own = _calibration(root)
+    own = [root / cam / "sensor.yaml" for cam in _CAMERAS]
+    if not any(file.exists() for file in own):
+        own = [file for name in _CAMCHAINS if (file := root / name).is_file()][:1]
     missing = f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing (nor is there a Kalibr camchain.yaml)"
     named = "calibration" in options or not own
     files = calibration_files(folder, options, f"{missing}: add calibration=FILE") if named else own
@@ -97,14 +99,6 @@ def _stamp_and_name(text: str) -> tuple[int, str]:
     if not 0 <= value <= MOST_NANOSECONDS:
         raise ValueError(f"{shorten(stamp)} is no possible time in nanoseconds")
     return value, name or f"{stamp}.png"
-
-
-def _calibration(root: Path) -> list[Path]:
-    """Both ``sensor.yaml`` or, where those are missing, a Kalibr ``camchain.yaml``; empty for neither."""
-    files = [root / cam / "sensor.yaml" for cam in _CAMERAS]
-    if any(file.exists() for file in files):
-        return files
-    return next(([root / name] for name in _CAMCHAINS if (root / name).is_file()), [])
 
 
 def _ground_truth(root: Path, calibration: list[Path], faults: FaultLog) -> Trajectory | None:

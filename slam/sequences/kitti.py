@@ -155,20 +155,15 @@ def _rig(folder: Path, where: Layout, size: Size, options: Given) -> tuple[Stere
         name = "P" if where.drive is None else "P_rect_"
         P_left, P_right = (kitti_matrix(rows, f"{name}{camera}", (3, 4)) for camera in where.cameras)
         if where.drive is not None:
-            _require_rectified(rows, size, where.cameras[0])
+            expected = kitti_matrix(rows, f"S_rect_{where.cameras[0]}", (2,)).astype(int)
+            if tuple(expected) != size:  # perhaps those of an unrectified drive
+                text = f"images are {size_text(size)}, S_rect_{where.cameras[0]} says {size_text(tuple(expected))}"
+                if tuple(rows.get(f"S_{where.cameras[0]}", ())) == size:
+                    text += ": this is an unrectified (extract) drive, take the rectified (sync) one"
+                raise CalibrationError(text)
             T = rigid(pose(kitti_matrix(rows, "R_rect_00", (3, 3)), np.zeros(3)), "R_rect_00")
         T = pose(np.eye(3), projection_offset(P_left)) @ T
         return read_rig(named, size, options) if named else rig_from_projections(P_left, P_right, size), T
-
-
-def _require_rectified(rows: dict[str, Array], size: Size, camera: str) -> None:
-    """Raise where images are of another size than the rectified ones: perhaps those of an unrectified drive."""
-    expected = kitti_matrix(rows, f"S_rect_{camera}", (2,)).astype(int)
-    if tuple(expected) != size:
-        text = f"images are {size_text(size)}, S_rect_{camera} says {size_text(tuple(expected))}"
-        if tuple(rows.get(f"S_{camera}", ())) == size:
-            text += ": this is an unrectified (extract) drive, take the rectified (sync) one"
-        raise CalibrationError(text)
 
 
 def _truth(

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from slam.errors import SequenceError
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
 from slam.sequences.base import Images, RecordedSequence
@@ -22,7 +21,7 @@ from slam.sequences.given import Given, flag, metres_per_unit
 from slam.sequences.images import Size, halves
 from slam.sequences.pairs import Listing, distinct, in_order, pair_up
 from slam.sequences.rigs import calibration_files, read_rig, require_size
-from slam.sequences.ros_bag import Bag, Message, Topics, choose_topics, open_bag, rig_from_camera_infos
+from slam.sequences.ros_bag import Bag, Message, choose_topics, open_bag, rig_from_camera_infos
 
 #: Options besides those of all formats.
 OPTIONS = frozenset({"left_info", "right_info"})
@@ -51,11 +50,19 @@ def open_folder(path: Path, options: Given, faults: FaultLog) -> RecordedSequenc
     with open_bag(path) as bag:
         topics = choose_topics(bag, options)
         messages = [_stamps(bag, topic, faults) for topic in dict.fromkeys((topics.left, topics.right))]
-        image = _first_image(bag, topics.left)
+        image = bag.first_image(topics.left)
     left, *right = _in_time(messages, faults)
     pairs = distinct(pair_up(left, right[0] if right else None, options, faults), faults)
     one = image if right else halves(image, topics.left)[0]
-    rig = _rig(path, topics, (one.shape[1], one.shape[0]), options)
+    size = one.shape[1], one.shape[0]
+    if "calibration" in options:
+        rig = read_rig(calibration_files(path if path.is_dir() else path.parent, options), size, options)
+    else:
+        where = Path(topics.info_names)
+        rectified = flag(options, "rectified") if "rectified" in options else topics.rectified
+        with naming(where):
+            rig = rig_from_camera_infos(topics.infos, rectified, metres_per_unit(options))
+        require_size(size, rig, where)
     rows = np.array([[-1 if row is None else int(row) for row in n] for n in (pairs.left.names, pairs.partners)])
     source = RosPairs(pairs.stamps, path, messages, rows[: len(messages)].T, (image.shape[1], image.shape[0]))
     return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source)
@@ -171,26 +178,3 @@ def _stamps(bag: Bag, topic: str, faults: FaultLog) -> Messages:
         faults.report("stamps", f"{topic}: the images have no stamps; the times of recording are taken")
         stamps = recorded
     return Messages(topic, np.array(stamps, np.int64), np.array(recorded, np.int64))
-
-
-def _first_image(bag: Bag, topic: str) -> np.ndarray:
-    """The first image of a topic that can be read."""
-    reason = "no messages"
-    for message in bag.messages([topic]):
-        try:
-            return bag.image(message, topic)
-        except SequenceError as error:
-            reason = str(error)
-    raise SequenceError(f"{bag.path}: no image of {topic} can be read: {reason}")
-
-
-def _rig(path: Path, topics: Topics, size: Size, options: Given) -> StereoRig:
-    """The rig by the calibration file that is named, else by the camera messages."""
-    if "calibration" in options:
-        return read_rig(calibration_files(path if path.is_dir() else path.parent, options), size, options)
-    where = Path(topics.info_names)
-    rectified = flag(options, "rectified") if "rectified" in options else topics.rectified
-    with naming(where):
-        rig = rig_from_camera_infos(topics.infos, rectified, metres_per_unit(options))
-    require_size(size, rig, where)
-    return rig

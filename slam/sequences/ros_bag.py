@@ -131,6 +131,16 @@ class Bag:
         with naming_recording(self.path):
             return grey_image(self.read(message), message.kind, what, size)
 
+    def first_image(self, topic: str) -> np.ndarray:
+        """The first image (H, W) of a topic that can be read; SequenceError where none can."""
+        reason = "no messages"
+        for message in self.messages([topic]):
+            try:
+                return self.image(message, topic)
+            except SequenceError as error:
+                reason = str(error)
+        raise SequenceError(f"{self.path}: no image of {topic} can be read: {reason}")
+
     def first(self, topic: str) -> Any:
         """The first message of a topic as an object; None where there is none."""
         with closing(self.messages([topic])) as messages:
@@ -226,7 +236,7 @@ class Topics:
     @property
     def rectified(self) -> bool:
         """Whether the images are rectified, by ROS's names for topics (``image_rect``, ``image_rect_raw``)."""
-        return all("rect" in _image_name(topic) for topic in (self.left, self.right))
+        return all("rect" in _split(topic)[1] for topic in (self.left, self.right))
 
 
 def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
@@ -270,7 +280,7 @@ def _with_infos(bag: Bag, images: tuple[str, ...], options: Mapping[str, str]) -
     """Images with their cameras' messages, named or in the same name space, unless a calibration is named."""
     names = []
     for side, topic in zip(("left", "right"), () if "calibration" in options else images):
-        usual = f"{_space(topic)}/camera_info"
+        usual = f"{_split(topic)[0]}/camera_info"
         if f"{side}_info" in options:
             names.append(_named(bag, options[f"{side}_info"], (_INFO,)))
         elif bag.kinds.get(usual) == _INFO:
@@ -287,7 +297,7 @@ def _pairs_by_messages(bag: Bag) -> Iterator[Topics]:
     """All pairs of cameras that say that they are one."""
     cameras = []
     for name in _of_kind(bag, (_INFO,)):
-        images = [t for t in _preferred(bag) if _space(t) == _space(name) and not _is_depth(bag, t)]
+        images = [t for t in _preferred(bag) if _split(t)[0] == _split(name)[0] and not _is_depth(bag, t)]
         if images and bag.first(name) is not None:
             cameras.append((images[0], name, CameraInfo.read(bag, name)))
     for left, left_name, a in cameras:
@@ -305,7 +315,7 @@ def _pairs_by_name(bag: Bag) -> list[Topics]:
         for names in SIDES:
             other = topic.replace(*names)
             if other != topic and other in images and not _is_depth(bag, topic):
-                spaces = _space(topic), _space(other)
+                spaces = _split(topic)[0], _split(other)[0]
                 found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), Topics(topic, other))
     return list(found.values())
 
@@ -335,25 +345,17 @@ def _preferred(bag: Bag) -> list[str]:
     """Topics of images in the order in which they are chosen: rectified, raw before compressed, grey before colour."""
 
     def key(topic: str) -> Any:
-        name = _image_name(topic)
+        _, name = _split(topic)
         return "rect" not in name, bag.kinds[topic] == COMPRESSED, "color" in name
 
     return sorted(_of_kind(bag, _IMAGES), key=key)
 
 
-def _base(topic: str) -> str:
-    """A topic without what names its compression."""
-    base, _, last = topic.rpartition("/")
-    return base if last.startswith("compressed") else topic
-
-
-def _space(topic: str) -> str:
-    """The name space of a camera's topic."""
-    return _base(topic).rpartition("/")[0]
-
-
-def _image_name(topic: str) -> str:
-    return _base(topic).rpartition("/")[2]
+def _split(topic: str) -> tuple[str, str]:
+    """The name space of a camera's topic, and its last name without what names its compression."""
+    space, _, last = topic.rpartition("/")
+    space, _, last = space.rpartition("/") if last.startswith("compressed") else (space, "", last)
+    return space, last
 
 
 def _listed(topics: list[str]) -> str:

@@ -9,7 +9,6 @@ May import `slam.geometry` and the data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -49,18 +48,13 @@ def open_world(text: str) -> WorldSequence:
     values = parse_query(name, query, options(name))
     key = tuple(sorted((k, v) for k, v in values.items() if k not in _RECORDING_ONLY))
     world = _build(name, key)
-    rig = _true_rig(world.rig, values)
-    recorded = world if rig is world.rig else replace(world, rig=rig, seen={})
-    return WorldSequence(text, recorded, values, world.rig)
-
-
-def _true_rig(told: StereoRig, values: Mapping[str, Any]) -> StereoRig:
-    """The cameras that record, where the system is told another rig; that rig itself where no error is asked for."""
+    told, recorded = world.rig, world
     share, turn = 1 / (1 + values["focal_error"]), 1e-3 * values["turn_error"]
-    if share == 1 and turn == 0:
-        return told
-    left, right = (replace(camera, fu=share * camera.fu, fv=share * camera.fv) for camera in (told.left, told.right))
-    return StereoRig(left, right, so3_exp(np.full(3, turn)) @ told.R, told.b)
+    if share != 1 or turn != 0:  # the cameras that record are others than the system is told
+        left, right = (replace(c, fu=share * c.fu, fv=share * c.fv) for c in (told.left, told.right))
+        true = StereoRig(left, right, so3_exp(np.full(3, turn)) @ told.R, told.b)
+        recorded = replace(world, rig=true, seen={})
+    return WorldSequence(text, recorded, values, told)
 
 
 def options(name: str) -> dict[str, Option]:
@@ -70,13 +64,8 @@ def options(name: str) -> dict[str, Option]:
 
 
 def describe(name: str) -> str:
-    """A world in a line, and a line for each option that it has alone, or with another default than other worlds.
-
-    Raises:
-        UnknownNameError: there is no such world.
-    """
-    scene = _scene(name)
-    table = options(name)
+    """A world in a line, and a line for each option of its own or with another default; raises UnknownNameError."""
+    scene, table = _scene(name), options(name)
     own = [o.name for o in scene.options]
     changed = [o for o in scene.defaults if o not in own]
     return "\n".join([f"{name}: {scene.text}", *(_line(table[key]) for key in (*own, *changed))])

@@ -260,38 +260,26 @@ def field(values: Mapping[str, Any]) -> Parts:
         rectangle(Material(12.0, 9.0, "wood", layout + 1, 1), (-6.0, 4.0, -0.01), RIGHT, BACK),
         rectangle(Material(12.0, 3.5, "plaster", layout, 0.3), (-6.0, 4.0, 3.4), RIGHT, DOWN),
     ]
-    return Parts(stamps, poses, hall + _boards(layout) + _obstacles(layout))
-
-
-def _boards(layout: int) -> list[Rectangle]:
-    """Advertising boards behind the field, and posters on the hall's wall."""
     rng = np.random.default_rng([layout, 49])
-    out = []
-    for i in range(8):
+    for i in range(8):  # advertising boards behind the field
         board = Material(0.72, 0.5, "poster", int(rng.integers(1 << 30)), 60, (0.03, 0.08))
-        out.append(rectangle(board, (-3.0 + 0.75 * i, 2.15 + rng.uniform(0, 0.1), 0.5), RIGHT, DOWN, occludes=True))
-    for i in range(7):
+        hall.append(rectangle(board, (-3.0 + 0.75 * i, 2.15 + rng.uniform(0, 0.1), 0.5), RIGHT, DOWN, occludes=True))
+    for i in range(7):  # and posters on the hall's wall
         poster = Material(0.6, 0.8, "poster", int(rng.integers(1 << 30)), 60, (0.03, 0.08))
-        out.append(rectangle(poster, (-4.2 + 1.2 * i, 3.98, 1.9), RIGHT, DOWN))
-    return out
-
-
-def _obstacles(layout: int) -> list[Rectangle]:
-    """Goal posts and cartons on the field."""
-    rng = np.random.default_rng([layout, 50])
-    out = []
-    for x in (-0.75, 0.7):  # the posts of the goal
+        hall.append(rectangle(poster, (-4.2 + 1.2 * i, 3.98, 1.9), RIGHT, DOWN))
+    for across in (-0.75, 0.7):  # the posts of the goal
         faces = {side: Material(0.05, 0.8, "board", layout) for side in ("front", "left", "right")}
-        out += cuboid(faces, (0.05, 0.05, 0.8), (x, 1.7, 0))
-    for i, (x, y) in enumerate(((-1.6, 0.9), (-0.4, 1.2), (0.5, 0.8), (1.7, 1.1))):
+        hall += cuboid(faces, (0.05, 0.05, 0.8), (across, 1.7, 0))
+    rng = np.random.default_rng([layout, 50])
+    for i, place in enumerate(((-1.6, 0.9), (-0.4, 1.2), (0.5, 0.8), (1.7, 1.1))):  # cartons on the field
         size = rng.uniform(0.18, 0.32, 3)
         faces = {}
         for side in ("front", "left", "right", "top"):
             a, b = FACES[side][3]
             faces[side] = Material(size[a], size[b], "carton", 1000 * layout + 10 * i + a, 200, (0.015, 0.04))
-        T = pose(yaw_pitch_roll(rng.uniform(-0.6, 0.6), 0, 0), np.array([x, y, 0.0]))
-        out += cuboid(faces, size, T_body_box=T)
-    return out
+        T = pose(yaw_pitch_roll(rng.uniform(-0.6, 0.6), 0, 0), np.array([*place, 0.0]))
+        hall += cuboid(faces, size, T_body_box=T)
+    return Parts(stamps, poses, hall)
 
 
 CAMERA = (0.03, -0.70, 0.027)  #: where the camera stands before the board, whose middle is the world's origin [m]

@@ -14,7 +14,7 @@ import numpy as np
 from slam.data import StereoFrame
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, exp, inverse, log
-from slam.worlds.faults import Faults, in_hand
+from slam.worlds.options import Faults, in_hand
 from slam.worlds.painting import paint
 from slam.worlds.raster import NEAR, Ripmap, View, draw, place
 from slam.worlds.world import World

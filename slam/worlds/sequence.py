@@ -18,8 +18,8 @@ from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
 from slam.showing import sequence_line
-from slam.worlds.faults import Faults
 from slam.worlds.observe import Appearance, SimulatedFeatures, appearance, simulate
+from slam.worlds.options import Faults
 from slam.worlds.world import World
 
 if TYPE_CHECKING:

@@ -149,6 +149,9 @@ def test_kalibr(two_folders: Path) -> None:
         ConfigurationError, match=r"option 'unit' does nothing with .*camchain\.yaml, which is Kalibr's"
     ):
         open_sequence(f"{two_folders}?unit=mm")
+    poses = [f"  T_imu_cam: [[1,0,0,{x}], [0,1,0,0], [0,0,1,0], [0,0,0,1]]\n" for x in (0.0, 0.3)]  # as OpenVINS has it
+    (two_folders / "camchain.yaml").write_text("".join(CAMERA.format(i) + T for i, T in enumerate(poses)))
+    assert np.allclose(open_sequence(two_folders).rig.b, [-0.3, 0, 0])
 
 
 @pytest.mark.parametrize(

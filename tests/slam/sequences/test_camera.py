@@ -19,6 +19,7 @@ import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.sequences import camera, is_live
 from slam.sequences import captures as devices
+from slam.sequences.rigs import write_opencv
 
 WIDTH, HEIGHT = 160, 120
 
@@ -32,10 +33,7 @@ def scene() -> list[slam.StereoFrame]:
 def rig_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> slam.StereoRig:
     """The calibration of the scene in the working folder."""
     rig = slam.open_sequence(f"synthetic:desk?frames=4&width={WIDTH}&height={HEIGHT}").rig
-    storage = cv2.FileStorage(str(tmp_path / "calibration.yaml"), cv2.FILE_STORAGE_WRITE)
-    for name, value in {"K1": rig.left.K, "K2": rig.right.K, "R": rig.R, "T": rig.R @ rig.b}.items():
-        storage.write(name, value)
-    storage.release()
+    write_opencv(tmp_path / "calibration.yaml", rig)
     monkeypatch.chdir(tmp_path)
     return rig
 
@@ -81,34 +79,27 @@ def grey(value: int, width: int = WIDTH) -> np.ndarray:
     return np.full((HEIGHT, width), value, np.uint8)
 
 
-def write_video(path: Path, images: list[np.ndarray], rate: float = 50.0) -> None:
-    size = images[0].shape[1], images[0].shape[0]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), rate, size)
-    for image in images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
+def both(values) -> list[np.ndarray]:
+    """Images that hold a left and a right one, side by side."""
+    return [np.hstack([grey(10 * k), grey(10 * k + 5)]) for k in values]
 
 
 def test_two_devices_and_one_with_both_images_give_the_same(rig_here, played):
     left, right = [grey(10 * k) for k in range(1, 5)], [grey(10 * k + 5) for k in range(1, 5)]
-    both = [np.hstack(pair) for pair in zip(left, right)]
-    expected = [(10 * k, 10 * k + 5) for k in (2, 3, 4)]  # the first pair told the size
-    for text, images in (("camera:0,1", {"0": left, "1": right}), ("camera:2", {"2": both})):
+    for text, images in (("camera:0,1", {"0": left, "1": right}), ("camera:2", {"2": both(range(1, 5))})):
         played(images)
         sequence = slam.open_sequence(text)
-        assert is_live(sequence)
+        assert is_live(sequence) and sequence.rig.b == pytest.approx(rig_here.b)
         assert (sequence.format, sequence.kind, sequence.name) == ("camera", "handheld", text)
-        assert sequence.rig.b == pytest.approx(rig_here.b)
         frames = list(sequence.frames(0, 3))
-        assert [(int(f.left[0, 0]), int(f.right[0, 0])) for f in frames] == expected
-        assert [f.index for f in frames] == [0, 1, 2]
-        assert (np.diff([f.stamp for f in frames]) > 0).all()
-        assert abs(frames[0].stamp - time.time()) < 60
+        found = [(f.index, int(f.left[0, 0]), int(f.right[0, 0])) for f in frames]
+        assert found == [(k - 2, 10 * k, 10 * k + 5) for k in (2, 3, 4)]  # the first pair told the size
+        assert (np.diff([f.stamp for f in frames]) > 0).all() and abs(frames[0].stamp - time.time()) < 60
 
 
 def test_a_camera_that_comes_back_with_another_size_ends_the_frames(rig_here, played):
-    good, other = np.hstack([grey(10), grey(20)]), np.hstack([grey(10), grey(20)])[:-1]
-    played({"0": [good, good, None, other, other]})
+    good = both([1])[0]
+    played({"0": [good, good, None, good[:-1], good[:-1]]})
     frames = slam.open_sequence("camera:0").frames()
     assert next(frames).index == 0
     with pytest.raises(SequenceError, match=r"camera:0: images are 160x119 now; they were 160x120"):
@@ -116,19 +107,21 @@ def test_a_camera_that_comes_back_with_another_size_ends_the_frames(rig_here, pl
 
 
 def test_a_video_is_no_camera_but_runs_live(rig_here, scene, tmp_path):
-    write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in scene], 20.0)
+    writer = cv2.VideoWriter(str(tmp_path / "both.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 20, (2 * WIDTH, HEIGHT))
+    for f in scene:
+        writer.write(cv2.cvtColor(np.hstack([f.left, f.right]), cv2.COLOR_GRAY2BGR))
+    writer.release()
     with pytest.raises(SequenceError, match=r"a file, not a camera; .*'both\.avi\?layout=sbs'"):
         slam.open_sequence("camera:both.avi")
     began = time.monotonic()
     frames = list(slam.LiveFrames(slam.open_sequence("both.avi?layout=sbs")))
-    assert [f.index for f in frames] == [0, 1, 2, 3]
-    assert time.monotonic() - began > 0.14
+    assert [f.index for f in frames] == [0, 1, 2, 3] and time.monotonic() - began > 0.14
     assert frames[0].left.shape == (HEIGHT, WIDTH)
     assert [np.abs(f.left.astype(float) - s.left).mean() < 5 for f, s in zip(frames, scene)] == [True] * 4
 
 
 def test_a_camera_that_stops_and_comes_back_is_waited_for(rig_here, played, caplog):
-    pairs = [np.hstack([grey(10 * k), grey(10 * k + 5)]) for k in range(6)]
+    pairs = both(range(6))
     played({"0": [*pairs[:3], None, None, None, *pairs[3:]]})
     sequence = slam.open_sequence("camera:0")
     frames = list(sequence.frames(0, 5))
@@ -136,15 +129,13 @@ def test_a_camera_that_stops_and_comes_back_is_waited_for(rig_here, played, capl
     assert (np.diff([f.stamp for f in frames]) > 0).all()
     assert Played.opened == 5  # for the size, for the frames, and after each of the failures
     assert len(sequence.warnings) == 2
-    assert "no more frames; they are waited for 10 s" in caplog.text
-    assert "frames again after 0." in caplog.text
+    assert "no more frames; they are waited for 10 s" in caplog.text and "frames again after 0." in caplog.text
 
 
 def test_a_camera_that_stays_silent_ends_the_run_with_one_line(rig_here, played):
-    played({"0": [np.hstack([grey(10), grey(15)])] * 3})
+    played({"0": both([1]) * 3})
     frames = slam.open_sequence("camera:0?wait=0.05").frames()
-    assert next(frames).index == 0
-    assert next(frames).index == 1
+    assert [next(frames).index, next(frames).index] == [0, 1]
     with pytest.raises(SequenceError, match=r"camera:0: no frames for 0.05 s"):
         next(frames)
 

@@ -27,9 +27,7 @@ def test_whoever_is_fast_enough_gets_every_frame_at_its_time():
     taken = [(frame.index, time.monotonic() - began) for frame in live]
     assert [index for index, _ in taken] == list(range(6))
     assert all(when >= 0.05 * index for index, when in taken)
-    assert live.dropped == 0
-    assert not live.ended_early
-    assert not threads()
+    assert live.dropped == 0 and not live.ended_early and not threads()
 
 
 def test_whoever_is_too_slow_gets_the_newest_and_what_is_left_out_is_counted():
@@ -38,9 +36,7 @@ def test_whoever_is_too_slow_gets_the_newest_and_what_is_left_out_is_counted():
         indices.append(frame.index)
         time.sleep(0.05)
         assert live.age(frame) >= 0.05
-    assert indices == sorted(indices)
-    assert indices[-1] == 99
-    assert 3 < len(indices) < 50
+    assert indices == sorted(indices) and indices[-1] == 99 and 3 < len(indices) < 50
     assert live.dropped == 100 - len(indices)
 
 
