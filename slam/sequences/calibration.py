@@ -1,4 +1,7 @@
-"""What calibrations of all forms are made of, and KITTI's files."""
+"""Calibration files of all forms as nested entries, and the matrices in them.
+
+Files may be hostile: YAML is bounded in depth and read without aliases and tags, XML without entities.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""KITTI's recordings as downloaded: odometry, tracking, raw (synchronised drives) and KITTI-360."""
+"""KITTI's recordings as downloaded, and their true paths: odometry, tracking, raw (synchronised) and KITTI-360."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ROS recordings as they are read by the package rosbags, and their image messages as grey images."""
+"""ROS recordings as they are read by the package rosbags: images in grey, and the topics and the rig of a pair."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
 """Pictures of a world: textured rectangles drawn in perspective, supersampled.
 
-First it is settled which rectangle each sample shows. Then each rectangle is painted where it is seen, in blocks of
-the view: its texture reaches a block by one homography, from the version of the texture whose texels are as large as
-the samples there; averaging the samples of a pixel then gives the pixel's area. Nothing is finer than the samples, so
-no aliasing is left for a detector to find. Where neighbouring blocks show different versions, one passes gradually into
-the other: the same edge lies a little differently in the texels of two versions, and a corner on a sharp seam between
-them would be drawn up to 0.1 px from its place.
+First it is settled which rectangles may be seen, which samples each covers, and which one each sample shows. Then
+each rectangle is painted where it is seen, in blocks of the view: its texture reaches a block by one homography, from
+the version of the texture whose texels are as large as the samples there; averaging the samples of a pixel then gives
+the pixel's area. Nothing is finer than the samples, so no aliasing is left for a detector to find. Where neighbouring
+blocks show different versions, one passes gradually into the other: the same edge lies a little differently in the
+texels of two versions, and a corner on a sharp seam between them would be drawn up to 0.1 px from its place.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Textured surfaces: where something stands out on them is known without painting them."""
+"""Textured surfaces, bookshelves among them: where something stands out is known without painting them."""
 
 from __future__ import annotations
 
