@@ -40,7 +40,7 @@ def pictures(group: Group) -> Iterator[tuple[str, str, Figure]]:
     trial = next(iter(shown.values())).trial
     of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
     known = {metric.key: metric for metric in group.metrics}
-    main = known.get("ate_online_m") or known.get("gps_m")
+    main = known.get("ate_online_m")
     if main is not None and group.trials > 1:
         text = f"{main.label}, of every trial; lines join the back ends' runs on the same recording."
         yield main.label, text, _draw_pairs(group, main)

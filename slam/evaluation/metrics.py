@@ -1,4 +1,4 @@
-"""Accuracy of an estimated path: ATE, RPE by frames and by distance, GPS distance, and consistency (NEES).
+"""Accuracy of an estimated path: ATE, RPE by frames and by distance, and consistency (NEES).
 
 Definitions, with P the estimated and Q the true poses ``T_world_left`` at common stamps:
 
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.errors import TrajectoryError
-from slam.geometry.alignment import Alignment, align, align_positions
+from slam.geometry.alignment import Alignment, align
 from slam.geometry.se3 import Array, inverse, log, pose, rotation_angle, so3_exp, so3_log
 from slam.geometry.stamps import pair
 from slam.geometry.trajectory import Trajectory
@@ -230,30 +230,6 @@ def segment_lengths(path_length: float) -> tuple[float, ...]:
     if path_length >= 1000:
         return KITTI_LENGTHS
     return tuple(path_length * i / 10 for i in range(1, 9)) if path_length > 1e-6 else ()
-
-
-def plane_errors(estimate: Trajectory, gps: Array, tolerance: float = 0.01) -> Array:
-    """Distances (N,) [m] from a positions-only track in the plane, after a rigid alignment in the plane.
-
-    Args:
-        estimate: the estimated path; the plane is spanned by its first camera's z (forward) and x (right) axes.
-        gps: rows (M, 3 or more) of stamp [s], forward, right [m], in any heading.
-        tolerance: a row of the track may lie so far away in time [s].
-
-    Raises:
-        TrajectoryError: no stamp has a partner.
-    """
-    partner = pair(estimate.stamps, gps[:, 0], tolerance)
-    rows = np.flatnonzero(partner >= 0)
-    if not len(rows):
-        raise TrajectoryError(
-            f"no estimated pose has a GPS position within {tolerance:g} s: {_span('estimate', estimate.stamps)}, "
-            f"{_span('GPS', gps[:, 0])}"
-        )
-    start = inverse(estimate.poses[0])
-    source = (estimate.positions[rows] @ start[:3, :3].T + start[:3, 3])[:, [2, 0]]
-    target = gps[partner[rows], 1:3]
-    return np.asarray(np.linalg.norm(align_positions(source, target).apply(source) - target, axis=1), np.float64)
 
 
 def _require_pairs(estimate: Trajectory, truth: Trajectory, count: int) -> None:

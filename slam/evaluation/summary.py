@@ -11,7 +11,7 @@ import numpy as np
 
 from slam.errors import TrajectoryError
 from slam.evaluation.consistency import consistency_figures
-from slam.evaluation.metrics import absolute_errors, associate, plane_errors, relative_errors, segment_errors
+from slam.evaluation.metrics import absolute_errors, associate, relative_errors, segment_errors
 from slam.geometry.se3 import Array, inverse, so3_log
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
@@ -42,9 +42,6 @@ def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
         for part in (_absolute, partial(_from_start, mounting=mounting), _relative, _over_a_second, _segments):
             figures.update(_where_possible(part, *pairs))
         figures["poses with truth"] = float(len(pairs[0]))
-    gps = getattr(sequence, "gps", None)
-    if gps is not None and len(estimate) >= 3:
-        figures.update(_against_gps(estimate, gps))
     return figures
 
 
@@ -58,14 +55,6 @@ def with_truth(estimate: Trajectory, sequence: WithTruth) -> tuple[Trajectory, T
     except TrajectoryError:  # nothing overlaps: then there is no figure, which is no fault of the run
         return None
     return (own, true) if len(own) >= 3 else None
-
-
-def _against_gps(estimate: Trajectory, gps: Array) -> dict[str, float]:
-    try:
-        errors = plane_errors(estimate, gps)
-    except TrajectoryError:
-        return {}
-    return {"GPS distance RMSE [m]": float(np.sqrt(np.mean(errors**2))), "GPS distance max [m]": float(errors.max())}
 
 
 def _where_possible(part: Callable[..., dict[str, float]], *arguments: object) -> dict[str, float]:

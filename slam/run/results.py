@@ -85,7 +85,6 @@ METRICS = (
            (*_ONLINE, "RPE rotation RMSE over 1 s [deg]")),
     Metric("segment_percent", "RPE by distance (segment error)", "lower", False, "%", 1.0,
            (*_ONLINE, "segment error [%]")),
-    Metric("gps_m", "GPS distance RMSE", "lower", True, *_MM, (*_ONLINE, "GPS distance RMSE [m]")),
     Metric("scale_error_percent", "scale error, absolute", "lower", False, "%", 1.0, (*_HONEST, "scale error [%]")),
     Metric("scale_sigma_percent", "scale sigma (claimed)", "", False, "%", 1.0, (*_HONEST, "scale sigma [%]")),
     *(Metric(key, f"NEES / 6 {where} (expected 1)", "one", main, place=(*_HONEST, name), share_of="dof")

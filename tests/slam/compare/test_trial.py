@@ -20,7 +20,7 @@ NONE = np.zeros(0, np.int64)
 STRAIGHT = np.tile(np.eye(4), (N, 1, 1))
 STRAIGHT[:, 2, 3] = 0.2 * np.arange(N)
 TRUTH = Trajectory(0.1 * np.arange(N), STRAIGHT)
-SEQUENCE = SimpleNamespace(format="folder", ground_truth=TRUTH, gps=None, truth_noise=TruthNoise(1e-4, 1e-3))
+SEQUENCE = SimpleNamespace(format="folder", ground_truth=TRUTH, truth_noise=TruthNoise(1e-4, 1e-3))
 
 
 def estimated():
