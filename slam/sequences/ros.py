@@ -21,7 +21,15 @@ from slam.sequences.given import Given, flag, metres_per_unit
 from slam.sequences.images import Size, halves
 from slam.sequences.pairs import Listing, distinct, in_order, pair_up
 from slam.sequences.rigs import calibration_files, read_rig, require_size
-from slam.sequences.ros_bag import Bag, Message, choose_topics, open_bag, rig_from_camera_infos
+from slam.sequences.ros_bag import (
+    Bag,
+    Message,
+    camera_info,
+    choose_topics,
+    is_rectified,
+    open_bag,
+    rig_by_messages,
+)  # fmt: skip
 
 #: Options besides those of all formats.
 OPTIONS = frozenset({"left_info", "right_info"})
@@ -49,19 +57,20 @@ def open_folder(path: Path, options: Given, faults: FaultLog) -> RecordedSequenc
     """Open a recording; all of it is read once, for the stamps."""
     with open_bag(path) as bag:
         topics = choose_topics(bag, options)
-        messages = [_stamps(bag, topic, faults) for topic in dict.fromkeys((topics.left, topics.right))]
-        image = bag.first_image(topics.left)
+        infos = [camera_info(bag, topic) for topic in topics.infos]
+        messages = [_stamps(bag, topic, faults) for topic in dict.fromkeys(topics.images)]
+        image = bag.first_image(topics.images[0])
     left, *right = _in_time(messages, faults)
     pairs = distinct(pair_up(left, right[0] if right else None, options, faults), faults)
-    one = image if right else halves(image, topics.left)[0]
+    one = image if right else halves(image, topics.images[0])[0]
     size = one.shape[1], one.shape[0]
     if "calibration" in options:
         rig = read_rig(calibration_files(path if path.is_dir() else path.parent, options), size, options)
     else:
-        where = Path(topics.info_names)
-        rectified = flag(options, "rectified") if "rectified" in options else topics.rectified
+        where = Path(" and ".join(topics.infos))
+        rectified = flag(options, "rectified") if "rectified" in options else all(map(is_rectified, topics.images))
         with naming(where):
-            rig = rig_from_camera_infos(topics.infos, rectified, metres_per_unit(options))
+            rig = rig_by_messages(infos, rectified, metres_per_unit(options))
         require_size(size, rig, where)
     rows = np.array([[-1 if row is None else int(row) for row in n] for n in (pairs.left.names, pairs.partners)])
     source = RosPairs(pairs.stamps, path, messages, rows[: len(messages)].T, (image.shape[1], image.shape[0]))

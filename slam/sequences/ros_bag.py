@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -14,10 +13,9 @@ import numpy as np
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError, one_line, text_of
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
 from slam.naming import suggestion
 from slam.sequences.calibration import array, naming
-from slam.sequences.calibration_keys import Entries, rig_of
+from slam.sequences.calibration_keys import Entries, Entry, rig_of
 from slam.sequences.given import layout_of
 from slam.sequences.images import Size, decode_image, require_image_size, size_text
 from slam.sequences.names import SIDES
@@ -26,6 +24,12 @@ from slam.sequences.names import SIDES
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
 _IMAGES = (RAW, COMPRESSED)
+_MATRICES: dict[str, tuple[str, tuple[int, ...] | None]] = {
+    "K": ("cameramatrix", (3, 3)),  # of the raw image
+    "D": ("distcoeffs", None),
+    "R": ("rectificationmatrix", (3, 3)),  # from raw to rectified camera axes
+    "P": ("projectionmatrix", (3, 4)),  # of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair
+}
 _SAME_PLACE = 1e-6  # [m] from a pair's left camera
 _LISTED = 12  # topics named in a message
 
@@ -170,73 +174,51 @@ def open_bag(path: Path) -> Iterator[Bag]:
         yield Bag(path, reader)
 
 
-@dataclass(frozen=True, eq=False)
-class CameraInfo:
-    """A CameraInfo message of ROS 1 or 2."""
+def camera_info(bag: Bag, topic: str) -> dict[str, Entry]:
+    """The first CameraInfo message of a topic, of ROS 1, which writes matrices in capitals, or 2, as entries.
 
-    size: tuple[int, int]  # width and height [px]
-    model: str  # name of the distortion model
-    K: Array  # camera matrix (3, 3) of the raw image
-    D: Array  # its distortion coefficients
-    R: Array  # rotation (3, 3) from raw to rectified camera axes
-    P: Array  # projection (3, 4) of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair
-
-    @classmethod
-    def read(cls, bag: Bag, topic: str) -> CameraInfo:
-        """The first message of a topic, of ROS 1, which writes matrices in capitals, or 2.
-
-        Raises:
-            CalibrationError: there is none, it holds what no calibration holds, or only a part of the image is given.
-        """
-        message = bag.first(topic)
-        if message is None:
-            raise CalibrationError(f"{bag.path}: topic {topic} has no messages")
-        with naming(Path(topic)):
-            shapes = {"K": (3, 3), "D": None, "R": (3, 3), "P": (3, 4)}
-            matrices = {
-                n: array(getattr(message, n, getattr(message, n.lower(), None)), n, s) for n, s in shapes.items()
-            }
-            size = int(message.width), int(message.height)
-            roi = int(message.roi.width), int(message.roi.height)
-            if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):
-                raise CalibrationError("binning and regions of interest are not supported")
-            return cls(size, str(message.distortion_model), **matrices)
-
-    @property
-    def baseline_term(self) -> float:
-        """``-P[0, 3] / P[0, 0]``: how far the camera stands to the right of the pair's left one [m]; NaN for no P."""
-        return float(-self.P[0, 3] / self.P[0, 0]) if self.P[0, 0] > 0 else float("nan")
+    Raises:
+        CalibrationError: there is none, it holds what no calibration holds, or only a part of the image is given.
+    """
+    message = bag.first(topic)
+    if message is None:
+        raise CalibrationError(f"{bag.path}: topic {topic} has no messages")
+    with naming(Path(topic)):
+        found: dict[str, Entry] = {"distortionmodel": ("distortion_model", str(message.distortion_model))}
+        for name, (entry, shape) in _MATRICES.items():
+            found[entry] = name, array(getattr(message, name, getattr(message, name.lower(), None)), name, shape)
+        size = int(message.width), int(message.height)
+        roi = int(message.roi.width), int(message.roi.height)
+        if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):
+            raise CalibrationError("binning and regions of interest are not supported")
+        return found | {"size": ("size", size)}
 
 
-def rig_from_camera_infos(infos: Sequence[CameraInfo], rectified: bool, unit: float = 1.0) -> StereoRig:
+def rig_by_messages(infos: Sequence[dict[str, Entry]], rectified: bool, unit: float = 1.0) -> StereoRig:
     """The rig of the rectified or of the raw images; the baseline in ``P`` is in units of so many metres.
 
     Raises:
         CalibrationError: a camera is not calibrated, or not as one of a pair; or the rig is impossible.
     """
     for side, info in zip(("left", "right"), infos):
-        if not (info.P[0, 0] > 0 and info.K[0, 0] > 0):
+        if not (info["projectionmatrix"][1][0, 0] > 0 and info["cameramatrix"][1][0, 0] > 0):
             raise CalibrationError(f"the {side} camera is not calibrated: K or P is zero")
-    if infos[0].size != infos[1].size:
+    left, right = (info["size"][1] for info in infos)
+    if left != right:
         raise CalibrationError("the images of the two cameras differ in size")
-    names = "cameramatrix", "distcoeffs", "rectificationmatrix", "projectionmatrix", "distortionmodel", "size"
-    files = [dict(zip(names, zip(names, (i.K, i.D, i.R, i.P, i.model, i.size)))) for i in infos]
-    return rig_of(Entries(files), infos[0].size, unit, rectified, False)
+    return rig_of(Entries(infos), left, unit, rectified, False)
 
 
-@dataclass(frozen=True, eq=False)
-class Topics:
+class Topics(NamedTuple):
     """The topics of a stereo rig."""
 
-    left: str  # of the images; the same where they are side by side
-    right: str
-    infos: tuple[CameraInfo, ...] = ()  # the cameras' calibrations; none where a file is named in their place
-    info_names: str = ""  # the topics of these
+    images: tuple[str, ...]  # of the left and the right one; the same where they are side by side
+    infos: tuple[str, ...] = ()  # of the cameras' calibrations; none where a file is named in their place
 
-    @property
-    def rectified(self) -> bool:
-        """Whether the images are rectified, by ROS's names for topics (``image_rect``, ``image_rect_raw``)."""
-        return all("rect" in _split(topic)[1] for topic in (self.left, self.right))
+
+def is_rectified(topic: str) -> bool:
+    """Whether images are rectified, by ROS's names for topics (``image_rect``, ``image_rect_raw``)."""
+    return "rect" in _split(topic)[1]
 
 
 def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
@@ -266,7 +248,7 @@ def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
         return pairs[0]
     images = _of_kind(bag, _IMAGES)
     if pairs:
-        found = "; ".join(f"left={pair.left}&right={pair.right}" for pair in pairs[:3])
+        found = "; ".join("left={}&right={}".format(*pair.images) for pair in pairs[:3])
         raise SequenceError(f"{bag.path}: several stereo pairs, choose one: {found}")
     if not images:
         raise SequenceError(f"{bag.path}: no images; its topics are {_listed(sorted(bag.kinds))}")
@@ -290,7 +272,7 @@ def _with_infos(bag: Bag, images: tuple[str, ...], options: Mapping[str, str]) -
             raise CalibrationError(
                 f"{bag.path}: no {usual} for {topic}: add {side}_info=/… (there are {known}) or calibration=FILE"
             )
-    return Topics(images[0], images[1], tuple(CameraInfo.read(bag, name) for name in names), " and ".join(names))
+    return Topics(images, tuple(names))
 
 
 def _pairs_by_messages(bag: Bag) -> Iterator[Topics]:
@@ -299,12 +281,14 @@ def _pairs_by_messages(bag: Bag) -> Iterator[Topics]:
     for name in _of_kind(bag, (_INFO,)):
         images = [t for t in _preferred(bag) if _split(t)[0] == _split(name)[0] and not _is_depth(bag, t)]
         if images and bag.first(name) is not None:
-            cameras.append((images[0], name, CameraInfo.read(bag, name)))
-    for left, left_name, a in cameras:
-        for right, right_name, b in cameras:
-            same = a.size == b.size and a.P[0, 0] == b.P[0, 0]
-            if same and abs(a.baseline_term) < _SAME_PLACE and b.baseline_term > _SAME_PLACE:
-                yield Topics(left, right, (a, b), f"{left_name} and {right_name}")
+            info = camera_info(bag, name)
+            P, size = info["projectionmatrix"][1], info["size"][1]
+            if P[0, 0] > 0:
+                cameras.append((images[0], name, (size, P[0, 0]), -P[0, 3] / P[0, 0]))
+    for left, left_info, a, left_offset in cameras:
+        for right, right_info, b, right_offset in cameras:
+            if a == b and abs(left_offset) < _SAME_PLACE and right_offset > _SAME_PLACE:
+                yield Topics((left, right), (left_info, right_info))
 
 
 def _pairs_by_name(bag: Bag) -> list[Topics]:
@@ -316,7 +300,7 @@ def _pairs_by_name(bag: Bag) -> list[Topics]:
             other = topic.replace(*names)
             if other != topic and other in images and not _is_depth(bag, topic):
                 spaces = _split(topic)[0], _split(other)[0]
-                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), Topics(topic, other))
+                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), Topics((topic, other)))
     return list(found.values())
 
 
