@@ -25,7 +25,7 @@ RATE = 10.0
 _TOLERANCE = 5_000_000  # [ns] between the stamps of a pair: hardware-triggered cameras agree far better
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Listing:
     """The images of one camera, in order of time."""
 
@@ -43,7 +43,7 @@ class Listing:
         return replace(self, keys=self.keys[index], names=[self.names[i] for i in index])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pairs:
     """Left images, and what belongs to each."""
 
