@@ -176,9 +176,9 @@ class PinholeCamera:
             return ab, None
         if self.model == "equidistant":
             return _distort_equidistant(ab, np.asarray(self.distortion), jacobian)
-        from slam.geometry import lens_kernels
+        from slam.geometry import kernels
 
-        distorted, D = lens_kernels.distort(ab, self._coefficients, self._radius_limit, jacobian)
+        distorted, D = kernels.distort(ab, self._coefficients, self._radius_limit, jacobian)
         return distorted, D if jacobian else None
 
     @cached_property
@@ -202,9 +202,9 @@ class PinholeCamera:
         """Invert `_distort`; NaN where no ray leads to the pixel."""
         if self.model == "equidistant":
             return _undistort_equidistant(target, np.asarray(self.distortion))
-        from slam.geometry import lens_kernels
+        from slam.geometry import kernels
 
-        return np.asarray(lens_kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
+        return np.asarray(kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
 
 
 def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:

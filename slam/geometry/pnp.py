@@ -140,11 +140,11 @@ def _some(mask: BoolArray) -> NDArray[np.intp]:
 
 def _refined(rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.intp], T: Array, steps: int) -> Array:
     """Least-squares poses (H, 4, 4) from poses T, each by the matches `rows` (H, K)."""
-    from slam.geometry.pose_kernels import gauss_newton
+    from slam.geometry.kernels import gauss_newton
 
     T, one, nothing = T.copy(), np.eye(3), np.zeros((6, 6))
     gauss_newton(
-        rig.rectified_parameters, one, points, measured, one[None], rows, nothing, nothing[0], T, np.inf, steps,
+        rig.rectified_parameters, points, measured, one[None], rows, nothing, nothing[0], T, np.inf, steps,
         _CONVERGED,
     )  # fmt: skip
     return T
@@ -201,6 +201,6 @@ def _agreement(rig: StereoRig, points: Array, measured: Array, T: Array, thresho
 
 def _errors(rig: StereoRig, points: Array, measured: Array, T: Array) -> Array:
     """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
-    from slam.geometry.pose_kernels import errors
+    from slam.geometry.kernels import errors
 
-    return np.asarray(errors(rig.rectified_parameters, np.eye(3), points, measured, T))
+    return np.asarray(errors(rig.rectified_parameters, points, measured, T))

@@ -235,7 +235,7 @@ class StereoRig:
 
     def _project_rectified(self, points: Array, jacobian: bool) -> tuple[Array, Array]:
         """`project_stereo` of a rectified rig."""
-        from slam.geometry.rig_kernels import project_rectified
+        from slam.geometry.kernels import project_rectified
 
         z, J = project_rectified(self.rectified_parameters, np.ascontiguousarray(points, float), jacobian)
         return z, J
@@ -247,7 +247,7 @@ class StereoRig:
         parallel, whose depth comes out negative, or whose pixels are NaN are NaN.
         """
         if self.is_rectified:
-            from slam.geometry.rig_kernels import triangulate_rectified
+            from slam.geometry.kernels import triangulate_rectified
 
             left, right = np.ascontiguousarray(uv_left, float), np.ascontiguousarray(uv_right, float)
             return np.asarray(triangulate_rectified(self.rectified_parameters, left, right))

@@ -32,11 +32,10 @@ from dataclasses import dataclass
 from slam.errors import ConfigurationError, text_of
 from slam.naming import unknown
 from slam.testing import estimation, hostile, protocol, running
-from slam.testing.scene import GENERAL_RIG, MODELS, RIG, SIGMA, Factory
+from slam.testing.scene import MODELS, RIG, SIGMA, Factory
 
 __all__ = [
     "BACKEND_CHECKS",
-    "GENERAL_RIG",
     "GOOD",
     "MODELS",
     "RIG",
@@ -89,7 +88,6 @@ RIGHT: Sequence[Check] = (
 #: It estimates well.
 GOOD: Sequence[Check] = (
     estimation.follows_the_camera,
-    estimation.follows_with_a_general_rig,
     estimation.landmarks_are_corrected,
     estimation.velocity_is_learnt,
     estimation.innovations_are_as_predicted,

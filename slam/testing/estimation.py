@@ -11,7 +11,6 @@ from slam.geometry import se3
 from slam.models import MotionModel
 from slam.testing.scene import (
     DT,
-    GENERAL_RIG,
     MODELS,
     RIG,
     SIGMA,
@@ -48,11 +47,6 @@ def new_landmarks_are_triangulated(factory: Factory) -> None:
 def follows_the_camera(factory: Factory) -> None:
     """Tracks a noisy scene: pose and landmarks near the truth, within what the covariances say."""
     _follows(factory, make_scene())
-
-
-def follows_with_a_general_rig(factory: Factory) -> None:
-    """The same with an unrectified, distorted rig, in its own pixels."""
-    _follows(factory, make_scene(rig=GENERAL_RIG))
 
 
 def _follows(factory: Factory, scene: Scene) -> None:

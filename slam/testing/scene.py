@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from slam.data import BoolArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.geometry import se3
-from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
@@ -20,14 +19,6 @@ from slam.models import EstimatorModels
 Factory = Callable[..., Backend]
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=319.5, v0=239.5, baseline=0.2, width=640, height=480)
-
-#: Distorted, with the right camera turned and shifted: measurements are in the rig's own pixels whatever it is.
-GENERAL_RIG = StereoRig(
-    PinholeCamera(410.0, 405.0, 310.0, 245.0, 640, 480, "radtan", (-0.1, 0.02, 1e-3, -5e-4)),
-    PinholeCamera(400.0, 402.0, 325.0, 238.0, 640, 480, "radtan", (-0.08, 0.01, -5e-4, 1e-3)),
-    se3.so3_exp(np.array([0.01, -0.03, 0.005])),
-    np.array([-0.2, 0.004, -0.006]),
-)
 
 SIGMA = 0.5  # pixel noise [px]
 MODELS = EstimatorModels(pixel_sigma=SIGMA)

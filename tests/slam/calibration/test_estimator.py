@@ -11,10 +11,9 @@ from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.system import StereoSlam
-from slam.testing import GENERAL_RIG
 from slam.tracker import _moved_as
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
-from tests.slam.scene import RIG, Cloud
+from tests.slam.scene import GENERAL_RIG, RIG, Cloud
 
 #: A turn of the right camera after a knock [rad].
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
