@@ -8,7 +8,7 @@ seconds. Pose covariances are (6, 6), order [rotation, translation], of a pertur
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -20,9 +20,9 @@ from slam.geometry.arrays import Array, ascending
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
 from slam.geometry.arrays import IndexArray as IndexArray
+from slam.naming import count, of_shapes, point
 from slam.object_data import MovingObject
 from slam.rig_error import CommonError, Revision
-from slam.showing import count, of_shapes, point
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,37 +59,11 @@ class ImagePair:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Image patches around pixels, one row each; made and used by a front end.
+    """Image patches around pixels, one row each; made and used by a front end."""
 
-    Attributes:
-        images: (N, S, S) float32, NaN beyond the image.
-        centres: coordinates of the pixels within the patches (N, 2).
-        size: of the features at the pixels (N,) [px].
-    """
-
-    images: NDArray[np.float32]
-    centres: Array
-    size: Array
-
-    @classmethod
-    def none(cls) -> Patches:
-        """No patches."""
-        return cls(np.zeros((0, 0, 0), np.float32), np.zeros((0, 2)), np.zeros(0))
-
-    def __len__(self) -> int:
-        return len(self.size)
-
-    def select(self, keep: NDArray) -> Patches:
-        """Some of the rows (a mask or indices)."""
-        if keep.dtype == bool and keep.all():
-            return self  # images are large
-        return Patches(self.images[keep], self.centres[keep], self.size[keep])
-
-    def joined(self, other: Patches) -> Patches:
-        """These and others."""
-        if not len(self) or not len(other):
-            return self if len(self) else other
-        return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Patches)))
+    images: NDArray[np.float32]  # (N, S, S), NaN beyond the image
+    centres: Array  # coordinates of the pixels within the patches (N, 2)
+    size: Array  # of the features at the pixels (N,) [px]
 
 
 #: Columns of `StereoFeatures`.

@@ -39,7 +39,7 @@ BUILT_IN = {
 ONLINE = ("ekf", "smoother", "window")
 
 #: What `slam.interfaces.Backend` and `slam.interfaces.Frontend` ask for.
-_METHODS = {
+METHODS = {
     "backends": ("predict", "update", "add", "remove", "estimate", "positions", "trajectory"),
     "frontends": ("extract",),
 }
@@ -144,7 +144,7 @@ def _unknown_option(what: str, made: Any, options: Mapping[str, Any]) -> str:
 
 def require_methods(role: str, part: Any, name: str = "") -> Any:
     """A back end or front end, or None for no front end; raises ConfigurationError where it lacks a method."""
-    missing = [method for method in _METHODS[role] if not callable(getattr(part, method, None))]
+    missing = [method for method in METHODS[role] if not callable(getattr(part, method, None))]
     if missing and (part is not None or role == "backends"):
         what = f"{_spoken(role)} {name or type(part).__name__}"
         raise ConfigurationError(f"{what} is none: it lacks {', '.join(missing)}")

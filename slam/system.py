@@ -24,6 +24,7 @@ from slam.interfaces import Backend, Frontend
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.step import Step
+from slam.naming import count
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
@@ -31,7 +32,6 @@ from slam.runtime.one_thread import OneThread
 from slam.runtime.prefetch import prefetch
 from slam.runtime.stages import Stages
 from slam.session import Elsewhere, Session, State
-from slam.showing import count
 from slam.third_party import named_failures
 from slam.tracker import Tracker, frame_result
 from slam.tracks.table import LandmarkTable

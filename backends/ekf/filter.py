@@ -252,7 +252,7 @@ class EkfBackend:
         if not self._form.stereo:
             z[:, 2] = np.nan
         update = Update(
-            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure.models.pixel_sigma, self._measure.stereo,
+            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self.models.pixel_sigma, self._measure.stereo,
             self._coordinates, self._form.iterations, self.models.gate_probability, guess,
         )  # fmt: skip
         noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)

@@ -141,7 +141,7 @@ class Mapper:
     def _count(self, landmarks: LandmarkTable, view: MapView, step: Step) -> LandmarkTable:
         """Count landmarks as seen or missed, unless the frame's pose was not measured."""
         m, matches = self.config, step.matches
-        measured = isin(matches.ids, np.concatenate([step.report.used, step.left_out]))
+        measured = isin(matches.ids, step.report.used)
         expected = landmarks.ids[:0]
         if not step.tracking.unmatched:
             size = (self.rig.width, self.rig.height)

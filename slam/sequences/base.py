@@ -15,9 +15,9 @@ from slam.geometry.rig import StereoRig, quarter_turn
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.naming import sequence_line
 from slam.sequences.door import Masks, at_the_door
 from slam.sequences.faults import FaultLog
-from slam.showing import sequence_line
 
 
 @runtime_checkable

@@ -16,7 +16,6 @@ from slam.testing.scene import (
     SIGMA,
     Factory,
     Run,
-    Scene,
     all_but_the_last,
     assert_covariance,
     assert_near,
@@ -46,10 +45,7 @@ def new_landmarks_are_triangulated(factory: Factory) -> None:
 
 def follows_the_camera(factory: Factory) -> None:
     """Tracks a noisy scene: pose and landmarks near the truth, within what the covariances say."""
-    _follows(factory, make_scene())
-
-
-def _follows(factory: Factory, scene: Scene) -> None:
+    scene = make_scene()
     run, reports = tracked(factory, scene)
     found = run.backend.estimate()
     assert_near(found.T_world_left, scene.poses[-1], "pose after the scene")

@@ -14,24 +14,18 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.se3 import Array
+from slam.table import Table
 from slam.tracks.config import AssociationConfig
 
 Descriptors = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(Table):
     """Pairs of a landmark and a feature."""
 
     landmarks: NDArray[np.intp]  # rows of the landmarks (K,)
     features: NDArray[np.intp]  # rows of the features (K,)
-
-    def __len__(self) -> int:
-        return len(self.landmarks)
-
-    def select(self, rows: NDArray) -> Matches:
-        """The pairs of these rows (a mask or indices)."""
-        return Matches(self.landmarks[rows], self.features[rows])
 
 
 def follow(

@@ -16,7 +16,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
-from slam.showing import sequence_line
+from slam.naming import sequence_line
 from slam.worlds.appearance import Appearance, appearance
 from slam.worlds.faults import Faults
 from slam.worlds.observe import SimulatedFeatures, simulate

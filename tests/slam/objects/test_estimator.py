@@ -15,8 +15,8 @@ from slam.errors import ConfigurationError, MeasurementError
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
 from slam.interfaces import RecentBackend
+from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
-from slam.object_models import ObjectModels
 from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.estimator import FRAMES, BodyEstimator
 from slam.window.stereo import RectifiedStereo

@@ -12,7 +12,8 @@ from slam.config import SystemConfig
 from slam.data import IdArray, ImagePair, Patches
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.tracks.alignment import Aligner, warps_of
+from slam.tracks import alignment
+from slam.tracks.alignment import warps_of
 from slam.tracks.localizer import LandmarkMatches
 from slam.tracks.table import LandmarkTable, Patch
 
@@ -81,10 +82,10 @@ def frame(right: bool = True) -> slam.StereoFeatures:
     return replace(_features(4), uv_left=uv, uv_right=uv_right, scale=np.full(4, 15.0), images=pair)
 
 
-def align(features: slam.StereoFeatures, landmarks: LandmarkTable, seen: LandmarkMatches = SEEN, enabled: bool = True):
+def align(features: slam.StereoFeatures, landmarks: LandmarkTable, seen: LandmarkMatches = SEEN):
     places = dict(zip(IDS.tolist(), POINTS))
-    aligner = Aligner(RIG, enabled)
-    return aligner.align(Shifting(), features, seen, landmarks, lambda ids: np.array([places[i] for i in ids.tolist()]))
+    positions = lambda ids: np.array([places[i] for i in ids.tolist()])  # noqa: E731
+    return alignment.align(RIG, Shifting(), features, seen, landmarks, positions)
 
 
 @pytest.mark.parametrize("right", [True, False])
@@ -112,7 +113,7 @@ def test_a_patch_that_is_not_found_or_of_another_scale_is_taken_anew(nearer, siz
     aligned, landmarks = align(features, rows(IDS, then, size))
     np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
     assert not landmarks.has_patch.any()
-    landmarks = Aligner(RIG, True).with_patches(Shifting(), aligned, SEEN, landmarks, np.eye(4))
+    landmarks = alignment.with_new_patches(Shifting(), aligned, SEEN, landmarks, np.eye(4))
     assert [(p.size, p.T_world_left.tolist()) for p in landmarks.patches] == 4 * [(15.0, np.eye(4).tolist())]
 
 
@@ -129,7 +130,6 @@ def test_without_a_pose_or_images_nothing_moves_and_what_was_not_seen_for_long_i
     for aligned, after in (
         align(features, landmarks, replace(SEEN, T_world_left=None)),
         align(replace(features, images=None), landmarks),
-        align(features, landmarks, enabled=False),
     ):
         np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
         assert after.has_patch.all()
