@@ -83,7 +83,7 @@ class PinholeCamera:
         Raises:
             CalibrationError: K is no camera matrix, or there are coefficients that are not supported.
         """
-        matrix, coefficients = _floats("camera matrix", K), _floats("distortion", D if D is not None else ()).ravel()
+        matrix, coefficients = floats("camera matrix", K), floats("distortion", D if D is not None else ()).ravel()
         if matrix.shape != (3, 3):
             raise CalibrationError(f"the camera matrix must be (3, 3), got {matrix.shape}")
         values = coefficients.tolist()
@@ -155,6 +155,10 @@ class PinholeCamera:
         distorted = (uv - (self.u0, self.v0)) / (self.fu, self.fv)
         return self._undistort(distorted) if self.has_distortion else distorted
 
+    def rays(self, uv: Array) -> Array:
+        """Rays (N, 3) = (x/z, y/z, 1) of pixels (N, 2)."""
+        return np.concatenate([self.normalise(uv), np.ones((len(uv), 1))], axis=1)
+
     def in_image(self, uv: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """Which pixels (N, 2) lie inside the image, `margin` [px] away from its border; NaN lies outside."""
         u, v = uv[:, 0], uv[:, 1]
@@ -222,7 +226,7 @@ def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     return ""
 
 
-def _floats(what: str, values: ArrayLike) -> Array:
+def floats(what: str, values: ArrayLike) -> Array:
     """An array of numbers.
 
     Raises:
@@ -231,7 +235,7 @@ def _floats(what: str, values: ArrayLike) -> Array:
     try:
         return np.array(values, float)
     except (TypeError, ValueError, OverflowError):
-        raise CalibrationError(f"{what}: no numbers") from None
+        raise CalibrationError(f"{what} must be numbers") from None
 
 
 def _undistort_equidistant(target: Array, coefficients: Array) -> Array:

@@ -391,7 +391,7 @@ def test_two_equal_cameras_side_by_side() -> None:
         ({"R": np.eye(4)}, r"\(3, 3\) rotation"),
         ({"R": np.full((3, 3), np.nan)}, "finite"),
         ({"D_left": np.ones(14)}, "thin prisms"),
-        ({"D_left": "none"}, "no numbers"),
+        ({"D_left": "none"}, "must be numbers"),
         ({"K_right": np.eye(2)}, r"\(3, 3\)"),
         ({"size": (64, 0)}, "size must be positive"),
     ],
