@@ -20,7 +20,6 @@ from slam.data import (
     Estimate,
     FrameResult,
     FrameStatus,
-    IdArray,
     Prediction,
     StereoFeatures,
     UpdateReport,
@@ -247,16 +246,20 @@ class Session:
         )  # fmt: skip
         return state, prediction
 
-    def left_behind(self, before: State, begun: State, step: Step) -> IdArray:
-        """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began.
+    def with_takeover(self, before: State, begun: State, step: Step) -> Step:
+        """The step, with the landmarks that left and joined the map where another back end took over.
 
         `before` is the state after the last frame; `begun` that in which the step began, without landmarks where a new
         map did. What the rig's uncertainty does to those that left is forgotten.
         """
-        if before.landmarks is None or begun.landmarks is not None:
-            return step.erased
-        self.rig_error.uncertainty.keep(step.landmarks.ids)
-        return np.concatenate([np.setdiff1d(before.landmarks.ids, step.landmarks.ids), step.erased])
+        if before.landmarks is None or begun is before:
+            return step
+        if begun.landmarks is None:
+            self.rig_error.uncertainty.keep(step.landmarks.ids)
+            gone = np.setdiff1d(before.landmarks.ids, step.landmarks.ids)
+            return replace(step, erased=np.concatenate([gone, step.erased]))
+        joined = np.setdiff1d(begun.landmarks.ids, before.landmarks.ids)
+        return replace(step, joined=np.union1d(step.joined, joined))
 
     def _start(self, T_world_left: Array) -> Backend:
         """A back end without landmarks at a pose (4, 4) that is only roughly known."""

@@ -280,7 +280,7 @@ class StereoSlam:
             self.objects.restart()
             step = self._step(state, features, begun)
             assert not isinstance(step, Elsewhere)  # a back end that takes over is believed
-        step = replace(step, erased=session.left_behind(self._state, state, step), repeated=repeated)
+        step = replace(session.with_takeover(self._state, state, step), repeated=repeated)
         common = session.rig_error.common(as_reported=True)
         result = frame_result(step, state.mapped, revision, self._stages.milliseconds, common)
         self._state, self._stages = state.after(step, checksum), Stages()

@@ -220,7 +220,8 @@ def frame_result(
         len(step.prediction.ids), step.matches.ids, step.matches.rows, step.added.ids, step.added.rows, step.erased,
         len(step.landmarks), dict(milliseconds), step.labels.moving, objects, revision=revision,
         T_map_odom=atlas.T_map_odom, loop=atlas.closed_in(step.index), refused_loop=atlas.refused_in(step.index),
-        keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index, returned=step.returned.ids,
+        keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
+        returned=np.union1d(step.returned.ids, step.joined),
         common=common if atlas.anchor is None else CommonError(),
     )  # fmt: skip
 

@@ -43,6 +43,7 @@ class Step:
     added: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)  # landmarks that joined the map
     # landmarks of a revisited place that rejoined the map, and the features that show them now
     returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+    joined: IdArray = field(default_factory=_NONE.copy)  # ids of those of a place at which another back end took over
     erased: IdArray = field(default_factory=_NONE.copy)  # ids of the landmarks that left the map
     # the part of the pose's error that other frames share; included in the covariance of `estimate`
     common: CommonError = field(default_factory=CommonError)

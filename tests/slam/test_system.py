@@ -60,13 +60,6 @@ def test_frames_with_nothing_to_see_are_predicted(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_starts_late_where_the_first_frames_are_empty(backend):
-    _, results, _ = run(backend, frames=8, change=nothing_at(0, 1, 2))
-    statuses = [r.status.value for r, _ in results]
-    assert statuses == ["predicted"] * 3 + ["started"] + ["tracked"] * 4
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_new_map_forgets_what_the_rig_s_error_does_to_the_landmarks_of_the_old_one(backend):
     """By a baseline 33 times too long nothing is tracked, and map follows map, while the calibration goes on."""
     sequence = slam.open_sequence("synthetic:desk?frames=12&baseline=0.075")

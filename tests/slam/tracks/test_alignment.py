@@ -97,15 +97,6 @@ def test_features_move_to_their_patches_also_without_a_right_image(right):
     assert landmarks.has_patch.all()
 
 
-def test_a_feature_that_has_no_right_pixel_is_aligned_in_the_left_image():
-    features = frame()
-    features.uv_right[2] = np.nan
-    aligned, landmarks = align(features, rows(IDS, np.eye(4)))
-    np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
-    np.testing.assert_allclose(aligned.uv_right, features.uv_right + SHIFT)
-    assert landmarks.has_patch.all()
-
-
 @pytest.mark.parametrize("nearer,size", [(0.0, 0.0), (2.5, 15.0)])
 def test_a_patch_that_is_not_found_or_of_another_scale_is_taken_anew(nearer, size):
     then, features = np.eye(4), frame()
