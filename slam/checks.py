@@ -18,13 +18,7 @@ MOST_ID = 2**53
 
 
 def require_stamp(owner: str, stamp: float, last: float | None) -> None:
-    """Check the time to which a back end is to be advanced.
-
-    `stamp` [s] is the new time, `last` [s] the one before it, None for the first; `owner` is the back end's name.
-
-    Raises:
-        MeasurementError: it is not finite, not later than the last one, or beyond `LATEST_STAMP`.
-    """
+    """Raise MeasurementError where a back end, `owner`, cannot be advanced from `last` [s], None at first, to `stamp`."""
     if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP or (last is not None and stamp <= last):
         after = "" if last is None else f" after {last}"
         raise MeasurementError(
@@ -33,24 +27,13 @@ def require_stamp(owner: str, stamp: float, last: float | None) -> None:
 
 
 def require_not_measured(owner: str, measured: bool) -> None:
-    """Check that an update comes in its turn.
-
-    `measured` says whether the present stamp has had its update, or something was added at its pose; `owner` is the
-    back end's name.
-
-    Raises:
-        MeasurementError: it has.
-    """
+    """Raise MeasurementError where the present stamp has had its update, or something was added at its pose."""
     if measured:
         raise MeasurementError(f"{owner}: a stamp has one update, right after its predict")
 
 
 def require_guess(owner: str, guess: Array | None) -> None:
-    """Check a guess of the camera's pose.
-
-    Raises:
-        MeasurementError: it is no rigid motion (4, 4).
-    """
+    """Raise MeasurementError where a guess of the camera's pose is no rigid motion (4, 4)."""
     if guess is None:
         return
     if not isinstance(guess, np.ndarray) or guess.shape != (4, 4) or not np.isfinite(guess).all():
@@ -61,11 +44,7 @@ def require_guess(owner: str, guess: Array | None) -> None:
 
 
 def require_recent(owner: str, n: int) -> int:
-    """How many of the last poses are asked for.
-
-    Raises:
-        MeasurementError: fewer than one.
-    """
+    """How many of the last poses are asked for; raises MeasurementError where fewer than one."""
     if n < 1:
         raise MeasurementError(f"{owner}: recent({n}): one pose at least must be asked for")
     return int(n)

@@ -120,26 +120,24 @@ def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:
     except SlamError:
         raise
     except (Exception, SystemExit) as error:  # whatever a foreign class does
-        wrong = _unknown_option(what, made, options) if isinstance(error, TypeError) else ""
-        raise ConfigurationError(wrong or f"{what} cannot be created: {cause(error)}") from error
+        wrong = _unknown_option(made, options) if isinstance(error, TypeError) else ""
+        raise ConfigurationError(f"{what}{wrong or f' cannot be created: {cause(error)}'}") from error
     return require_methods(role, created, repr(name))
 
 
-def _unknown_option(what: str, made: Any, options: Mapping[str, Any]) -> str:
-    """The line for the first option that a class does not take; empty where it takes all, or does not say."""
+def _unknown_option(made: Any, options: Mapping[str, Any]) -> str:
+    """What is said of the first option that a class does not take; empty where it takes all, or does not say."""
     try:
         known = signature(made).parameters
     except (TypeError, ValueError):
         return ""
-    if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in known.values()):
-        return ""
     wrong = next((option for option in options if option not in known), None)
-    if wrong is None:
+    if wrong is None or any(parameter.kind is Parameter.VAR_KEYWORD for parameter in known.values()):
         return ""
     own = [option for option in list(known)[1:] if option != "models"]  # the first one is the rig
     if wrong == "models":
-        return f"{what} cannot be created: it does not take the argument models"
-    return f"{what}: {unknown('option', wrong, own)}" if own else f"{what} has no options, got {wrong!r}"
+        return " cannot be created: it does not take the argument models"
+    return f": {unknown('option', wrong, own)}" if own else f" has no options, got {wrong!r}"
 
 
 def require_methods(role: str, part: Any, name: str = "") -> Any:

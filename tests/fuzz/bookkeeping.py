@@ -79,7 +79,7 @@ class Books:
 
     def refused(self) -> None:
         """A frame that comes too early is refused, and nothing has changed."""
-        stamp = self.stamp - choose(self.rng, (0.0, 0.01, np.nan, np.inf))
+        stamp = (self.stamps[-1] if self.stamps else 0.0) - choose(self.rng, (0.0, 0.01, np.nan, np.inf))
         if not self.stamps and np.isfinite(stamp):
             return
         try:
@@ -171,7 +171,7 @@ def keep_books(rng: np.random.Generator, folder: Path) -> None:
         books.step(at, choose(rng, _KINDS))
         if rng.random() < 0.2:
             books.refused()
-        if rng.random() < 0.1:
+        if rng.random() < 0.1 and books.stamps:
             books.system.estimate()
         if rng.random() < 0.4:
             books.count()
