@@ -83,6 +83,11 @@ def _is(kind: Any) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, kind) and not isinstance(value, (bool, np.bool_))
 
 
+def _maps_names(value: Any) -> bool:
+    """Whether a value is a mapping of names."""
+    return isinstance(value, dict) and all(isinstance(key, str) for key in value)
+
+
 #: By type: what a value must fulfil, and that in words.
 _TYPES: dict[Any, tuple[Callable[[Any], bool], str]] = {
     NoneType: (lambda value: value is None, "none"),
@@ -90,10 +95,7 @@ _TYPES: dict[Any, tuple[Callable[[Any], bool], str]] = {
     str: (lambda value: isinstance(value, str) and len(value) <= _WORD and "\0" not in value, "a text"),
     int: (_is(numbers.Integral), "a whole number"),
     float: (_is(numbers.Real), "a number"),
-    dict: (
-        lambda value: isinstance(value, dict) and all(isinstance(k, str) for k in value),
-        "a mapping of names to values",
-    ),
+    dict: (_maps_names, "a mapping of names to values"),
 }
 
 

@@ -18,7 +18,7 @@ MOST_ID = 2**53
 
 
 def require_stamp(owner: str, stamp: float, last: float | None) -> None:
-    """Raise MeasurementError where a back end, `owner`, cannot be advanced from `last` [s], None at first, to `stamp`."""
+    """Raise MeasurementError where a back end, `owner`, cannot be advanced from `last` [s] (None: none) to `stamp`."""
     if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP or (last is not None and stamp <= last):
         after = "" if last is None else f" after {last}"
         raise MeasurementError(
