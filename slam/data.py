@@ -291,14 +291,6 @@ class Estimate:
         where = f"camera at {point(t)} ± {point(np.sqrt(np.diag(R @ self.covariance[3:, 3:] @ R.T).clip(min=0)))} m"
         return f"Estimate({self.stamp:.3f} s, {where}, {count(len(self.ids), 'landmark')})"
 
-    def to_table(self) -> dict[str, NDArray]:
-        """The landmarks as columns (N,) like those of ``landmarks.csv``, for instance for a data frame.
-
-        ``id``, ``x``, ``y``, ``z`` [m] in world coordinates, and the covariance terms ``cxx`` to ``czz`` [m²].
-        """
-        terms = {f"c{'xyz'[i]}{'xyz'[j]}": self.covariances[:, i, j] for i in range(3) for j in range(i, 3)}
-        return {"id": self.ids, **{"xyz"[i]: self.positions[:, i] for i in range(3)}, **terms}
-
 
 class FrameStatus(StrEnum):
     """How a frame ended.

@@ -142,11 +142,8 @@ def _refined(rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.in
     """Least-squares poses (H, 4, 4) from poses T, each by the matches `rows` (H, K)."""
     from slam.geometry.kernels import gauss_newton
 
-    T, one, nothing = T.copy(), np.eye(3), np.zeros((6, 6))
-    gauss_newton(
-        rig.rectified_parameters, points, measured, one[None], rows, nothing, nothing[0], T, np.inf, steps,
-        _CONVERGED,
-    )  # fmt: skip
+    T, one, none, camera = T.copy(), np.eye(3)[None], np.zeros((6, 6)), rig.rectified_parameters
+    gauss_newton(camera, points, measured, one, rows, none, none[0], T, np.inf, steps, _CONVERGED)
     return T
 
 

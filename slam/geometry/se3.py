@@ -78,9 +78,9 @@ def rotation_from_quaternion(q: Array) -> Array:
 
 
 def nearest_rotation(M: Array) -> Array:
-    """The rotation (3, 3) nearest to a matrix in the Frobenius norm (polar decomposition)."""
+    """The rotation (D, D), D = 2 or 3, nearest to a matrix in the Frobenius norm (polar decomposition)."""
     U, _, Vt = np.linalg.svd(M)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return np.asarray(U @ np.diag([*np.ones(len(M) - 1), np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def pose(R: Array, t: Array) -> Array:
