@@ -48,8 +48,8 @@ METHODS = {
 @cache
 def _table(role: str) -> dict[str, str]:
     """Name to ``module:attribute``; a built-in name cannot be taken over."""
-    found = {point.name: point.value for point in entry_points(group=f"slam.{role}")}
-    return {**found, **BUILT_IN[role]}
+    registered = {point.name: point.value for point in entry_points(group=f"slam.{role}")}
+    return {**registered, **BUILT_IN[role]}
 
 
 def names(role: str) -> list[str]:
@@ -98,10 +98,10 @@ def _hidden(package: str) -> str:
     spec = find_spec(package)
     if spec is None:
         return ""
-    found = Path(next(iter(spec.submodule_search_locations or [str(spec.origin)]))).resolve()
-    if found.parent == Path(__file__).resolve().parents[1]:
+    hiding = Path(next(iter(spec.submodule_search_locations or [str(spec.origin)]))).resolve()
+    if hiding.parent == Path(__file__).resolve().parents[1]:
         return ""
-    return f"{found} hides slam's own `{package}`: rename it"
+    return f"{hiding} hides slam's own `{package}`: rename it"
 
 
 def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:

@@ -70,11 +70,11 @@ class State:
     restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
 
     @classmethod
-    def in_map(cls, backend: Backend, known: SavedMap) -> State:
+    def in_map(cls, backend: Backend, saved: SavedMap) -> State:
         """Before the first frame of a run that starts in a map."""
-        atlas = Atlas.of_earlier_run(known.keyframes, known.keyframe_poses, known.loops)
-        dimensions, mapped = known.dimensions if len(known) else None, len(known) > 0
-        return cls(backend, known.rows, atlas, dimensions=dimensions, mapped=mapped, prior_map=known)
+        atlas = Atlas.of_earlier_run(saved.keyframes, saved.keyframe_poses, saved.loops)
+        dimensions, mapped = saved.dimensions if len(saved) else None, len(saved) > 0
+        return cls(backend, saved.rows, atlas, dimensions=dimensions, mapped=mapped, prior_map=saved)
 
     def begins_at(self, index: int) -> bool:
         """Whether the back end takes over in this frame."""
@@ -82,13 +82,13 @@ class State:
 
     def after(self, step: Step, checksum: tuple[int, int] | None) -> State:
         """The state after one more frame."""
-        known = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
+        located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
         return replace(
             self, landmarks=step.landmarks, atlas=step.atlas, index=step.index, stamp=step.features.stamp,
             tracking=step.tracking, standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, mapped=self.mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
-            measured_at=step.features.stamp if known else self.measured_at,
+            measured_at=step.features.stamp if located else self.measured_at,
         )  # fmt: skip
 
     def path(self) -> Trajectory:
@@ -103,7 +103,7 @@ class Elsewhere:
     # the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins
     T_world_left: Array | None
     # the place of the atlas by which it was found; None if it was found by the map's landmarks
-    found: Found | None = None
+    place: Found | None = None
 
 
 class Session:
@@ -170,22 +170,22 @@ class Session:
         Raises:
             SlamError: the descriptors have another length than the map's.
         """
-        known = state.prior_map
-        assert known is not None
-        known.require_fits("", features.descriptors.shape[1])
-        prediction, found = nowhere(features.stamp, self._models.initial_pose), None
-        matches = self.localizer.match(prediction, known.rows, known.positions, features, state.index + 1)
+        saved = state.prior_map
+        assert saved is not None
+        saved.require_fits("", features.descriptors.shape[1])
+        prediction, place = nowhere(features.stamp, self._models.initial_pose), None
+        matches = self.localizer.match(prediction, saved.rows, saved.positions, features, state.index + 1)
         T = matches.T_world_left if len(matches) >= self.localizer.config.minimum_consistent else None
         if T is None:
-            found = self.find(state, features)
-            if found is None:
+            place = self.find(state, features)
+            if place is None:
                 return None
-            T = found.T_odom_left
+            T = place.T_odom_left
         new, landmarks = self._start(T), state.landmarks
-        _fill(new, known)
-        self.mapper.next_id = known.next_id
-        if found is not None:
-            landmarks = self.mapper.insert(new, known.rows, found.place)
+        _fill(new, saved)
+        self.mapper.next_id = saved.next_id
+        if place is not None:
+            landmarks = self.mapper.insert(new, saved.rows, place.place)
         return replace(state, backend=new, landmarks=landmarks, prior_map=None)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
@@ -229,14 +229,15 @@ class Session:
             after, common = new.estimate(landmarks=False), self.rig_error.common(as_reported=False)
             atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
         else:
-            new, place, landmarks = self._start(T), None, state.landmarks
+            new, seen_at, landmarks = self._start(T), None, state.landmarks
             _give_landmarks(old, new)
-            if elsewhere.found is not None:
+            if elsewhere.place is not None:
                 assert landmarks is not None
-                landmarks, place = self.mapper.insert(new, landmarks, elsewhere.found.place), elsewhere.found.stamp
+                landmarks = self.mapper.insert(new, landmarks, elsewhere.place.place)
+                seen_at = elsewhere.place.stamp
             prediction = new.predict(stamp)
             standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
-            atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), place)
+            atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), seen_at)
         path = old.trajectory().select(slice(None, -1))
         hidden = elsewhere.T_world_left is None and state.tracking.stood and self._models.motion.wheels
         state = replace(
@@ -281,15 +282,15 @@ def _give_landmarks(old: Backend, new: Backend) -> None:
     new.insert(whole.ids, whole.positions, definite(whole.covariances))
 
 
-def _fill(backend: Backend, known: SavedMap) -> None:
+def _fill(backend: Backend, saved: SavedMap) -> None:
     """Give a back end a saved map."""
     name = type(backend).__name__
     if not isinstance(backend, MapBackend):
         raise ConfigurationError(f"{name} cannot start in a prior map: it has no insert")
     most = getattr(backend, "most_landmarks", None)
-    if most is not None and len(known) > most:
+    if most is not None and len(saved) > most:
         raise SlamError(
             f"{known.source}: {len(known)} landmarks, but {name} takes a map of at most {most}: "
             "start in a smaller map, or with another back end"
         )
-    backend.insert(known.ids, known.positions, known.covariances)
+    backend.insert(saved.ids, saved.positions, saved.covariances)

@@ -117,7 +117,7 @@ class StereoSlam:
 
     def __repr__(self) -> str:
         frontend = "no front end" if self.frontend is None else type(self.frontend).__name__
-        known = 0 if self.landmarks is None else len(self.landmarks)
+        landmarks = 0 if self.landmarks is None else len(self.landmarks)
         done = f"{count(self._state.index + 1, 'frame')}, {count(known, 'landmark')}"
         return f"StereoSlam({frontend}, {type(self.backend).__name__}, {done})"
 
@@ -194,12 +194,12 @@ class StereoSlam:
         """
         if not isinstance(frames, Iterable):
             raise MeasurementError(f"run: frames must be a sequence of frames, got {type(frames).__name__}")
-        extracted = (self._extractor.extract(self.frontend, frame) for frame in frames)
+        extractions = (self._extractor.extract(self.frontend, frame) for frame in frames)
         depth = 1 if getattr(frames, "live", False) else 2  # live frames must not wait
-        for found in prefetch(extracted, depth) if overlap else extracted:
+        for extracted in prefetch(extractions, depth) if overlap else extractions:
             with self._stepping:
-                result = self._timed_step(found)
-            yield found.frame, result
+                result = self._timed_step(extracted)
+            yield extracted.frame, result
 
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and manage the map (paper A, III and IV; paper B, 2).
@@ -217,13 +217,13 @@ class StereoSlam:
         with self._stepping, self._named(f"frame {self._state.index + 1}"):
             return self._process(documented(features, self.rig), None)
 
-    def _timed_step(self, found: Extracted) -> FrameResult:
+    def _timed_step(self, extracted: Extracted) -> FrameResult:
         """A step with what was found in images; the result has the time of extraction, too."""
         with self._named(f"frame {found.frame.index}"):
-            result = self._process(found.features, found.checksum)
+            result = self._process(extracted.features, extracted.checksum)
         if result.reason == REPEATED:
-            self._extractor.warn_of_repeated(found.frame.index)
-        return replace(result, milliseconds={**found.milliseconds, **result.milliseconds})
+            self._extractor.warn_of_repeated(extracted.frame.index)
+        return replace(result, milliseconds={**extracted.milliseconds, **result.milliseconds})
 
     def _named(self, place: str) -> AbstractContextManager[None]:
         """Make exceptions of third-party parts say what failed, and where."""
@@ -324,7 +324,7 @@ class StereoSlam:
             estimate = self._estimate(of_map=True) if self.landmarks is not None else None
             if estimate is None or self.landmarks is None:
                 raise SlamError("there is no map yet: no frame was processed")
-            rows = self.landmarks.moved(self.atlas.T_map_odom)
+            rows = self.landmarks.in_world(self.atlas.T_map_odom)
             keyframes = (k.corrected(self.calibration.applied, self._session.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
             return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas)

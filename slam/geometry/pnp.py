@@ -172,8 +172,8 @@ def _left_poses(rig: StereoRig, points: Array, measured: Array, triples: NDArray
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
             poses.append(inverse(T))
-    found = np.array(poses).reshape(-1, 4, 4)
-    return found[np.isfinite(found).all(axis=(1, 2))]
+    poses_left = np.array(poses).reshape(-1, 4, 4)
+    return poses_left[np.isfinite(poses_left).all(axis=(1, 2))]
 
 
 def rigid_fit(source: Array, target: Array) -> Array:

@@ -123,8 +123,8 @@ def check_backend(factory: Factory, tier: str = "good") -> None:
         AssertionError: the first check that fails, by name, with how it fails and what it asks for.
         ConfigurationError: there is no such tier.
     """
-    for found in findings(factory, tier):
-        if found.failure:
+    for finding in findings(factory, tier):
+        if finding.failure:
             raise AssertionError(f"{found.check} ({found.tier}): {found.failure}. Asked for: {found.demand}")
 
 

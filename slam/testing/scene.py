@@ -136,9 +136,9 @@ def require_status(report: UpdateReport, expected: UpdateStatus, what: str) -> N
     require(status is expected, f"status of {what}: {status!s} {report.reason!r}, not {expected.value}")
 
 
-def require_same(found: ArrayLike, expected: ArrayLike, what: str, tolerance: float = 0.0) -> None:
+def require_same(value: ArrayLike, expected: ArrayLike, what: str, tolerance: float = 0.0) -> None:
     """Fail unless two arrays have one shape and differ by no more than `tolerance`."""
-    a, b = np.asarray(found), np.asarray(expected)
+    a, b = np.asarray(value), np.asarray(expected)
     require(a.shape == b.shape, f"{what}: shape {a.shape}, {b.shape} expected")
     if a.size and tolerance:
         off = float(np.abs(a - b).max())
@@ -173,6 +173,6 @@ def assert_covariance(P: Array, shape: tuple[int, ...], what: str) -> None:
 def assert_near(T: Array, truth: Array, what: str, factor: float = 1.0) -> None:
     """Fail unless a pose is near the true one."""
     error = se3.log(se3.inverse(truth) @ T)
-    turned, moved = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
-    near = moved < factor * _POSITION and turned < factor * _ROTATION
+    turned, shifted = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+    near = shifted < factor * _POSITION and turned < factor * _ROTATION
     require(near, f"{what}: off by {moved:.3g} m, {turned:.3g} rad")

@@ -123,12 +123,12 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
     return rows[:count], order.take(places[:count])
 
 
-def crowded(uv: Array, others: Array, radius: float) -> BoolArray:
+def crowded(uv: Array, neighbours: Array, radius: float) -> BoolArray:
     """Which pixels (N, 2) lie within `radius` [px] of any of `others` (M, 2)."""
-    if not len(others):
+    if not len(neighbours):
         return np.zeros(len(uv), bool)
-    rows, columns = pairs_in_boxes(uv, np.full((len(uv), 2), radius), others)
-    gap = (uv[rows] - others[columns]).astype(np.float32)
+    rows, columns = pairs_in_boxes(uv, np.full((len(uv), 2), radius), neighbours)
+    gap = (uv[rows] - neighbours[columns]).astype(np.float32)
     out = np.zeros(len(uv), bool)
     out[rows[np.square(gap).sum(axis=1) < radius * radius]] = True
     return out

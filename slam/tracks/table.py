@@ -140,6 +140,6 @@ class LandmarkTable(Table):
         whole = super().joined(other)
         return whole if ascending(whole.ids) else whole.select(np.argsort(whole.ids, kind="stable"))
 
-    def moved(self, T: Array) -> LandmarkTable:
+    def in_world(self, T: Array) -> LandmarkTable:
         """The same in another world frame; `T` (4, 4) transforms coordinates to it."""
         return replace(self, seen_from=transform(T, self.seen_from))
