@@ -290,7 +290,7 @@ def _fill(backend: Backend, saved: SavedMap) -> None:
     most = getattr(backend, "most_landmarks", None)
     if most is not None and len(saved) > most:
         raise SlamError(
-            f"{known.source}: {len(known)} landmarks, but {name} takes a map of at most {most}: "
+            f"{saved.source}: {len(saved)} landmarks, but {name} takes a map of at most {most}: "
             "start in a smaller map, or with another back end"
         )
     backend.insert(saved.ids, saved.positions, saved.covariances)

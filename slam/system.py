@@ -118,7 +118,7 @@ class StereoSlam:
     def __repr__(self) -> str:
         frontend = "no front end" if self.frontend is None else type(self.frontend).__name__
         landmarks = 0 if self.landmarks is None else len(self.landmarks)
-        done = f"{count(self._state.index + 1, 'frame')}, {count(known, 'landmark')}"
+        done = f"{count(self._state.index + 1, 'frame')}, {count(landmarks, 'landmark')}"
         return f"StereoSlam({frontend}, {type(self.backend).__name__}, {done})"
 
     @property
@@ -219,7 +219,7 @@ class StereoSlam:
 
     def _timed_step(self, extracted: Extracted) -> FrameResult:
         """A step with what was found in images; the result has the time of extraction, too."""
-        with self._named(f"frame {found.frame.index}"):
+        with self._named(f"frame {extracted.frame.index}"):
             result = self._process(extracted.features, extracted.checksum)
         if result.reason == REPEATED:
             self._extractor.warn_of_repeated(extracted.frame.index)

@@ -125,7 +125,7 @@ def check_backend(factory: Factory, tier: str = "good") -> None:
     """
     for finding in findings(factory, tier):
         if finding.failure:
-            raise AssertionError(f"{found.check} ({found.tier}): {found.failure}. Asked for: {found.demand}")
+            raise AssertionError(f"{finding.check} ({finding.tier}): {finding.failure}. Asked for: {finding.demand}")
 
 
 def _failure(check: Check, factory: Factory) -> str:

@@ -26,10 +26,10 @@ def main(arguments: list[str] | None = None) -> int:
         if finding.tier != tier:
             tier = finding.tier
             print(tier)
-        print(f"  {'fails ' if found.failure else 'passes'}  {found.check}")
+        print(f"  {'fails ' if finding.failure else 'passes'}  {finding.check}")
         if finding.failure:
             failures += 1
-            print(f"          {found.failure}.\n          Asked for: {found.demand}")
+            print(f"          {finding.failure}.\n          Asked for: {finding.demand}")
     print(f"{failures} failed" if failures else "all passed")
     return int(failures > 0)
 

@@ -133,8 +133,8 @@ def misuse_is_refused(factory: Factory) -> None:
             raises(MeasurementError, getattr(backend, method), argument, what=f"{method} {what}")
         else:
             getattr(backend, method)(argument)
-    place = getattr(backend, "place", None)
-    for depth in (-5.0, 0.0, float("nan")) if place else ():
+    place: Any = getattr(backend, "place", None)
+    for depth in (-5.0, 0.0, float("nan")) if place is not None else ():
         raises(MeasurementError, place, *cloud([7], [[0, 0, depth]]), what=f"place at a depth of {depth}")
     after = backend.estimate()
     require_same(after.ids, before.ids, "landmarks after calls that were refused")

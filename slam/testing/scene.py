@@ -175,4 +175,4 @@ def assert_near(T: Array, truth: Array, what: str, factor: float = 1.0) -> None:
     error = se3.log(se3.inverse(truth) @ T)
     turned, shifted = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
     near = shifted < factor * _POSITION and turned < factor * _ROTATION
-    require(near, f"{what}: off by {moved:.3g} m, {turned:.3g} rad")
+    require(near, f"{what}: off by {shifted:.3g} m, {turned:.3g} rad")

@@ -103,8 +103,8 @@ def follow(
     signs,
     rows,
     uv,
-    looks_of_features,
-    other_signs,
+    feature_looks,
+    feature_signs,
     order,
     pairs,
 ):
@@ -139,7 +139,7 @@ def follow(
         while place < len(order) and uv[order[place], 0] <= x + reach_u:
             feature = order[place]
             place += 1
-            if abs(uv[feature, 1] - y) > reach_v or other_signs[feature] != signs[rows[row]]:
+            if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[rows[row]]:
                 continue
             du, dv = np.float32(uv[feature, 0] - x), np.float32(uv[feature, 1] - y)
             if bounds[1] > 0:
@@ -164,7 +164,7 @@ def follow(
         for p in range(count):
             allowed[p] = level[p] <= number and not done[a[p]] and not taken[b[p]]
             if allowed[p] and level[p] == number:  # in a larger window, of tracks that are not found yet alone
-                likeness = product(looks[rows[a[p]]], looks_of_features[b[p]])
+                likeness = product(looks[rows[a[p]]], feature_looks[b[p]])
                 distance[p] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
         best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[number], ratio, good)
         for p in range(count):
