@@ -57,10 +57,11 @@ def require_not_negative(config: object, ranges: Ranges | None = None, owner: st
     require_positive(config, ranges, owner, positive=False)
 
 
-def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool) -> str:
+def _range_fault(value: Any, limits: tuple[float, float] | None, positive: bool) -> str:
     """What is required of a number outside its range; empty if it is inside, or no number."""
-    if not isinstance(number, numbers.Real) or isinstance(number, (bool, np.bool_)):
+    if not isinstance(value, numbers.Real) or isinstance(value, (bool, np.bool_)):
         return ""
+    number: Any = value
     whole = isinstance(number, numbers.Integral)
     text = "positive and finite" if positive else "finite and not negative"
     if limits is not None and number == limits[1]:  # which may be infinite

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import overload
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.step import Step
 from slam.naming import count
-from slam.objects.modes import ObjectDetector, detector_for
+from slam.objects.modes import detector_for
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.one_thread import OneThread
@@ -59,6 +58,11 @@ class StereoSlam:
             LOST until the camera is found in it. The back end must be given by name.
         rig_prior: errors of the rig as estimated from earlier recordings (see `slam.load_calibration`). They are
             corrected from the first frame on, and their estimation continues.
+
+    Attributes:
+        rig, frontend, config: as given.
+        calibration: the rig's error as estimated so far.
+        objects: the detector of what moves.
 
     Raises:
         CalibrationError: `rig_prior` is of another rig.
@@ -106,8 +110,10 @@ class StereoSlam:
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
         inside.require_fits(first)
-        self._session = Session(inside.rig, inner, names[1], first, SelfCalibration(rig, c.self_calibration, rig_prior))
-        self._tracker = Tracker(self._session, detector_for(inside.rig, c.objects, inner.models))
+        self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
+        self._session = Session(inside.rig, inner, names[1], first, self.calibration)
+        self.objects = detector_for(inside.rig, c.objects, inner.models)
+        self._tracker = Tracker(self._session, self.objects, self.frontend)
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
@@ -141,28 +147,10 @@ class StereoSlam:
         return self._state.atlas
 
     @property
-    def objects(self) -> ObjectDetector:
-        """The detector of what moves."""
-        return self._tracker.objects
-
-    @objects.setter
-    def objects(self, detector: ObjectDetector) -> None:
-        self._tracker.objects = detector
-
-    @property
-    def calibration(self) -> SelfCalibration:
-        """The rig's error as estimated so far."""
-        return self._session.calibration
-
-    @property
     def restarted(self) -> list[int]:
         """Indices of the frames in which another back end took over: a kidnapped camera, or a new map."""
         return list(self._state.restarted)
 
-    @overload
-    def process(self, frame: StereoFrame, /) -> FrameResult: ...
-    @overload
-    def process(self, left: np.ndarray, right: np.ndarray | None, stamp: float) -> FrameResult: ...
     def process(
         self, left: StereoFrame | np.ndarray, right: np.ndarray | None = None, stamp: float | None = None
     ) -> FrameResult:
@@ -238,7 +226,7 @@ class StereoSlam:
         with stage("predict"):  # the motion model advances the camera's pose (paper A, Eq. 11), unless it stands
             standing, prediction = (state.standing, begun) if begun else t.predict(state, features)
         with stage("associate"):  # correct the features; find landmarks in size-variable windows (paper A, IV)
-            step = t.associate(state, features, standing, prediction, self.frontend)
+            step = t.associate(state, features, standing, prediction)
             if isinstance(step, Elsewhere):  # the camera was found somewhere else in the map
                 return step
         with stage("update"):  # the landmarks' pixels correct pose and map
@@ -250,7 +238,7 @@ class StereoSlam:
         with stage("objects"):  # sort the features: still, moving, undecided; estimate moving bodies (paper B, 3)
             step = t.sort(state, step)
         with stage("manage"):  # count what was seen, erase bad landmarks, add new ones (paper A, IV)
-            step = t.manage(state, step, self.frontend)
+            step = t.manage(state, step)
         with stage("atlas"):  # the frame may become a keyframe; a loop corrects the path
             return t.close_loops(state, step)
 

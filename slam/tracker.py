@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypeGuard
 
 import numpy as np
 
@@ -41,15 +40,18 @@ class Tracker:
     Args:
         session: with the parts of the system, and the back ends.
         objects: detects what moves.
+        frontend: made the features; those of landmarks are aligned with earlier images if it can do that.
 
     Attributes:
         advanced: stamp to which a back end was last advanced [s]; an interrupted step counts.
     """
 
-    def __init__(self, session: Session, objects: ObjectDetector) -> None:
+    def __init__(self, session: Session, objects: ObjectDetector, frontend: Frontend | None) -> None:
         self.objects = objects
         self.advanced = -np.inf
         self._session = session
+        aligns = session.config.association.align and isinstance(frontend, AligningFrontend)
+        self._aligning: AligningFrontend | None = frontend if aligns else None  # type: ignore[assignment]
 
     def revise(self, state: State) -> Revision | None:
         """Apply the present estimate of the rig's error, also to earlier measurements if the back end can."""
@@ -68,10 +70,9 @@ class Tracker:
         return standing, prediction
 
     def associate(
-        self, state: State, features: StereoFeatures, standing: Standing, prediction: Prediction,
-        frontend: Frontend | None,
-    ) -> Step | Elsewhere:  # fmt: skip
-        """Match landmarks with features, and align the features if the front end that made them can."""
+        self, state: State, features: StereoFeatures, standing: Standing, prediction: Prediction
+    ) -> Step | Elsewhere:
+        """Match landmarks with features, and align the features with earlier images."""
         corrected, place = self._session.calibration.correct(features), None
         landmarks = state.landmarks or LandmarkTable.empty(features.descriptors.shape[1])
 
@@ -91,9 +92,9 @@ class Tracker:
                 return Elsewhere(matches.T_world_left, place)
             matches = LandmarkMatches.nothing()
         aligned = features
-        if self._aligns(frontend):
+        if self._aligning is not None:
             rig, positions = self._session.rig, state.backend.positions
-            aligned, landmarks = align(rig, frontend, features, matches, landmarks, positions)
+            aligned, landmarks = align(rig, self._aligning, features, matches, landmarks, positions)
         if aligned is not features:
             corrected = _shifted_as(corrected, features, aligned)
         step = Step(
@@ -103,10 +104,6 @@ class Tracker:
         suspects = self._suspects(state, step)
         moving = isin(matches.ids, suspects)
         return replace(step, matches=matches.select(~moving), withheld=matches.select(moving), suspects=suspects)
-
-    def _aligns(self, frontend: Frontend | None) -> TypeGuard[AligningFrontend]:
-        """Whether features are aligned with earlier images."""
-        return self._session.config.association.align and isinstance(frontend, AligningFrontend)
 
     def _suspects(self, state: State, step: Step) -> IdArray:
         """Ids of landmarks that may move; while the camera stands, all matched ones that do not stay where they are."""
@@ -149,13 +146,13 @@ class Tracker:
         labels = labels.with_undecided(standing.leaving(len(step.features)))
         return replace(step, labels=labels, objects=objects)
 
-    def manage(self, state: State, step: Step, frontend: Frontend | None) -> Step:
+    def manage(self, state: State, step: Step) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
         step = self._session.mapper.update(state.backend, step)
         seen, T = step.matches.joined(step.added), step.estimate.T_world_left
         landmarks = step.landmarks
-        if self._aligns(frontend):
-            landmarks = with_new_patches(frontend, step.measured, seen, landmarks, T)
+        if self._aligning is not None:
+            landmarks = with_new_patches(self._aligning, step.measured, seen, landmarks, T)
         new = step.added.ids[~isin(step.added.ids, step.erased)]
         self._session.rig_error.uncertainty.change(new, _positions(state, new), step.erased)
         return replace(step, landmarks=landmarks)

@@ -226,7 +226,7 @@ def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     return ""
 
 
-def floats(what: str, values: ArrayLike) -> Array:
+def floats(what: str, values: ArrayLike | None) -> Array:
     """An array of numbers.
 
     Raises:

@@ -149,7 +149,7 @@ class StereoRig:
         if K_right is not None or D_right is not None:
             right = PinholeCamera.from_matrix(K_left if K_right is None else K_right, D_right, size, fisheye)
         rotation = floats("stereo extrinsics", np.eye(3) if R is None else R)
-        offset = floats("stereo extrinsics", baseline if T is None else T).reshape(-1)
+        offset = floats("stereo extrinsics", T if baseline is None else baseline).reshape(-1)
         offset = offset * [-1.0, 0.0, 0.0] if T is None else offset
         if rotation.shape != (3, 3) or offset.shape != (3,):
             raise CalibrationError("stereo extrinsics must be a (3, 3) rotation and a (3,) translation")

@@ -11,7 +11,6 @@ from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
-from slam.objects.modes import NoDetector
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
@@ -82,11 +81,10 @@ def test_time_must_increase():
 
 def test_landmarks_held_in_suspicion_stay_and_are_not_counted():
     cloud = Cloud(150)
-    system = StereoSlam(RIG, None, "ekf", config=CONFIG)
+    system = StereoSlam(RIG, None, "ekf", config=CONFIG.with_settings(["objects.mode=off"]))
     held = np.zeros(0, np.int64)
     for k, T in enumerate(path(20)):
         if k == 5:
-            system.objects = NoDetector()
             held = system.objects.suspects = system.landmarks.ids[:6].copy()
             before = system.landmarks.select(np.arange(6))
         result = system.process_features(cloud.features(T, k / 30, 0.3)[0])

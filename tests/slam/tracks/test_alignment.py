@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import slam
-from slam.config import SystemConfig
 from slam.data import IdArray, ImagePair, Patches
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -128,31 +127,3 @@ def test_without_a_pose_or_images_nothing_moves_and_what_was_not_seen_for_long_i
     assert after.has_patch.tolist() == [True, False, True, True]
     moved = np.abs(aligned.uv_left - features.uv_left).max(axis=1) > 0
     assert moved[SEEN.rows].tolist() == [True, False, True, True]
-
-
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_features_slide_less(backend):
-    """Reprojection errors of the true path are half as large; all else is the same."""
-    sequence = slam.open_sequence("synthetic:desk?frames=8")
-    config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-    true = sequence.ground_truth.poses
-    slid = {}
-    for aligned in (False, True):
-        association = replace(config.association, align=aligned)
-        system = slam.StereoSlam(sequence.rig, backend=backend, config=replace(config, association=association))
-        first: dict[int, np.ndarray] = {}  # where the landmarks are, by their first sight and the true pose
-        errors = []
-        for k, frame in enumerate(sequence):
-            result = system.process(frame)
-            assert result.features.images is None  # a result does not hold the images
-            z = result.features
-            known = np.array([i in first for i in result.matched.tolist()], bool)
-            if known.any():
-                points = np.array([first[i] for i in result.matched[known].tolist()])
-                expected = sequence.rig.left.project(se3.transform(se3.inverse(true[k]), points))
-                errors.append(np.linalg.norm(z.uv_left[result.matched_features[known]] - expected, axis=1))
-            rows = result.added_features
-            world = se3.transform(true[k], sequence.rig.triangulate(z.uv_left[rows], z.uv_right[rows]))
-            first |= dict(zip(result.added.tolist(), world))
-        slid[aligned] = np.median(np.concatenate(errors))
-    assert slid[True] < 0.7 * slid[False]
