@@ -7,7 +7,6 @@ the end, so that a step has happened or has not. If a step finds that the camera
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -69,13 +68,6 @@ class State:
     past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
     restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
 
-    @classmethod
-    def in_map(cls, backend: Backend, saved: SavedMap) -> State:
-        """Before the first frame of a run that starts in a map."""
-        atlas = Atlas.of_earlier_run(saved.keyframes, saved.keyframe_poses, saved.loops)
-        dimensions, mapped = saved.dimensions if len(saved) else None, len(saved) > 0
-        return cls(backend, saved.rows, atlas, dimensions=dimensions, mapped=mapped, prior_map=saved)
-
     def begins_at(self, index: int) -> bool:
         """Whether the back end takes over in this frame."""
         return index in self.restarted[-1:]
@@ -126,10 +118,8 @@ class Session:
         self, rig: StereoRig, config: SystemConfig, backend: str | None, first: Backend, calibration: SelfCalibration
     ) -> None:
         c = config
-        self.rig, self.config, self._models = rig, c, c.models
-        self._backend: str | None = backend
-        self._options: Mapping[str, Any] = c.backend
-        self.calibration = calibration
+        self.rig, self.config, self.calibration = rig, c, calibration
+        self._models, self._backend = c.models, backend
         self.rig_error = RemainingRigError(self.calibration, c.models)
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self.mapper = Mapper(rig, c.map, self.localizer, first)
@@ -149,7 +139,9 @@ class Session:
         if not len(prior_map) and not prior_map.keyframes:
             raise SlamError(f"{prior_map.source}: the map holds no landmarks, so the camera cannot be found in it")
         _fill(first, prior_map)
-        return State.in_map(first, prior_map)
+        atlas = Atlas.of_earlier_run(prior_map.keyframes, prior_map.keyframe_poses, prior_map.loops)
+        dimensions, mapped = prior_map.dimensions if len(prior_map) else None, len(prior_map) > 0
+        return State(first, prior_map.rows, atlas, dimensions=dimensions, mapped=mapped, prior_map=prior_map)
 
     def can_restart(self, state: State) -> bool:
         """Whether another back end can take over."""
@@ -230,7 +222,8 @@ class Session:
             atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
         else:
             new, seen_at, landmarks = self._start(T), None, state.landmarks
-            _give_landmarks(old, new)
+            whole = old.estimate()
+            new.insert(whole.ids, whole.positions, definite(whole.covariances))  # type: ignore[attr-defined]
             if elsewhere.place is not None:
                 assert landmarks is not None
                 landmarks = self.mapper.insert(new, landmarks, elsewhere.place.place)
@@ -271,15 +264,8 @@ class Session:
         """Another back end of the same kind."""
         assert self._backend is not None
         changed = replace(self._models, **models)
-        backend: Backend = registry.create("backends", self._backend, self.rig, models=changed, **self._options)
+        backend: Backend = registry.create("backends", self._backend, self.rig, models=changed, **self.config.backend)
         return backend
-
-
-def _give_landmarks(old: Backend, new: Backend) -> None:
-    """Give all landmarks of a back end to another one."""
-    assert isinstance(new, MapBackend)
-    whole = old.estimate()
-    new.insert(whole.ids, whole.positions, definite(whole.covariances))
 
 
 def _fill(backend: Backend, saved: SavedMap) -> None:

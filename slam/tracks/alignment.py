@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -54,13 +53,20 @@ def align(
     if matches.T_world_left is None or features.images is None or not usable.any():
         return features, landmarks
     rows, at = matches.rows[usable], at[usable]
-    patches, poses = _stacked(landmarks.patches[at].tolist())
+    columns = (
+        [getattr(p, name) for p in landmarks.patches[at]] for name in ("image", "centre", "size", "T_world_left")
+    )
+    images, centres, size, poses = map(np.array, columns)
     warps = warps_of(rig, poses, matches.T_world_left, positions(landmarks.ids[at]))
     growth = np.sqrt(np.abs(np.linalg.det(warps)))
     similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
     outgrown = (growth > _RENEWED) | (growth * _RENEWED < 1)
     start = features.uv_left[rows], features.uv_right[rows]
-    left, right = _pixels(frontend, frontend.align(features.images, patches, warps, *start), len(rows))
+    answer = frontend.align(features.images, Patches(images, centres, size), warps, *start)
+    if (got := [np.shape(uv) for uv in checked(frontend, "align", answer)]) != 2 * [start[0].shape]:
+        what = f"{type(frontend).__name__}.align: must give left and right pixels {start[0].shape}"
+        raise SlamError(f"{what}, got {got}")
+    left, right = answer
     stereo = features.has_stereo[rows]
     aligned = similar & rig.left.in_image(left) & (rig.right.in_image(right) | ~stereo)
     right[~stereo] = np.nan
@@ -97,21 +103,6 @@ def with_new_patches(
     return landmarks.with_patches(
         at, [Patch(*each, T_world_left) for each in zip(taken.images, taken.centres, taken.size)]
     )
-
-
-def _stacked(patches: list[Patch]) -> tuple[Patches, Array]:
-    """Patches as the front end wants them, and the poses (N, 4, 4) from which they were taken."""
-    columns = ([getattr(patch, name) for patch in patches] for name in ("image", "centre", "size", "T_world_left"))
-    images, centres, size, poses = map(np.array, columns)
-    return Patches(images, centres, size), poses
-
-
-def _pixels(frontend: AligningFrontend, answer: Any, count: int) -> tuple[Array, Array]:
-    """Left and right pixels (N, 2) that a front end has found; raises SlamError where it answered something else."""
-    both = [np.shape(uv) for uv in checked(frontend, "align", answer)]
-    if both != 2 * [(count, 2)]:
-        raise SlamError(f"{type(frontend).__name__}.align: must give left and right pixels ({count}, 2), got {both}")
-    return answer[0], answer[1]
 
 
 def warps_of(rig: StereoRig, poses: Array, T_world_left: Array, positions: Array) -> Array:

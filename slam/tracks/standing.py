@@ -19,6 +19,7 @@ from slam.geometry.arrays import median
 from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.table import Table
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
@@ -31,7 +32,7 @@ _BLIND = (
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class Places(Table):
     """Features that may stay at their pixels, a row each."""
 
     z: Array  # mean (uL, vL, uR) of their first sights (K, 3) [px]
@@ -67,11 +68,7 @@ class Places:
         keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
         keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:3000])  # 3000: features
         new = np.delete(np.arange(len(z)), rows)
-        return Places(
-            np.concatenate([mean[keep], z[new]]), np.concatenate([self.descriptors[keep], descriptors[new]]),
-            np.concatenate([sights[keep], np.ones(len(new), np.int64)]),
-            np.concatenate([missed[keep], np.zeros(len(new), np.int64)]),
-        )  # fmt: skip
+        return Places(mean, self.descriptors, sights, missed).select(keep).joined(Places.of(z[new], descriptors[new]))
 
 
 @dataclass(frozen=True, eq=False)
