@@ -203,13 +203,7 @@ class EstimatorModels:
 
 #: Models by kind of motion; every sequence of a kind runs with the same.
 KINDS = {
-    "handheld": EstimatorModels(
-        MotionModel(acceleration=1.0, angular_acceleration=1.0),
-        pixel_sigma=0.3,
-        initial_velocity_sigma=1.0,
-        initial_angular_velocity_sigma=1.0,
-        objects=ObjectModels(drift=0.7),
-    ),
+    "handheld": EstimatorModels(pixel_sigma=0.3, objects=ObjectModels(drift=0.7)),
     "driving": EstimatorModels(
         MotionModel(acceleration=1.0, angular_acceleration=0.3, wheels=True),
         pixel_sigma=0.7,

@@ -53,10 +53,8 @@ def align(
     if matches.T_world_left is None or features.images is None or not usable.any():
         return features, landmarks
     rows, at = matches.rows[usable], at[usable]
-    columns = (
-        [getattr(p, name) for p in landmarks.patches[at]] for name in ("image", "centre", "size", "T_world_left")
-    )
-    images, centres, size, poses = map(np.array, columns)
+    names = ("image", "centre", "size", "T_world_left")
+    images, centres, size, poses = (np.array([getattr(p, name) for p in landmarks.patches[at]]) for name in names)
     warps = warps_of(rig, poses, matches.T_world_left, positions(landmarks.ids[at]))
     growth = np.sqrt(np.abs(np.linalg.det(warps)))
     similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
