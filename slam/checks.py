@@ -32,14 +32,21 @@ def require_not_measured(owner: str, measured: bool) -> None:
         raise MeasurementError(f"{owner}: a stamp has one update, right after its predict")
 
 
+def is_rigid(T: Array, tolerance: float) -> bool:
+    """Whether T (4, 4) is a rotation and a translation, as far as a double can tell what a camera sees there."""
+    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_POSITION).all() or np.abs(T[:3, :3]).max() >= 1.1:
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() <= tolerance and np.linalg.det(R) > 0)
+
+
 def require_guess(owner: str, guess: Array | None) -> None:
     """Raise MeasurementError where a guess of the camera's pose is no rigid motion (4, 4)."""
     if guess is None:
         return
     if not isinstance(guess, np.ndarray) or guess.shape != (4, 4) or not np.isfinite(guess).all():
         raise MeasurementError(f"{owner}: the guess must be a finite pose, an array (4, 4)")
-    R = guess[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or (guess[3] != (0, 0, 0, 1)).any():
+    if not is_rigid(guess, 1e-3) or (guess[3] != (0, 0, 0, 1)).any():
         raise MeasurementError(f"{owner}: the guess must be a rigid motion: a rotation and a translation")
 
 

@@ -97,15 +97,6 @@ class StereoFeatures:
     threshold: float = float("nan")
     images: ImagePair | None = field(default=None, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
-        for name in _COLUMNS:
-            value = getattr(self, name)
-            if not isinstance(value, (np.ndarray, list, tuple)) or (isinstance(value, np.ndarray) and not value.ndim):
-                kind = type(value).__name__
-                raise MeasurementError(f"features: {name} must be an array with a row for each feature, got {kind}")
-            if len(value) != len(self.uv_left):
-                raise MeasurementError(f"features: {name} has {len(value)} rows, uv_left has {len(self.uv_left)}")
-
     def __len__(self) -> int:
         return len(self.uv_left)
 

@@ -11,7 +11,7 @@ import numpy as np
 from slam.bounds import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.bounds import require_not_negative as require_not_negative
 from slam.bounds import require_positive
-from slam.checks import FARTHEST_POSITION
+from slam.checks import is_rigid
 from slam.chi_square import SIGMAS
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
@@ -41,14 +41,6 @@ _BODY_RANGES = {
     "max_turn_rate": (1e-6, 1e6),
     "drift": (0.0, 1e3),
 }
-
-
-def _is_pose(T: Array) -> bool:
-    """Whether an array is a rigid motion (4, 4), its rotation to within the rounding of six digits."""
-    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_POSITION).all() or np.abs(T[:3, :3]).max() >= 1.1:
-        return False
-    R = T[:3, :3]
-    return bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-6 and np.linalg.det(R) > 0)
 
 
 @dataclass(frozen=True)
@@ -189,7 +181,7 @@ class EstimatorModels:
                 T = np.array(self.T_world_left, float)
             except (TypeError, ValueError, OverflowError):
                 T = np.zeros(0)
-            if not _is_pose(T):
+            if not is_rigid(T, 1e-6):  # to within the rounding of six digits
                 raise ConfigurationError("T_world_left must be a (4, 4) pose: a rotation and a translation")
             object.__setattr__(self, "T_world_left", tuple(map(tuple, T.tolist())))
         if self.gate_probability >= 1:

@@ -12,18 +12,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import MeasurementError
 from slam.geometry.arrays import Array, BoolArray, IdArray
 from slam.naming import count, of_shapes, point
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectObservations:
-    """Points of one rigid body seen in the current frame, a row each.
-
-    Raises:
-        MeasurementError: shapes differ, a point occurs twice, or a left pixel is not finite.
-    """
+    """Points of one rigid body seen in the current frame, a row each."""
 
     id: int  # of the body
     points: IdArray  # ids of its points (M,), unique over all bodies; a point keeps its id as long as it is tracked
@@ -36,20 +31,6 @@ class ObjectObservations:
     velocity_sigma: Array | None = None  # its standard deviations (6,); None where there is no prior
 
     __repr__ = of_shapes
-
-    def __post_init__(self) -> None:
-        n, shapes = len(self.points), (self.uv_left.shape, self.uv_right.shape)
-        fault = ""
-        if shapes != ((n, 2), (n, 2)):
-            fault = f"{n} points, but uv_left is {shapes[0]} and uv_right {shapes[1]}"
-        elif len(np.unique(self.points)) != n:
-            fault = "a point stands twice"
-        elif not np.isfinite(self.uv_left).all():
-            fault = "a left pixel is not finite"
-        elif (self.velocity is None) != (self.velocity_sigma is None):
-            fault = "a velocity and its sigma belong together"
-        if fault:
-            raise MeasurementError(f"object {self.id}: {fault}")
 
     @property
     def has_stereo(self) -> BoolArray:

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 import backends
 from slam.data import RecentPoses
-from slam.errors import ConfigurationError, MeasurementError
+from slam.errors import ConfigurationError
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
 from slam.interfaces import RecentBackend
@@ -120,9 +120,8 @@ def test_pose_is_exact_but_for_the_camera_at_first_sight():
 
 
 def test_a_new_bodys_velocity_is_what_was_known_of_it():
-    scene, rng = box_scene(frames=2), np.random.default_rng(0)
+    scene = box_scene(frames=2)
     velocity, sigma = np.array([0, 0.1, 0, 0.3, -0.2, 0.1]), np.full(6, 0.02)
-    seen = scene.observations(0, rng)
 
     def rule(k, o):
         return replace(o, velocity=velocity, velocity_sigma=sigma) if k == 0 else None
@@ -131,8 +130,6 @@ def test_a_new_bodys_velocity_is_what_was_known_of_it():
     assert first.estimate.velocity == pytest.approx(velocity)
     assert np.sqrt(first.estimate.velocity_covariance.diagonal()) == pytest.approx(sigma)
     assert np.linalg.norm(second.estimate.velocity - velocity) < 1e-6, "and it goes on so"
-    with pytest.raises(MeasurementError, match="belong together"):
-        replace(seen, velocity=velocity)
 
 
 def test_abrupt_stop_and_start():
