@@ -74,16 +74,16 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
         try:
             if fault := _impossible(output, made):
                 raise SlamError(f"{output.path}: cannot be written: {fault}")
-            for path in output.present:
-                if not overwrite and not any(_is_input(path, file) for file in read):
-                    allow = "" if overwrite is None else ", or --overwrite to replace it"
-                    raise SlamError(f"{path}: is there already; give another {output.option}{allow}")
-                if output.names is not None and path.exists():
-                    _require_kind(path, path.name not in output.names and f"{path.name}/" in output.names)
             filled = output.is_folder and output.path.is_dir() and next(output.path.iterdir(), None) is not None
             for path in [*output.present, *([output.path] if filled else [])]:
                 if any(_is_input(path, file) for file in read):
                     raise SlamError(f"{path}: is an input, or in a folder of inputs; give another {output.option}")
+            for path in output.present:
+                if not overwrite:
+                    allow = "" if overwrite is None else ", or --overwrite to replace it"
+                    raise SlamError(f"{path}: is there already; give another {output.option}{allow}")
+                if output.names is not None and path.exists():
+                    _require_kind(path, path.name not in output.names and f"{path.name}/" in output.names)
         except OSError as fault:
             raise SlamError(f"{output.path}: cannot be written: {reason(fault)}") from fault
     for one, other in permutations(outputs, 2):
