@@ -79,7 +79,7 @@ FAULTS = (
     ),
     Fault(
         "pixel noise not scaled to the rectified image", "slam/input/rectification.py",
-        "pixel_sigma=models.pixel_sigma * scale", "pixel_sigma=models.pixel_sigma",
+        "pixel_sigma=models.pixel_sigma * scale", "pixel_sigma=1.0 * models.pixel_sigma",
         "tests/slam/input/test_rectification.py",
     ),
     # the sliding window
