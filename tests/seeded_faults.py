@@ -79,7 +79,8 @@ FAULTS = (
     ),
     Fault(
         "pixel noise not scaled to the rectified image", "slam/input/rectification.py",
-        "pixel_sigma=models.pixel_sigma * scale", "pixel_sigma=1.0 * models.pixel_sigma",
+        "return replace(models, pixel_sigma=models.pixel_sigma * scale, T_world_left=T.tolist(), objects=objects)",
+        "return replace(models, T_world_left=T.tolist(), objects=objects)",
         "tests/slam/input/test_rectification.py",
     ),
     # the sliding window
