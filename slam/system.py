@@ -225,21 +225,21 @@ class StereoSlam:
         stage, t = self._stages.stage, self._tracker
         with stage("predict"):  # the motion model advances the camera's pose (paper A, Eq. 11), unless it stands
             standing, prediction = (state.standing, begun) if begun else t.predict(state, features)
-        with stage("associate"):  # correct the features; find landmarks in size-variable windows (paper A, IV)
+        with stage("associate"):  # correct the features; find landmarks in windows (paper A, IV): `slam.tracks.localizer`
             step = t.associate(state, features, standing, prediction)
             if isinstance(step, Elsewhere):  # the camera was found somewhere else in the map
                 return step
         with stage("update"):  # the landmarks' pixels correct pose and map
             step = t.update(state, step)
-            if isinstance(step, Elsewhere):  # the place is unknown
+            if isinstance(step, Elsewhere):  # the place is unknown: a new map begins
                 return step
         with stage("estimate"):  # the pose; how it depends on the rig's error; the calibration learns from it
             step = t.estimate(state, step)
-        with stage("objects"):  # sort the features: still, moving, undecided; estimate moving bodies (paper B, 3)
+        with stage("objects"):  # still, moving or undecided; moving bodies (paper B, 3): `slam.objects.detector`
             step = t.sort(state, step)
-        with stage("manage"):  # count what was seen, erase bad landmarks, add new ones (paper A, IV)
+        with stage("manage"):  # count, erase and add landmarks (paper A, IV): `slam.mapping.mapper`
             step = t.manage(state, step)
-        with stage("atlas"):  # the frame may become a keyframe; a loop corrects the path
+        with stage("atlas"):  # the frame may become a keyframe, a loop corrects the path: `slam.mapping.atlas`
             return t.close_loops(state, step)
 
     @one_blas_thread
@@ -263,7 +263,7 @@ class StereoSlam:
         with self._stages.stage("predict"):
             revision = tracker.revise(state)
         step = self._step(state, features)
-        if isinstance(step, Elsewhere):
+        if isinstance(step, Elsewhere):  # another back end begins there, in the map or in a new one
             state, begun = session.taken_over(state, step, features)
             self.objects.restart()
             step = self._step(state, features, begun)
