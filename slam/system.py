@@ -225,7 +225,7 @@ class StereoSlam:
         stage, t = self._stages.stage, self._tracker
         with stage("predict"):  # the motion model advances the camera's pose (paper A, Eq. 11), unless it stands
             standing, prediction = (state.standing, begun) if begun else t.predict(state, features)
-        with stage("associate"):  # correct the features; find landmarks in windows (paper A, IV): `slam.tracks.localizer`
+        with stage("associate"):  # correct features, find landmarks (paper A, IV): `slam.tracks.localizer`
             step = t.associate(state, features, standing, prediction)
             if isinstance(step, Elsewhere):  # the camera was found somewhere else in the map
                 return step
