@@ -112,7 +112,6 @@ class Variant:
 
 
 _HALF = {"driving": ("map.target_in_view=80",), "handheld": ("map.target_in_view=40",)}
-_FEW = "association.measured=40"
 ALL_ON = Variant("everything on")
 USUAL = Variant("default settings", base=False)
 #: In the order in which they are run; those of one tuple share the features of a trial.
@@ -123,8 +122,6 @@ GROUPS = (
         Variant("defaults, half as many in view", {"driving": _HALF["driving"], "handheld": ()}, base=False),
         Variant("no patch alignment", ("association.align=false",)),
         Variant("half as many landmarks in view", _HALF),
-        Variant("40 measured, the most informative", (_FEW,)),
-        Variant("both of these", {kind: (*half, _FEW) for kind, half in _HALF.items()}),
         Variant("the other form of landmarks", {
             "driving": ("backend.landmarks=inverse_depth",), "handheld": ("backend.landmarks=euclidean",),
         }),

@@ -23,10 +23,10 @@ from experiments.loops import ate
 from experiments.tables import show
 from slam.calibration.posterior import RigPosterior
 from slam.config import SystemConfig
+from slam.naming import count
 from slam.registry import ONLINE
 from slam.run.calibrating import Targets, calibrate
 from slam.sequences import open_sequence
-from slam.showing import count
 from slam.system import StereoSlam
 
 #: Worlds as features, so that a drive takes half a minute.

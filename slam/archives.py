@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import io
 import json
-import lzma
 import math
-import struct
-import tokenize
 import zipfile
-import zlib
 from typing import Any
 
 import numpy as np
 
-from slam.errors import SlamError
+from slam.errors import SlamError, text_of
 
 #: Bytes that an archive may unpack to: the larger of this many, and this many times its own size.
 _AT_LEAST, _TIMES = 64 * 2**20, 50
@@ -23,12 +19,6 @@ _MEMBERS = 100  # most members of an archive
 _HEADER = 10_000  # bytes of an array's header
 _KINDS = "biufU"  # of arrays: numbers and text, never objects
 _TEXT = 2**20  # characters of a text that is read as JSON
-
-#: What unpacking damaged archives raises.
-_DAMAGED = (
-    OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, ArithmeticError, SyntaxError, MemoryError,
-    AttributeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error,
-)  # fmt: skip
 
 
 def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict[str, bytes]:
@@ -41,48 +31,37 @@ def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
             members = file.infolist()
-            _require_plain(members, len(data))
+            total, names = sum(m.file_size for m in members), {m.filename for m in members}
+            if not len(names) == len(members) <= _MEMBERS:
+                raise ValueError(f"an archive of {len(members)} members")
+            if total > max(_AT_LEAST, _TIMES * len(data)):
+                raise ValueError(f"{len(data)} bytes that would unpack to {total}")
+            for m in members:
+                if m.flag_bits & 1 or m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError(f"{m.filename} is encrypted, or packed in a way that is not known")
             return {m.filename: file.read(m) for m in members}
-    except _DAMAGED as fault:
+    except Exception as fault:  # the libraries raise some fifteen kinds of them for damaged archives
         raise error(f"{source}: damaged, or no archive of arrays: {_text(fault)}") from fault
-
-
-def _require_plain(members: list[zipfile.ZipInfo], size: int) -> None:
-    """Raise ValueError for an archive that should not be unpacked."""
-    if len(members) > _MEMBERS or len({m.filename for m in members}) < len(members):
-        raise ValueError(f"an archive of {len(members)} members")
-    total = sum(m.file_size for m in members)
-    if total > max(_AT_LEAST, _TIMES * size):
-        raise ValueError(f"{size} bytes that would unpack to {total}")
-    for m in members:
-        if m.flag_bits & 1:
-            raise ValueError(f"{m.filename} is encrypted")
-        if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError(f"{m.filename} is packed in a way that is not known")
 
 
 def array(data: bytes, name: str, source: str, error: type[SlamError] = SlamError) -> np.ndarray:
     """The array of an ``.npy`` member, whose header must agree with the data; raises `error` where it is none."""
     try:
-        return _array(data)
-    except _DAMAGED as fault:
+        stream = io.BytesIO(data)
+        version = np.lib.format.read_magic(stream)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"version {version}")
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(stream, max_header_size=_HEADER)
+        body, count = data[stream.tell() :], math.prod(shape)
+        if dtype.kind not in _KINDS:
+            raise ValueError(f"of type {dtype}")
+        if min(shape, default=0) < 0 or max(shape, default=0) >= 2**31 or count * dtype.itemsize != len(body):
+            raise ValueError(f"{len(body)} bytes for shape {shape} of {dtype}")
+        flat = np.frombuffer(body, dtype) if dtype.itemsize else np.zeros(count, dtype)
+        return flat.reshape(shape, order="F" if fortran else "C").copy()
+    except Exception as fault:  # likewise
         raise error(f"{source}: {name} cannot be read as an array: {_text(fault)}") from fault
-
-
-def _array(data: bytes) -> np.ndarray:
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version}")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read(stream, max_header_size=_HEADER)
-    if dtype.kind not in _KINDS:
-        raise ValueError(f"of type {dtype}")
-    body = data[stream.tell() :]
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(body) or max(shape, default=0) >= 2**31:
-        raise ValueError(f"{len(body)} bytes for shape {shape} of {dtype}")
-    flat = np.frombuffer(body, dtype) if dtype.itemsize else np.zeros(math.prod(shape), dtype)
-    return flat.reshape(shape, order="F" if fortran else "C").copy()
 
 
 def json_text(text: str | bytes, source: str, error: type[SlamError] = SlamError) -> Any:
@@ -96,4 +75,4 @@ def json_text(text: str | bytes, source: str, error: type[SlamError] = SlamError
 
 
 def _text(fault: BaseException) -> str:
-    return str(fault) or type(fault).__name__
+    return text_of(fault) or type(fault).__name__

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from types import NoneType, UnionType
@@ -13,6 +13,9 @@ import numpy as np
 
 from slam.errors import ConfigurationError
 from slam.naming import unknown
+
+#: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
+FORBID_UNKNOWN = {"extra": "forbid"}
 
 #: Numbers of settings lie below this, in whatever unit: their squares and products stay far from overflow.
 MOST = 1e9
@@ -30,7 +33,7 @@ _C = TypeVar("_C")
 Ranges = Mapping[str, tuple[float, float]]
 
 
-def require_positive(config: object, ranges: Ranges | None = None, owner: str = "") -> None:
+def require_positive(config: object, ranges: Ranges | None = None, owner: str = "", positive: bool = True) -> None:
     """Check the types of a configuration dataclass, and that its numbers are positive and in their ranges.
 
     `ranges` has least and largest values by field, both allowed; default: `LEAST` to `MOST`, counts to a million.
@@ -39,31 +42,26 @@ def require_positive(config: object, ranges: Ranges | None = None, owner: str = 
     Raises:
         ConfigurationError: a value is of the wrong type or out of its range.
     """
-    _require(config, ranges or {}, owner, positive=True)
+    mark, hints = f"{owner}: " if owner else "", _hints(type(config))  # type: ignore[arg-type]
+    for f in fields(config):  # type: ignore[arg-type]
+        value, limits = getattr(config, f.name), (ranges or {}).get(f.name, _COSTLY.get(f.name))
+        fault = _type_fault(value, hints[f.name])
+        numbers_of = value if isinstance(value, (tuple, list)) and not fault else (value,)
+        faults = [fault, *(_range_fault(number, limits, positive) for number in numbers_of if not fault)]
+        if wanted := next(filter(None, faults), ""):
+            raise ConfigurationError(f"{mark}{f.name} must be {wanted}, got {value!r}")
 
 
 def require_not_negative(config: object, ranges: Ranges | None = None, owner: str = "") -> None:
     """As `require_positive`, for numbers that may be zero."""
-    _require(config, ranges or {}, owner, positive=False)
+    require_positive(config, ranges, owner, positive=False)
 
 
-def _require(config: object, ranges: Ranges, owner: str, positive: bool) -> None:
-    mark = f"{owner}: " if owner else ""
-    hints = _hints(type(config))  # type: ignore[arg-type]
-    for f in fields(config):  # type: ignore[arg-type]
-        value = getattr(config, f.name)
-        fault = _type_fault(value, hints[f.name])
-        if fault:
-            raise ConfigurationError(f"{mark}{f.name} must be {fault}, got {value!r}")
-        for number in value if isinstance(value, (tuple, list)) else (value,):
-            if isinstance(number, numbers.Real) and not isinstance(number, (bool, np.bool_)):
-                fault = _range_fault(number, ranges.get(f.name, _COSTLY.get(f.name)), positive)
-                if fault:
-                    raise ConfigurationError(f"{mark}{f.name} must be {fault}, got {value}")
-
-
-def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool) -> str:
-    """What is required of a number outside its range; empty if it is inside."""
+def _range_fault(value: Any, limits: tuple[float, float] | None, positive: bool) -> str:
+    """What is required of a number outside its range; empty if it is inside, or no number."""
+    if not isinstance(value, numbers.Real) or isinstance(value, (bool, np.bool_)):
+        return ""
+    number: Any = value
     whole = isinstance(number, numbers.Integral)
     text = "positive and finite" if positive else "finite and not negative"
     if limits is not None and number == limits[1]:  # which may be infinite
@@ -81,29 +79,39 @@ def _hints(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)
 
 
+def _is(kind: Any) -> Callable[[Any], bool]:
+    """A test for a kind of number, of which true and false are none."""
+    return lambda value: isinstance(value, kind) and not isinstance(value, (bool, np.bool_))
+
+
+def _maps_names(value: Any) -> bool:
+    """Whether a value is a mapping of names."""
+    return isinstance(value, dict) and all(isinstance(key, str) for key in value)
+
+
+#: By type: what a value must fulfil, and that in words.
+_TYPES: dict[Any, tuple[Callable[[Any], bool], str]] = {
+    NoneType: (lambda value: value is None, "none"),
+    bool: (lambda value: isinstance(value, (bool, np.bool_)), "true or false"),
+    str: (lambda value: isinstance(value, str) and len(value) <= _WORD and "\0" not in value, "a text"),
+    int: (_is(numbers.Integral), "a whole number"),
+    float: (_is(numbers.Real), "a number"),
+    dict: (_maps_names, "a mapping of names to values"),
+}
+
+
 def _type_fault(value: Any, hint: Any) -> str:
     """What is required of a value of the wrong type; empty if the type is right."""
-    if get_origin(hint) in (Union, UnionType):
+    origin = get_origin(hint)
+    if origin in (Union, UnionType):
         faults = [_type_fault(value, kind) for kind in get_args(hint)]
         return "" if "" in faults else " or ".join(filter(None, faults))
-    if hint is NoneType:
-        return "" if value is None else "none"
-    if hint is bool:
-        return "" if isinstance(value, (bool, np.bool_)) else "true or false"
-    if hint is str:
-        return "" if isinstance(value, str) and len(value) <= _WORD and "\0" not in value else "a text"
-    if hint is int or hint is float:
-        kind = numbers.Integral if hint is int else numbers.Real
-        good = isinstance(value, kind) and not isinstance(value, (bool, np.bool_))
-        return "" if good else "a whole number" if hint is int else "a number"
-    if get_origin(hint) is tuple:
+    if origin is tuple:
         return _tuple_fault(value, get_args(hint))
-    if get_origin(hint) is dict:
-        good = isinstance(value, dict) and all(isinstance(key, str) for key in value)
-        return "" if good else "a mapping of names to values"
-    if isinstance(hint, type) and is_dataclass(hint):
-        return "" if isinstance(value, hint) else f"of type {hint.__name__}"
-    return ""
+    good, words = _TYPES.get(origin or hint, (None, ""))
+    if good is None and isinstance(hint, type) and is_dataclass(hint):
+        good, words = lambda value: isinstance(value, hint), f"of type {hint.__name__}"
+    return "" if good is None or good(value) else words
 
 
 def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:

@@ -18,13 +18,7 @@ MOST_ID = 2**53
 
 
 def require_stamp(owner: str, stamp: float, last: float | None) -> None:
-    """Check the time to which a back end is to be advanced.
-
-    `stamp` [s] is the new time, `last` [s] the one before it, None for the first; `owner` is the back end's name.
-
-    Raises:
-        MeasurementError: it is not finite, not later than the last one, or beyond `LATEST_STAMP`.
-    """
+    """Raise MeasurementError where a back end, `owner`, cannot be advanced from `last` [s] (None: none) to `stamp`."""
     if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP or (last is not None and stamp <= last):
         after = "" if last is None else f" after {last}"
         raise MeasurementError(
@@ -33,39 +27,31 @@ def require_stamp(owner: str, stamp: float, last: float | None) -> None:
 
 
 def require_not_measured(owner: str, measured: bool) -> None:
-    """Check that an update comes in its turn.
-
-    `measured` says whether the present stamp has had its update, or something was added at its pose; `owner` is the
-    back end's name.
-
-    Raises:
-        MeasurementError: it has.
-    """
+    """Raise MeasurementError where the present stamp has had its update, or something was added at its pose."""
     if measured:
         raise MeasurementError(f"{owner}: a stamp has one update, right after its predict")
 
 
-def require_guess(owner: str, guess: Array | None) -> None:
-    """Check a guess of the camera's pose.
+def is_rigid(T: Array, tolerance: float) -> bool:
+    """Whether T (4, 4) is a rotation and a translation, as far as a double can tell what a camera sees there."""
+    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_POSITION).all() or np.abs(T[:3, :3]).max() >= 1.1:
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() <= tolerance and np.linalg.det(R) > 0)
 
-    Raises:
-        MeasurementError: it is no rigid motion (4, 4).
-    """
+
+def require_guess(owner: str, guess: Array | None) -> None:
+    """Raise MeasurementError where a guess of the camera's pose is no rigid motion (4, 4)."""
     if guess is None:
         return
     if not isinstance(guess, np.ndarray) or guess.shape != (4, 4) or not np.isfinite(guess).all():
         raise MeasurementError(f"{owner}: the guess must be a finite pose, an array (4, 4)")
-    R = guess[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or (guess[3] != (0, 0, 0, 1)).any():
+    if not is_rigid(guess, 1e-3) or (guess[3] != (0, 0, 0, 1)).any():
         raise MeasurementError(f"{owner}: the guess must be a rigid motion: a rotation and a translation")
 
 
 def require_recent(owner: str, n: int) -> int:
-    """How many of the last poses are asked for.
-
-    Raises:
-        MeasurementError: fewer than one.
-    """
+    """How many of the last poses are asked for; raises MeasurementError where fewer than one."""
     if n < 1:
         raise MeasurementError(f"{owner}: recent({n}): one pose at least must be asked for")
     return int(n)

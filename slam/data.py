@@ -8,7 +8,7 @@ seconds. Pose covariances are (6, 6), order [rotation, translation], of a pertur
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -20,9 +20,9 @@ from slam.geometry.arrays import Array, ascending
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
 from slam.geometry.arrays import IndexArray as IndexArray
+from slam.naming import count, of_shapes, point
 from slam.object_data import MovingObject
 from slam.rig_error import CommonError, Revision
-from slam.showing import count, of_shapes, point
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,37 +59,11 @@ class ImagePair:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Image patches around pixels, one row each; made and used by a front end.
+    """Image patches around pixels, one row each; made and used by a front end."""
 
-    Attributes:
-        images: (N, S, S) float32, NaN beyond the image.
-        centres: coordinates of the pixels within the patches (N, 2).
-        size: of the features at the pixels (N,) [px].
-    """
-
-    images: NDArray[np.float32]
-    centres: Array
-    size: Array
-
-    @classmethod
-    def none(cls) -> Patches:
-        """No patches."""
-        return cls(np.zeros((0, 0, 0), np.float32), np.zeros((0, 2)), np.zeros(0))
-
-    def __len__(self) -> int:
-        return len(self.size)
-
-    def select(self, keep: NDArray) -> Patches:
-        """Some of the rows (a mask or indices)."""
-        if keep.dtype == bool and keep.all():
-            return self  # images are large
-        return Patches(self.images[keep], self.centres[keep], self.size[keep])
-
-    def joined(self, other: Patches) -> Patches:
-        """These and others."""
-        if not len(self) or not len(other):
-            return self if len(self) else other
-        return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Patches)))
+    images: NDArray[np.float32]  # (N, S, S), NaN beyond the image
+    centres: Array  # coordinates of the pixels within the patches (N, 2)
+    size: Array  # of the features at the pixels (N,) [px]
 
 
 #: Columns of `StereoFeatures`.
@@ -122,15 +96,6 @@ class StereoFeatures:
     descriptors: NDArray[np.float32]
     threshold: float = float("nan")
     images: ImagePair | None = field(default=None, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        for name in _COLUMNS:
-            value = getattr(self, name)
-            if not isinstance(value, (np.ndarray, list, tuple)) or (isinstance(value, np.ndarray) and not value.ndim):
-                kind = type(value).__name__
-                raise MeasurementError(f"features: {name} must be an array with a row for each feature, got {kind}")
-            if len(value) != len(self.uv_left):
-                raise MeasurementError(f"features: {name} has {len(value)} rows, uv_left has {len(self.uv_left)}")
 
     def __len__(self) -> int:
         return len(self.uv_left)
@@ -317,14 +282,6 @@ class Estimate:
         where = f"camera at {point(t)} ± {point(np.sqrt(np.diag(R @ self.covariance[3:, 3:] @ R.T).clip(min=0)))} m"
         return f"Estimate({self.stamp:.3f} s, {where}, {count(len(self.ids), 'landmark')})"
 
-    def to_table(self) -> dict[str, NDArray]:
-        """The landmarks as columns (N,) like those of ``landmarks.csv``, for instance for a data frame.
-
-        ``id``, ``x``, ``y``, ``z`` [m] in world coordinates, and the covariance terms ``cxx`` to ``czz`` [m²].
-        """
-        terms = {f"c{'xyz'[i]}{'xyz'[j]}": self.covariances[:, i, j] for i in range(3) for j in range(i, 3)}
-        return {"id": self.ids, **{"xyz"[i]: self.positions[:, i] for i in range(3)}, **terms}
-
 
 class FrameStatus(StrEnum):
     """How a frame ended.
@@ -371,7 +328,8 @@ class FrameResult:
         loop, refused_loop: if the frame closed a loop, or one that contradicts the path, index of the earlier frame of
             the same place, or −1 if that is in the prior map; else None.
         keyframe: whether the frame has become a keyframe.
-        returned: ids of the revisited place's landmarks that have rejoined the map.
+        returned: ids of a revisited place's landmarks that have joined the map: those that they had before, new ones
+            where the place was kept before a feature of it became a landmark.
         common: the part of the pose's error that all frames share; empty after a loop, which mixes it with noise.
     """
 

@@ -36,19 +36,19 @@ _inputs: ContextVar[list[Path] | None] = ContextVar("inputs", default=None)
 @contextmanager
 def noting_inputs() -> Iterator[list[Path]]:
     """A list of what is read meanwhile: files, and folders of which all is an input."""
-    found: list[Path] = []
-    token = _inputs.set(found)
+    noted: list[Path] = []
+    token = _inputs.set(noted)
     try:
-        yield found
+        yield noted
     finally:
         _inputs.reset(token)
 
 
 def note_input(path: str | Path) -> None:
     """Say that a file, or what is in a folder, is read."""
-    found = _inputs.get()
-    if found is not None:
-        found.append(Path(path).absolute())
+    noted = _inputs.get()
+    if noted is not None:
+        noted.append(Path(path).absolute())
 
 
 def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError) -> bytes:

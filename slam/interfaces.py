@@ -62,9 +62,9 @@ class AligningFrontend(Protocol):
 class Backend(Protocol):
     """Estimates the camera's path and the landmarks' positions. Created as ``Backend(rig, **options)``.
 
-    Measurements are in pixels of that rig's own images; a system gives the rectified pair, ``rig.rectified.rig``. The
-    order of calls in a step is predict, at most one update, then add and remove as needed. The world frame is the left
-    camera's frame at the first `predict` unless the options give an initial pose.
+    The rig is rectified, such as ``rig.rectified.rig``, and measurements are in its pixels. The order of calls in a
+    step is predict, at most one update, then add and remove as needed. The world frame is the left camera's frame at
+    the first `predict` unless the options give an initial pose.
 
     `estimate`, `positions` and `trajectory` may be asked at any time after the first `predict`. They are pure: asking
     never changes a later answer. A call that raises an exception changes nothing either.

@@ -1,20 +1,22 @@
-"""The assumptions shared by all estimators: motion model, pixel noise, priors, gate."""
+"""The assumptions shared by all estimators: motion of camera and bodies, pixel noise, priors, gate."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from slam.bounds import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.bounds import require_not_negative as require_not_negative
 from slam.bounds import require_positive
-from slam.checks import FARTHEST_POSITION
+from slam.checks import is_rigid
+from slam.chi_square import SIGMAS
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
 from slam.naming import unknown
-from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
-from slam.object_models import ObjectModels
+from slam.object_data import ObjectEstimate, ObjectObservations
 
 ANYWHERE = 1e3  # numerics: standard deviation of an unknown position [m]
 
@@ -28,14 +30,17 @@ _RANGES = {
     "initial_velocity_sigma": _SIGMAS,
     "initial_angular_velocity_sigma": (1e-7, 1e3),
 }
-
-
-def _is_pose(T: Array) -> bool:
-    """Whether an array is a rigid motion (4, 4), its rotation to within the rounding of six digits."""
-    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_POSITION).all() or np.abs(T[:3, :3]).max() >= 1.1:
-        return False
-    R = T[:3, :3]
-    return bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-6 and np.linalg.det(R) > 0)
+_BODY_RANGES = {
+    "acceleration": _DENSITIES,
+    "angular_acceleration": _DENSITIES,
+    "initial_velocity_sigma": _SIGMAS,
+    "initial_angular_velocity_sigma": (1e-7, 1e3),
+    "points": (1, 1000),
+    "max_speed": (1e-6, 1e6),
+    "max_acceleration": (1e-6, 1e9),
+    "max_turn_rate": (1e-6, 1e6),
+    "drift": (0.0, 1e3),
+}
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,82 @@ class MotionModel:
     def velocity_variance(self, dt: float) -> tuple[float, float]:
         """Variances of w_v [m²/s²] and w_ω [rad²/s²] over `dt` [s]."""
         return self.acceleration**2 * dt, self.angular_acceleration**2 * dt
+
+
+@dataclass(frozen=True)
+class ObjectModels:
+    """How bodies move: constant velocity in world axes, disturbed by impulses, as the camera does.
+
+    Pixel noise and gate are those of `EstimatorModels`.
+
+    Attributes:
+        acceleration: density of the noise of the origin's velocity [m/s / √s].
+        angular_acceleration: density of the noise of the angular velocity [rad/s / √s].
+        initial_velocity_sigma, initial_angular_velocity_sigma: standard deviations of a new body's velocities [m/s],
+            [rad/s], whose mean is zero.
+        points: largest number of points estimated per body; those unseen for longest make room for new ones.
+        max_speed, max_acceleration, max_turn_rate: limits of any body's motion [m/s], [m/s²], [rad/s]; an estimate
+            beyond them is refused. The acceleration is that of a collision.
+        drift: density of the random walk of a point's pixel, in both images alike, with the angle from which it is seen
+            [px / √rad]: from another viewpoint, a feature is found at another point of the body.
+
+    Raises:
+        ConfigurationError: a number is not positive and finite, or fewer than three points are allowed.
+    """
+
+    acceleration: float = 1.0
+    angular_acceleration: float = 2.0
+    initial_velocity_sigma: float = 0.5
+    initial_angular_velocity_sigma: float = 1.0
+    points: int = 40
+    max_speed: float = 3.0
+    max_acceleration: float = 100.0
+    max_turn_rate: float = 20.0
+    drift: float = 0.0
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        require_not_negative(self, _BODY_RANGES, "objects")
+        if self.points < 3:
+            raise ConfigurationError(f"objects: points must be at least 3, got {self.points}")
+
+    def velocity_variance(self, dt: float) -> tuple[float, float]:
+        """Variances of the impulses on the linear [m²/s²] and angular [rad²/s²] velocity over `dt` [s]."""
+        return self.acceleration**2 * dt, self.angular_acceleration**2 * dt
+
+    def first_velocity(self, o: ObjectObservations | None) -> tuple[Array, Array]:
+        """Mean and standard deviations (6,) of a new body's [ω, v], at least as certain as in general."""
+        sigmas = np.repeat([self.initial_angular_velocity_sigma, self.initial_velocity_sigma], 3)
+        if o is None or o.velocity is None or o.velocity_sigma is None:
+            return np.zeros(6), sigmas
+        return o.velocity, np.minimum(o.velocity_sigma, sigmas)
+
+    def possible(self, velocity: Array, covariance: Array, before: Array, covariance_before: Array, dt: float) -> bool:
+        """Whether a change of velocity [ω, v] (6,), with covariances (6, 6), is physically possible within `dt` [s]."""
+        noise = SIGMAS * math.sqrt(np.trace(covariance[3:, 3:]) + np.trace(covariance_before[3:, 3:]))
+        change = float(np.linalg.norm(velocity[3:] - before[3:]))
+        return bool(
+            np.linalg.norm(velocity[3:]) <= self.max_speed
+            and np.linalg.norm(velocity[:3]) <= self.max_turn_rate
+            and change <= self.max_acceleration * dt + noise
+        )
+
+    def known(self, estimate: ObjectEstimate) -> bool:
+        """Whether an estimate of a body is more certain than these limits alone.
+
+        Standard deviations are compared: of the position with the largest distance covered in a second, of the
+        orientation with π, of the velocities with the largest ones.
+        """
+        P, V = estimate.covariance, estimate.velocity_covariance
+        rotation, position = np.trace(P[:3, :3]), np.trace(P[3:, 3:])
+        turning, speed = np.trace(V[:3, :3]), np.trace(V[3:, 3:])
+        return bool(
+            rotation <= math.pi**2
+            and position <= self.max_speed**2
+            and turning <= self.max_turn_rate**2
+            and speed <= self.max_speed**2
+        )
 
 
 @dataclass(frozen=True)
@@ -100,7 +181,7 @@ class EstimatorModels:
                 T = np.array(self.T_world_left, float)
             except (TypeError, ValueError, OverflowError):
                 T = np.zeros(0)
-            if not _is_pose(T):
+            if not is_rigid(T, 1e-6):  # to within the rounding of six digits
                 raise ConfigurationError("T_world_left must be a (4, 4) pose: a rotation and a translation")
             object.__setattr__(self, "T_world_left", tuple(map(tuple, T.tolist())))
         if self.gate_probability >= 1:
@@ -114,13 +195,7 @@ class EstimatorModels:
 
 #: Models by kind of motion; every sequence of a kind runs with the same.
 KINDS = {
-    "handheld": EstimatorModels(
-        MotionModel(acceleration=1.0, angular_acceleration=1.0),
-        pixel_sigma=0.3,
-        initial_velocity_sigma=1.0,
-        initial_angular_velocity_sigma=1.0,
-        objects=ObjectModels(drift=0.7),
-    ),
+    "handheld": EstimatorModels(pixel_sigma=0.3, objects=ObjectModels(drift=0.7)),
     "driving": EstimatorModels(
         MotionModel(acceleration=1.0, angular_acceleration=0.3, wheels=True),
         pixel_sigma=0.7,

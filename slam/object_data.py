@@ -12,51 +12,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import MeasurementError
 from slam.geometry.arrays import Array, BoolArray, IdArray
-from slam.showing import count, of_shapes, point
+from slam.naming import count, of_shapes, point
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectObservations:
-    """Points of one rigid body seen in the current frame, a row each.
+    """Points of one rigid body seen in the current frame, a row each."""
 
-    Attributes:
-        id: of the body.
-        points: ids of its points (M,), unique over all bodies; a point keeps its id as long as it is tracked.
-        uv_left: left pixels (M, 2), finite.
-        uv_right: right pixels (M, 2), NaN where there is no stereo match.
-        T_world_object: guess of the body's present pose (4, 4), from the rigid fit of its points; None without one. It
-            is no measurement, but the first linearisation point, and a new body's frame.
-        velocity: prior [ω, v] (6,) of a new body in world axes [rad/s], [m/s]; None without one.
-        velocity_sigma: its standard deviations (6,).
-
-    Raises:
-        MeasurementError: shapes differ, a point occurs twice, or a left pixel is not finite.
-    """
-
-    id: int
-    points: IdArray
-    uv_left: Array
-    uv_right: Array
+    id: int  # of the body
+    points: IdArray  # ids of its points (M,), unique over all bodies; a point keeps its id as long as it is tracked
+    uv_left: Array  # left pixels (M, 2), finite
+    uv_right: Array  # right pixels (M, 2), NaN where there is no stereo match
+    # guess of the body's present pose (4, 4), from the rigid fit of its points; None without one. It is no
+    # measurement, but the first linearisation point, and a new body's frame
     T_world_object: Array | None = None
-    velocity: Array | None = None
-    velocity_sigma: Array | None = None
+    velocity: Array | None = None  # prior [ω, v] (6,) of a new body in world axes [rad/s], [m/s]
+    velocity_sigma: Array | None = None  # its standard deviations (6,); None where there is no prior
 
     __repr__ = of_shapes
-
-    def __post_init__(self) -> None:
-        n = len(self.points)
-        if self.uv_left.shape != (n, 2) or self.uv_right.shape != (n, 2):
-            raise MeasurementError(
-                f"object {self.id}: {n} points, but uv_left is {self.uv_left.shape} and uv_right {self.uv_right.shape}"
-            )
-        if len(np.unique(self.points)) != n:
-            raise MeasurementError(f"object {self.id}: a point stands twice")
-        if not np.isfinite(self.uv_left).all():
-            raise MeasurementError(f"object {self.id}: a left pixel is not finite")
-        if (self.velocity is None) != (self.velocity_sigma is None):
-            raise MeasurementError(f"object {self.id}: a velocity and its sigma belong together")
 
     @property
     def has_stereo(self) -> BoolArray:
@@ -66,17 +40,11 @@ class ObjectObservations:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A back end's use of a body's observations in one frame.
+    """The use of a body's observations in one frame."""
 
-    Attributes:
-        measured: whether the body's update used observations.
-        used: ids of the points whose observations were used (K,).
-        rejected: ids of those that failed the gate (R,).
-    """
-
-    measured: bool = False
-    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    measured: bool = False  # whether the body's update used observations
+    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))  # ids of the points whose ones were used (K,)
+    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))  # ids of those that failed the gate (R,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,17 +115,11 @@ class MovingObject:
 
 @dataclass(frozen=True, eq=False)
 class MotionLabels:
-    """Motion labels of a frame's features.
+    """Motion labels of a frame's features."""
 
-    Attributes:
-        moving: rows of features that move, or lie on a moving body (V,).
-        undecided: rows of features not seen for long enough to be classified, or in doubt (U,).
-        landmarks: ids of landmarks that turned out to move (L,).
-    """
-
-    moving: NDArray[np.intp]
-    undecided: NDArray[np.intp]
-    landmarks: IdArray
+    moving: NDArray[np.intp]  # rows of features that move, or lie on a moving body (V,)
+    undecided: NDArray[np.intp]  # rows of features not seen for long enough to be classified, or in doubt (U,)
+    landmarks: IdArray  # ids of landmarks that turned out to move (L,)
 
     def with_undecided(self, rows: NDArray[np.intp]) -> MotionLabels:
         """The labels with other features undecided as well, unless they move."""

@@ -7,7 +7,6 @@ command are the same file.
 from __future__ import annotations
 
 import os
-import stat
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -18,8 +17,7 @@ from pathlib import Path
 from slam.errors import SlamError
 from slam.files import reason
 
-_RUN, _COMPARISON = ("config.json", "frames.csv"), ("sweep.json",)  # what folders of our own hold
-_OTHER = "cannot be written: there is something that is not a"
+_OURS = (("config.json", "frames.csv"), ("sweep.json",))  # what folders of a run and of a comparison hold
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Output:
         return any(fnmatchcase(name, pattern.rstrip("/")) for pattern in self.names or ())
 
     @property
-    def found(self) -> list[Path]:
+    def present(self) -> list[Path]:
         """What of it is there already."""
         if not self.is_folder:
             return [self.path] if self.path.exists() else []
@@ -74,9 +72,18 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
     made = {output.real for output in outputs if output.is_folder}
     for output in outputs:
         try:
-            _require_possible(output, made)
-            _require_no_input(output, read)
-            _require_free(output, overwrite)
+            if fault := _impossible(output, made):
+                raise SlamError(f"{output.path}: cannot be written: {fault}")
+            filled = output.is_folder and output.path.is_dir() and next(output.path.iterdir(), None) is not None
+            for path in [*output.present, *([output.path] if filled else [])]:
+                if any(_is_input(path, file) for file in read):
+                    raise SlamError(f"{path}: is an input, or in a folder of inputs; give another {output.option}")
+            for path in output.present:
+                if not overwrite:
+                    allow = "" if overwrite is None else ", or --overwrite to replace it"
+                    raise SlamError(f"{path}: is there already; give another {output.option}{allow}")
+                if output.names is not None and path.exists():
+                    _require_kind(path, path.name not in output.names and f"{path.name}/" in output.names)
         except OSError as fault:
             raise SlamError(f"{output.path}: cannot be written: {reason(fault)}") from fault
     for one, other in permutations(outputs, 2):
@@ -84,62 +91,46 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
             raise SlamError(f"{one.path}: {one.option} and {other.option} cannot write to the same place")
 
 
-def _require_possible(output: Output, made: set[Path]) -> None:
-    """Raise where there is something else, or no folder to write to; `made` are folders that other outputs make."""
-    path = output.path
+def _require_kind(path: Path, folder: bool) -> None:
+    """Raise where what is there is not a folder, or not a regular file."""
+    if not (path.is_dir() if folder else path.is_file()):
+        kind = "folder" if folder else "regular file"
+        raise SlamError(f"{path}: cannot be written: there is something that is not a {kind}")
+
+
+def _impossible(output: Output, made: set[Path]) -> str:
+    """Why an output cannot be written; empty where it can. `made` are folders that other outputs make."""
+    path, exists = output.path, False
     try:
-        mode = path.stat().st_mode
+        exists = bool(path.stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
-        mode = None
-    if mode is not None and not (stat.S_ISDIR if output.is_folder else stat.S_ISREG)(mode):
-        raise SlamError(f"{path}: {_OTHER} {'folder' if output.is_folder else 'regular file'}")
-    if mode is not None and not os.access(path, os.W_OK):
-        raise SlamError(f"{path}: cannot be written: Permission denied")
-    if output.is_folder and mode is None and path.is_symlink():
-        raise SlamError(f"{path}: cannot be written: a link to a folder that is not there")
-    place = path if output.is_folder and mode is not None else output.real.parent
+        if output.is_folder and path.is_symlink():
+            return "a link to a folder that is not there"
+    if exists:
+        _require_kind(path, output.is_folder)
+        if not os.access(path, os.W_OK):
+            return "Permission denied"
+    place = path if output.is_folder and exists else output.real.parent
     near = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
     above = next(folder for folder in (place, *place.absolute().parents) if os.path.lexists(folder))
     for folder in (near, above):
         if not folder.is_dir():  # such as a link to nothing
-            raise SlamError(f"{path}: cannot be written: {folder} is not a folder")
+            return f"{folder} is not a folder"
     if above != place and not output.is_folder and not output.makes_folder and place not in made:
-        raise SlamError(f"{path}: cannot be written: there is no folder {path.parent}")
+        return f"there is no folder {path.parent}"
     with tempfile.TemporaryFile(dir=above):  # permissions alone do not say it
-        pass
+        return ""
 
 
-def _require_no_input(output: Output, inputs: Sequence[Path]) -> None:
-    """Raise where an input would be replaced, or files would be added to a folder of inputs."""
-    found = output.found
-    if output.is_folder and output.path.is_dir() and next(output.path.iterdir(), None) is not None:
-        found.append(output.path)
-    for path in found:
-        if any(_is_input(path, known) for known in inputs):
-            raise SlamError(f"{path}: is an input, or in a folder of inputs; give another {output.option}")
-
-
-def _is_input(path: Path, known: Path) -> bool:
+def _is_input(path: Path, file: Path) -> bool:
     """Whether a path that exists is an input, or lies in one; a run's folder in a folder of inputs does not count."""
     real = Path(os.path.realpath(path))
-    if real == known or (path.exists() and known.exists() and path.samefile(known)):
+    if real == file or (path.exists() and file.exists() and path.samefile(file)):
         return True
-    if not (known.is_dir() and real.is_relative_to(known)):
+    if not (file.is_dir() and real.is_relative_to(file)):
         return False
-    between = [folder for folder in (real, *real.parents) if folder != known and folder.is_relative_to(known)]
-    return not any(all((f / name).is_file() for name in names) for f in between for names in (_RUN, _COMPARISON))
-
-
-def _require_free(output: Output, overwrite: bool | None) -> None:
-    """Raise where something is there that may not be replaced."""
-    for path in output.found:
-        if not overwrite:
-            allow = "" if overwrite is None else ", or --overwrite to replace it"
-            raise SlamError(f"{path}: is there already; give another {output.option}{allow}")
-        if output.names is not None and path.exists():
-            folder = path.name not in output.names and f"{path.name}/" in output.names
-            if not (path.is_dir() if folder else path.is_file()):
-                raise SlamError(f"{path}: {_OTHER} {'folder' if folder else 'regular file'}")
+    between = [folder for folder in (real, *real.parents) if folder != file and folder.is_relative_to(file)]
+    return not any(all((f / name).is_file() for name in names) for f in between for names in _OURS)
 
 
 def _clash(one: Output, other: Output) -> bool:

@@ -39,7 +39,7 @@ BUILT_IN = {
 ONLINE = ("ekf", "smoother", "window")
 
 #: What `slam.interfaces.Backend` and `slam.interfaces.Frontend` ask for.
-_METHODS = {
+METHODS = {
     "backends": ("predict", "update", "add", "remove", "estimate", "positions", "trajectory"),
     "frontends": ("extract",),
 }
@@ -48,8 +48,8 @@ _METHODS = {
 @cache
 def _table(role: str) -> dict[str, str]:
     """Name to ``module:attribute``; a built-in name cannot be taken over."""
-    found = {point.name: point.value for point in entry_points(group=f"slam.{role}")}
-    return {**found, **BUILT_IN[role]}
+    registered = {point.name: point.value for point in entry_points(group=f"slam.{role}")}
+    return {**registered, **BUILT_IN[role]}
 
 
 def names(role: str) -> list[str]:
@@ -98,10 +98,10 @@ def _hidden(package: str) -> str:
     spec = find_spec(package)
     if spec is None:
         return ""
-    found = Path(next(iter(spec.submodule_search_locations or [str(spec.origin)]))).resolve()
-    if found.parent == Path(__file__).resolve().parents[1]:
+    hiding = Path(next(iter(spec.submodule_search_locations or [str(spec.origin)]))).resolve()
+    if hiding.parent == Path(__file__).resolve().parents[1]:
         return ""
-    return f"{found} hides slam's own `{package}`: rename it"
+    return f"{hiding} hides slam's own `{package}`: rename it"
 
 
 def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:
@@ -120,31 +120,29 @@ def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:
     except SlamError:
         raise
     except (Exception, SystemExit) as error:  # whatever a foreign class does
-        wrong = _unknown_option(what, made, options) if isinstance(error, TypeError) else ""
-        raise ConfigurationError(wrong or f"{what} cannot be created: {cause(error)}") from error
+        wrong = _unknown_option(made, options) if isinstance(error, TypeError) else ""
+        raise ConfigurationError(f"{what}{wrong or f' cannot be created: {cause(error)}'}") from error
     return require_methods(role, created, repr(name))
 
 
-def _unknown_option(what: str, made: Any, options: Mapping[str, Any]) -> str:
-    """The line for the first option that a class does not take; empty where it takes all, or does not say."""
+def _unknown_option(made: Any, options: Mapping[str, Any]) -> str:
+    """What is said of the first option that a class does not take; empty where it takes all, or does not say."""
     try:
         known = signature(made).parameters
     except (TypeError, ValueError):
         return ""
-    if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in known.values()):
-        return ""
     wrong = next((option for option in options if option not in known), None)
-    if wrong is None:
+    if wrong is None or any(parameter.kind is Parameter.VAR_KEYWORD for parameter in known.values()):
         return ""
     own = [option for option in list(known)[1:] if option != "models"]  # the first one is the rig
     if wrong == "models":
-        return f"{what} cannot be created: it does not take the argument models"
-    return f"{what}: {unknown('option', wrong, own)}" if own else f"{what} has no options, got {wrong!r}"
+        return " cannot be created: it does not take the argument models"
+    return f": {unknown('option', wrong, own)}" if own else f" has no options, got {wrong!r}"
 
 
 def require_methods(role: str, part: Any, name: str = "") -> Any:
     """A back end or front end, or None for no front end; raises ConfigurationError where it lacks a method."""
-    missing = [method for method in _METHODS[role] if not callable(getattr(part, method, None))]
+    missing = [method for method in METHODS[role] if not callable(getattr(part, method, None))]
     if missing and (part is not None or role == "backends"):
         what = f"{_spoken(role)} {name or type(part).__name__}"
         raise ConfigurationError(f"{what} is none: it lacks {', '.join(missing)}")

@@ -16,14 +16,10 @@ class CommonError:
 
     If the correction has changed since a pose was estimated, the pose still contains the difference. It is one column
     of `root`: its effect on the pose is only known from a model of the estimator, so it counts as an error, too.
-
-    Attributes:
-        jacobian: derivative (6, m) of the pose, perturbed on the right, by m errors that all poses share.
-        root: derivative (m, n) of these errors by the common errors c (n,), which have unit variance.
     """
 
-    jacobian: Array = field(default_factory=lambda: np.zeros((6, 0)))
-    root: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    jacobian: Array = field(default_factory=lambda: np.zeros((6, 0)))  # of the pose by the m shared errors (6, m)
+    root: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of these by c (m, n), which has unit variance
 
     @property
     def covariance(self) -> Array:
@@ -32,21 +28,17 @@ class CommonError:
         return np.asarray(S @ S.T)
 
 
-class Correction(Protocol):
-    """A correction of measurements by the present estimate of the rig's error."""
-
-    def rows(self, z: Array) -> Array:
-        """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]."""
-        ...
-
-    def undone(self, z: Array) -> Array:
-        """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
-        ...
-
-
 class Revision(Protocol):
     """A change of the rig's correction during a run, for measurements that have the earlier correction."""
 
     def rows(self, z: Array) -> Array:
         """Rectified rows (uL, vL, uR) (N, 3) [px], corrected again."""
+        ...
+
+
+class Correction(Revision, Protocol):
+    """A correction of measurements by the present estimate of the rig's error."""
+
+    def undone(self, z: Array) -> Array:
+        """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
         ...

@@ -7,7 +7,6 @@ the end, so that a step has happened or has not. If a step finds that the camera
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,7 +19,6 @@ from slam.data import (
     Estimate,
     FrameResult,
     FrameStatus,
-    IdArray,
     Prediction,
     StereoFeatures,
     UpdateReport,
@@ -70,26 +68,19 @@ class State:
     past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
     restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
 
-    @classmethod
-    def in_map(cls, backend: Backend, known: SavedMap) -> State:
-        """Before the first frame of a run that starts in a map."""
-        atlas = Atlas.of_earlier_run(known.keyframes, known.keyframe_poses, known.loops)
-        dimensions, mapped = known.dimensions if len(known) else None, len(known) > 0
-        return cls(backend, known.rows, atlas, dimensions=dimensions, mapped=mapped, prior_map=known)
-
     def begins_at(self, index: int) -> bool:
         """Whether the back end takes over in this frame."""
         return index in self.restarted[-1:]
 
     def after(self, step: Step, checksum: tuple[int, int] | None) -> State:
         """The state after one more frame."""
-        known = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
+        located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
         return replace(
             self, landmarks=step.landmarks, atlas=step.atlas, index=step.index, stamp=step.features.stamp,
             tracking=step.tracking, standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, mapped=self.mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
-            measured_at=step.features.stamp if known else self.measured_at,
+            measured_at=step.features.stamp if located else self.measured_at,
         )  # fmt: skip
 
     def path(self) -> Trajectory:
@@ -104,7 +95,7 @@ class Elsewhere:
     # the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins
     T_world_left: Array | None
     # the place of the atlas by which it was found; None if it was found by the map's landmarks
-    found: Found | None = None
+    place: Found | None = None
 
 
 class Session:
@@ -127,10 +118,8 @@ class Session:
         self, rig: StereoRig, config: SystemConfig, backend: str | None, first: Backend, calibration: SelfCalibration
     ) -> None:
         c = config
-        self.rig, self.config, self._models = rig, c, c.models
-        self._backend: str | None = backend
-        self._options: Mapping[str, Any] = c.backend
-        self.calibration = calibration
+        self.rig, self.config, self.calibration = rig, c, calibration
+        self._models, self._backend = c.models, backend
         self.rig_error = RemainingRigError(self.calibration, c.models)
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self.mapper = Mapper(rig, c.map, self.localizer, first)
@@ -150,7 +139,9 @@ class Session:
         if not len(prior_map) and not prior_map.keyframes:
             raise SlamError(f"{prior_map.source}: the map holds no landmarks, so the camera cannot be found in it")
         _fill(first, prior_map)
-        return State.in_map(first, prior_map)
+        atlas = Atlas.of_earlier_run(prior_map.keyframes, prior_map.keyframe_poses, prior_map.loops)
+        dimensions, mapped = prior_map.dimensions if len(prior_map) else None, len(prior_map) > 0
+        return State(first, prior_map.rows, atlas, dimensions=dimensions, mapped=mapped, prior_map=prior_map)
 
     def can_restart(self, state: State) -> bool:
         """Whether another back end can take over."""
@@ -171,22 +162,22 @@ class Session:
         Raises:
             SlamError: the descriptors have another length than the map's.
         """
-        known = state.prior_map
-        assert known is not None
-        known.require_fits("", features.descriptors.shape[1])
-        prediction, found = nowhere(features.stamp, self._models.initial_pose), None
-        matches = self.localizer.match(prediction, known.rows, known.positions, features, state.index + 1)
+        saved = state.prior_map
+        assert saved is not None
+        saved.require_fits("", features.descriptors.shape[1])
+        prediction, place = nowhere(features.stamp, self._models.initial_pose), None
+        matches = self.localizer.match(prediction, saved.rows, saved.positions, features, state.index + 1)
         T = matches.T_world_left if len(matches) >= self.localizer.config.minimum_consistent else None
         if T is None:
-            found = self.find(state, features)
-            if found is None:
+            place = self.find(state, features)
+            if place is None:
                 return None
-            T = found.T_odom_left
+            T = place.T_odom_left
         new, landmarks = self._start(T), state.landmarks
-        _fill(new, known)
-        self.mapper.next_id = known.next_id
-        if found is not None:
-            landmarks = self.mapper.insert(new, known.rows, found.place)
+        _fill(new, saved)
+        self.mapper.next_id = saved.next_id
+        if place is not None:
+            landmarks = self.mapper.insert(new, saved.rows, place.place)
         return replace(state, backend=new, landmarks=landmarks, prior_map=None)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
@@ -230,14 +221,16 @@ class Session:
             after, common = new.estimate(landmarks=False), self.rig_error.common(as_reported=False)
             atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
         else:
-            new, place, landmarks = self._start(T), None, state.landmarks
-            _give_landmarks(old, new)
-            if elsewhere.found is not None:
+            new, seen_at, landmarks = self._start(T), None, state.landmarks
+            whole = old.estimate()
+            new.insert(whole.ids, whole.positions, definite(whole.covariances))  # type: ignore[attr-defined]
+            if elsewhere.place is not None:
                 assert landmarks is not None
-                landmarks, place = self.mapper.insert(new, landmarks, elsewhere.found.place), elsewhere.found.stamp
+                landmarks = self.mapper.insert(new, landmarks, elsewhere.place.place)
+                seen_at = elsewhere.place.stamp
             prediction = new.predict(stamp)
             standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
-            atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), place)
+            atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), seen_at)
         path = old.trajectory().select(slice(None, -1))
         hidden = elsewhere.T_world_left is None and state.tracking.stood and self._models.motion.wheels
         state = replace(
@@ -247,16 +240,20 @@ class Session:
         )  # fmt: skip
         return state, prediction
 
-    def left_behind(self, before: State, begun: State, step: Step) -> IdArray:
-        """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began.
+    def with_takeover(self, before: State, begun: State, step: Step) -> Step:
+        """The step, with the landmarks that left and joined the map where another back end took over.
 
         `before` is the state after the last frame; `begun` that in which the step began, without landmarks where a new
         map did. What the rig's uncertainty does to those that left is forgotten.
         """
-        if before.landmarks is None or begun.landmarks is not None:
-            return step.erased
-        self.rig_error.uncertainty.keep(step.landmarks.ids)
-        return np.concatenate([np.setdiff1d(before.landmarks.ids, step.landmarks.ids), step.erased])
+        if before.landmarks is None or begun is before:
+            return step
+        if begun.landmarks is None:
+            self.rig_error.uncertainty.keep(step.landmarks.ids)
+            gone = np.setdiff1d(before.landmarks.ids, step.landmarks.ids)
+            return replace(step, erased=np.concatenate([gone, step.erased]))
+        joined = np.setdiff1d(begun.landmarks.ids, before.landmarks.ids)
+        return replace(step, joined=np.union1d(step.joined, joined))
 
     def _start(self, T_world_left: Array) -> Backend:
         """A back end without landmarks at a pose (4, 4) that is only roughly known."""
@@ -267,26 +264,19 @@ class Session:
         """Another back end of the same kind."""
         assert self._backend is not None
         changed = replace(self._models, **models)
-        backend: Backend = registry.create("backends", self._backend, self.rig, models=changed, **self._options)
+        backend: Backend = registry.create("backends", self._backend, self.rig, models=changed, **self.config.backend)
         return backend
 
 
-def _give_landmarks(old: Backend, new: Backend) -> None:
-    """Give all landmarks of a back end to another one."""
-    assert isinstance(new, MapBackend)
-    whole = old.estimate()
-    new.insert(whole.ids, whole.positions, definite(whole.covariances))
-
-
-def _fill(backend: Backend, known: SavedMap) -> None:
+def _fill(backend: Backend, saved: SavedMap) -> None:
     """Give a back end a saved map."""
     name = type(backend).__name__
     if not isinstance(backend, MapBackend):
         raise ConfigurationError(f"{name} cannot start in a prior map: it has no insert")
     most = getattr(backend, "most_landmarks", None)
-    if most is not None and len(known) > most:
+    if most is not None and len(saved) > most:
         raise SlamError(
-            f"{known.source}: {len(known)} landmarks, but {name} takes a map of at most {most}: "
+            f"{saved.source}: {len(saved)} landmarks, but {name} takes a map of at most {most}: "
             "start in a smaller map, or with another back end"
         )
-    backend.insert(known.ids, known.positions, known.covariances)
+    backend.insert(saved.ids, saved.positions, saved.covariances)

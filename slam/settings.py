@@ -84,28 +84,31 @@ def _value(text: str) -> Any:
 
 def _set(tree: dict[str, Any], path: list[str], value: Any, setting: str) -> None:
     """Set one leaf of the tree; every key on the way must exist, except options of front end and back end."""
-    node, prefix = tree, ""
-    for key in path[:-1]:
-        if not isinstance(node.get(key), dict):
-            raise ConfigurationError(f"setting {setting!r}: {_unknown('section', key, prefix, tree, path)}")
-        node, prefix = node[key], f"{prefix}{key}."
-    leaf = path[-1]
-    if isinstance(node.get(leaf), dict):
-        raise ConfigurationError(f"setting {setting!r}: {leaf!r} is a section; set {'.'.join(path)}.KEY=VALUE")
-    if len(path) < 2 or (path[0] not in _FREE and leaf not in node):
-        raise ConfigurationError(f"setting {setting!r}: {_unknown('key', leaf, prefix, tree, path)}")
-    node[leaf] = value
+    node = tree
+    for depth, key in enumerate(path):
+        last = depth == len(path) - 1
+        free = last and depth > 0 and path[0] in _FREE
+        if last and isinstance(node.get(key), dict):
+            raise ConfigurationError(f"setting {setting!r}: {key!r} is a section; set {'.'.join(path)}.KEY=VALUE")
+        if not free and (key not in node or (last and depth == 0) or not (last or isinstance(node[key], dict))):
+            what = "key" if last else "section"
+            raise ConfigurationError(f"setting {setting!r}: {_unknown(what, key, path[:depth], tree, path[-1])}")
+        if last:
+            node[key] = value
+        else:
+            node = node[key]
 
 
-def _unknown(what: str, name: str, prefix: str, tree: dict[str, Any], path: list[str]) -> str:
-    """The line for an unknown name below `prefix`; a key that another section has is suggested with its section.
+def _unknown(what: str, name: str, above: list[str], tree: dict[str, Any], leaf: str) -> str:
+    """The line for an unknown name in a section; a key that another one has is suggested with it.
 
     Only what users can set is named.
     """
     settable = [key for key in leaves(tree) if can_be_set(key) and key.partition(".")[0] not in _FREE]
+    prefix = "".join(f"{key}." for key in above)
     below = [key.removeprefix(prefix).partition(".")[0] for key in settable if key.startswith(prefix)]
-    known = list(dict.fromkeys([*below, *([] if prefix else _FREE)]))
-    elsewhere = [key for key in settable if key.rpartition(".")[2] == path[-1]]
+    known = list(dict.fromkeys([*below, *([] if above else _FREE)]))
+    elsewhere = [key for key in settable if key.rpartition(".")[2] == leaf]
     if not elsewhere:
         return unknown(what, name, known)
     return f"unknown {what} {name!r} (did you mean {' or '.join(map(repr, elsewhere))}?); known: {', '.join(known)}"

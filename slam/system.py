@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import overload
 
 import numpy as np
 
@@ -24,14 +23,14 @@ from slam.interfaces import Backend, Frontend
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.step import Step
-from slam.objects.modes import ObjectDetector, detector_for
+from slam.naming import count
+from slam.objects.modes import detector_for
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.one_thread import OneThread
 from slam.runtime.prefetch import prefetch
 from slam.runtime.stages import Stages
 from slam.session import Elsewhere, Session, State
-from slam.showing import count
 from slam.third_party import named_failures
 from slam.tracker import Tracker, frame_result
 from slam.tracks.table import LandmarkTable
@@ -59,6 +58,11 @@ class StereoSlam:
             LOST until the camera is found in it. The back end must be given by name.
         rig_prior: errors of the rig as estimated from earlier recordings (see `slam.load_calibration`). They are
             corrected from the first frame on, and their estimation continues.
+
+    Attributes:
+        rig, frontend, config: as given.
+        calibration: the rig's error as estimated so far.
+        objects: the detector of what moves.
 
     Raises:
         CalibrationError: `rig_prior` is of another rig.
@@ -106,8 +110,10 @@ class StereoSlam:
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
         inside.require_fits(first)
-        self._session = Session(inside.rig, inner, names[1], first, SelfCalibration(rig, c.self_calibration, rig_prior))
-        self._tracker = Tracker(self._session, detector_for(inside.rig, c.objects, inner.models))
+        self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
+        self._session = Session(inside.rig, inner, names[1], first, self.calibration)
+        self.objects = detector_for(inside.rig, c.objects, inner.models)
+        self._tracker = Tracker(self._session, self.objects, self.frontend)
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
@@ -117,8 +123,8 @@ class StereoSlam:
 
     def __repr__(self) -> str:
         frontend = "no front end" if self.frontend is None else type(self.frontend).__name__
-        known = 0 if self.landmarks is None else len(self.landmarks)
-        done = f"{count(self._state.index + 1, 'frame')}, {count(known, 'landmark')}"
+        landmarks = 0 if self.landmarks is None else len(self.landmarks)
+        done = f"{count(self._state.index + 1, 'frame')}, {count(landmarks, 'landmark')}"
         return f"StereoSlam({frontend}, {type(self.backend).__name__}, {done})"
 
     @property
@@ -141,28 +147,10 @@ class StereoSlam:
         return self._state.atlas
 
     @property
-    def objects(self) -> ObjectDetector:
-        """The detector of what moves."""
-        return self._tracker.objects
-
-    @objects.setter
-    def objects(self, detector: ObjectDetector) -> None:
-        self._tracker.objects = detector
-
-    @property
-    def calibration(self) -> SelfCalibration:
-        """The rig's error as estimated so far."""
-        return self._session.calibration
-
-    @property
     def restarted(self) -> list[int]:
         """Indices of the frames in which another back end took over: a kidnapped camera, or a new map."""
         return list(self._state.restarted)
 
-    @overload
-    def process(self, frame: StereoFrame, /) -> FrameResult: ...
-    @overload
-    def process(self, left: np.ndarray, right: np.ndarray | None, stamp: float) -> FrameResult: ...
     def process(
         self, left: StereoFrame | np.ndarray, right: np.ndarray | None = None, stamp: float | None = None
     ) -> FrameResult:
@@ -194,12 +182,12 @@ class StereoSlam:
         """
         if not isinstance(frames, Iterable):
             raise MeasurementError(f"run: frames must be a sequence of frames, got {type(frames).__name__}")
-        extracted = (self._extractor.extract(self.frontend, frame) for frame in frames)
+        extractions = (self._extractor.extract(self.frontend, frame) for frame in frames)
         depth = 1 if getattr(frames, "live", False) else 2  # live frames must not wait
-        for found in prefetch(extracted, depth) if overlap else extracted:
+        for extracted in prefetch(extractions, depth) if overlap else extractions:
             with self._stepping:
-                result = self._timed_step(found)
-            yield found.frame, result
+                result = self._timed_step(extracted)
+            yield extracted.frame, result
 
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and manage the map (paper A, III and IV; paper B, 2).
@@ -217,13 +205,13 @@ class StereoSlam:
         with self._stepping, self._named(f"frame {self._state.index + 1}"):
             return self._process(documented(features, self.rig), None)
 
-    def _timed_step(self, found: Extracted) -> FrameResult:
+    def _timed_step(self, extracted: Extracted) -> FrameResult:
         """A step with what was found in images; the result has the time of extraction, too."""
-        with self._named(f"frame {found.frame.index}"):
-            result = self._process(found.features, found.checksum)
+        with self._named(f"frame {extracted.frame.index}"):
+            result = self._process(extracted.features, extracted.checksum)
         if result.reason == REPEATED:
-            self._extractor.warn_of_repeated(found.frame.index)
-        return replace(result, milliseconds={**found.milliseconds, **result.milliseconds})
+            self._extractor.warn_of_repeated(extracted.frame.index)
+        return replace(result, milliseconds={**extracted.milliseconds, **result.milliseconds})
 
     def _named(self, place: str) -> AbstractContextManager[None]:
         """Make exceptions of third-party parts say what failed, and where."""
@@ -237,21 +225,21 @@ class StereoSlam:
         stage, t = self._stages.stage, self._tracker
         with stage("predict"):  # the motion model advances the camera's pose (paper A, Eq. 11), unless it stands
             standing, prediction = (state.standing, begun) if begun else t.predict(state, features)
-        with stage("associate"):  # correct the features; find landmarks in size-variable windows (paper A, IV)
-            step = t.associate(state, features, standing, prediction, self.frontend)
+        with stage("associate"):  # correct features, find landmarks (paper A, IV): `slam.tracks.localizer`
+            step = t.associate(state, features, standing, prediction)
             if isinstance(step, Elsewhere):  # the camera was found somewhere else in the map
                 return step
         with stage("update"):  # the landmarks' pixels correct pose and map
             step = t.update(state, step)
-            if isinstance(step, Elsewhere):  # the place is unknown
+            if isinstance(step, Elsewhere):  # the place is unknown: a new map begins
                 return step
         with stage("estimate"):  # the pose; how it depends on the rig's error; the calibration learns from it
             step = t.estimate(state, step)
-        with stage("objects"):  # sort the features: still, moving, undecided; estimate moving bodies (paper B, 3)
+        with stage("objects"):  # still, moving or undecided; moving bodies (paper B, 3): `slam.objects.detector`
             step = t.sort(state, step)
-        with stage("manage"):  # count what was seen, erase bad landmarks, add new ones (paper A, IV)
-            step = t.manage(state, step, self.frontend)
-        with stage("atlas"):  # the frame may become a keyframe; a loop corrects the path
+        with stage("manage"):  # count, erase and add landmarks (paper A, IV): `slam.mapping.mapper`
+            step = t.manage(state, step)
+        with stage("atlas"):  # the frame may become a keyframe, a loop corrects the path: `slam.mapping.atlas`
             return t.close_loops(state, step)
 
     @one_blas_thread
@@ -275,12 +263,12 @@ class StereoSlam:
         with self._stages.stage("predict"):
             revision = tracker.revise(state)
         step = self._step(state, features)
-        if isinstance(step, Elsewhere):
+        if isinstance(step, Elsewhere):  # another back end begins there, in the map or in a new one
             state, begun = session.taken_over(state, step, features)
             self.objects.restart()
             step = self._step(state, features, begun)
             assert not isinstance(step, Elsewhere)  # a back end that takes over is believed
-        step = replace(step, erased=session.left_behind(self._state, state, step), repeated=repeated)
+        step = replace(session.with_takeover(self._state, state, step), repeated=repeated)
         common = session.rig_error.common(as_reported=True)
         result = frame_result(step, state.mapped, revision, self._stages.milliseconds, common)
         self._state, self._stages = state.after(step, checksum), Stages()
@@ -324,7 +312,7 @@ class StereoSlam:
             estimate = self._estimate(of_map=True) if self.landmarks is not None else None
             if estimate is None or self.landmarks is None:
                 raise SlamError("there is no map yet: no frame was processed")
-            rows = self.landmarks.moved(self.atlas.T_map_odom)
+            rows = self.landmarks.in_world(self.atlas.T_map_odom)
             keyframes = (k.corrected(self.calibration.applied, self._session.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
             return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas)

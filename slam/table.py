@@ -52,9 +52,9 @@ class LandmarkRows(Table):
         Raises:
             MeasurementError: one is not in the map.
         """
-        ids, known = np.asarray(ids, np.int64), self.ids[self.order]
-        at = np.searchsorted(known, ids).clip(0, max(len(known) - 1, 0))
-        bad = known[at] != ids if len(known) else np.ones(len(ids), bool)
+        ids, present = np.asarray(ids, np.int64), self.ids[self.order]
+        at = np.searchsorted(present, ids).clip(0, max(len(present) - 1, 0))
+        bad = present[at] != ids if len(present) else np.ones(len(ids), bool)
         if bad.any():
             raise MeasurementError(f"landmark {ids[bad][0]} is not in the map")
         return self.order[at]

@@ -28,7 +28,7 @@ _ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
     "patches": (Patches, {"images": ("n", "s", "s"), "centres": ("n", 2), "size": ("n",)}),
     "align": (tuple, {}),
 }
-_FINITE = {"T_world_left", "covariance", "positions", "covariances", "real"}
+_IDS, _FINITE = ("ids", "used", "rejected"), ("T_world_left", "covariance", "positions", "covariances", "real")
 
 
 def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
@@ -39,15 +39,22 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     Raises:
         SlamError: it is of another type than documented, an array of another shape, or a pose or position not finite.
     """
-    what = f"{type(owner).__name__}.{method}"
-    kind, attributes = _ANSWERS[method]
+    what, (kind, attributes) = f"{type(owner).__name__}.{method}", _ANSWERS[method]
     if not isinstance(answer, kind):
         raise SlamError(f"{what}: must give a {kind.__name__}, got {type(answer).__name__}")
     for name, wanted in attributes.items():
         value, where = getattr(answer, name), what if name == "real" else f"{what}: {name}"
         if isinstance(wanted, tuple):
-            _require_array(value, wanted, sizes, where)
-            if name in ("ids", "used", "rejected") and value.dtype.kind not in "iu":
+            shape, numeric = np.shape(value), isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
+            if numeric and len(shape) == len(wanted):
+                for letter, size in zip(wanted, shape):
+                    if isinstance(letter, str):
+                        sizes.setdefault(letter, size)
+            expected = tuple(map(sizes.get, wanted, wanted))
+            if not numeric or shape != expected:
+                got = f"{value.dtype} {shape}" if isinstance(value, np.ndarray) else type(value).__name__
+                raise SlamError(f"{where} must be an array {expected} of numbers, got {got}".replace("'", ""))
+            if name in _IDS and value.dtype.kind not in "iu":
                 raise SlamError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _FINITE and not np.isfinite(value).all():
                 raise SlamError(f"{where} is not finite")
@@ -56,18 +63,6 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
         elif name == "stamp" and not abs(value) <= LATEST_STAMP:
             raise SlamError(f"{where} must be within {LATEST_STAMP:g} s")
     return answer
-
-
-def _require_array(value: Any, wanted: tuple[Any, ...], sizes: dict[str, int], where: str) -> None:
-    """Check that a value is a numeric array of a shape, of which `sizes` remembers what its letters stand for."""
-    good = isinstance(value, np.ndarray) and value.ndim == len(wanted) and value.dtype.kind in "fiu"
-    if not good or any(
-        found != sizes.setdefault(size, found) if isinstance(size, str) else found != size
-        for size, found in zip(wanted, value.shape)
-    ):
-        shape = tuple(sizes.get(size, size) if isinstance(size, str) else size for size in wanted)
-        got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-        raise SlamError(f"{where} must be an array {shape} of numbers, got {got}".replace("'", ""))
 
 
 @contextmanager
@@ -97,8 +92,8 @@ def named_failures(place: str, *parts: object) -> Iterator[None]:
 def _call(error: BaseException, part: object) -> str:
     """The method of `part` that raised an exception, or was called wrongly; empty for none."""
     for frame, _ in walk_tb(error.__traceback__):
-        first = frame.f_code.co_varnames[:1]
-        if first and frame.f_locals.get(first[0]) is part:
-            return frame.f_code.co_name
+        first, name = frame.f_code.co_varnames[:1], frame.f_code.co_name
+        if first and frame.f_locals.get(first[0]) is part and hasattr(part, name):
+            return name
     name, dot, rest = text_of(error).partition(".")
     return rest.partition("(")[0] if dot and isinstance(error, TypeError) and name == type(part).__qualname__ else ""

@@ -20,15 +20,15 @@ from slam.data import (
 from slam.geometry.arrays import Array, isin
 from slam.geometry.se3 import inverse
 from slam.input.warnings import REPEATED
-from slam.interfaces import Frontend, RestingBackend
+from slam.interfaces import AligningFrontend, Frontend, RestingBackend
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
 from slam.objects.modes import ObjectDetector
 from slam.rig_error import CommonError, Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
 from slam.third_party import checked
-from slam.tracks.alignment import Aligner
-from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.alignment import align, with_new_patches
+from slam.tracks.localizer import LandmarkMatches, Search
 from slam.tracks.standing import Standing
 from slam.tracks.state import HIDDEN
 from slam.tracks.table import LandmarkTable
@@ -40,16 +40,18 @@ class Tracker:
     Args:
         session: with the parts of the system, and the back ends.
         objects: detects what moves.
+        frontend: made the features; those of landmarks are aligned with earlier images if it can do that.
 
     Attributes:
         advanced: stamp to which a back end was last advanced [s]; an interrupted step counts.
     """
 
-    def __init__(self, session: Session, objects: ObjectDetector) -> None:
+    def __init__(self, session: Session, objects: ObjectDetector, frontend: Frontend | None) -> None:
         self.objects = objects
         self.advanced = -np.inf
         self._session = session
-        self._aligner = Aligner(session.rig, session.config.association.align)
+        aligns = session.config.association.align and isinstance(frontend, AligningFrontend)
+        self._aligning: AligningFrontend | None = frontend if aligns else None  # type: ignore[assignment]
 
     def revise(self, state: State) -> Revision | None:
         """Apply the present estimate of the rig's error, also to earlier measurements if the back end can."""
@@ -68,32 +70,33 @@ class Tracker:
         return standing, prediction
 
     def associate(
-        self, state: State, features: StereoFeatures, standing: Standing, prediction: Prediction,
-        frontend: Frontend | None,
-    ) -> Step | Elsewhere:  # fmt: skip
-        """Match landmarks with features, and align the features if the front end that made them can."""
-        corrected, found = self._session.calibration.correct(features), None
+        self, state: State, features: StereoFeatures, standing: Standing, prediction: Prediction
+    ) -> Step | Elsewhere:
+        """Match landmarks with features, and align the features with earlier images."""
+        corrected, place = self._session.calibration.correct(features), None
         landmarks = state.landmarks or LandmarkTable.empty(features.descriptors.shape[1])
 
         def elsewhere() -> Array | None:
-            nonlocal found
-            found = self._session.find(state, corrected)
-            return None if found is None else found.T_odom_left
+            nonlocal place
+            place = self._session.find(state, corrected)
+            return None if place is None else place.T_odom_left
 
-        seen = prediction, landmarks, _positions(state, landmarks.ids), corrected
         localizer, index, tracking = self._session.localizer, state.index + 1, state.tracking
+        search = Search(localizer, prediction, landmarks, _positions(state, landmarks.ids), corrected, index)
         if state.begins_at(index):
-            matches = localizer.match(*seen, index)
+            matches = search.match()
         else:
-            matches, tracking, standing = localizer.follow(*seen, tracking, standing, index, elsewhere)
+            matches, tracking, standing = search.follow(tracking, standing, elsewhere)
         if matches.kidnapped:
             if self._session.can_restart(state):
-                return Elsewhere(matches.T_world_left, found)
+                return Elsewhere(matches.T_world_left, place)
             matches = LandmarkMatches.nothing()
-        places = state.backend.positions
-        aligned, landmarks = self._aligner.align(frontend, features, matches, landmarks, places)
+        aligned = features
+        if self._aligning is not None:
+            rig, positions = self._session.rig, state.backend.positions
+            aligned, landmarks = align(rig, self._aligning, features, matches, landmarks, positions)
         if aligned is not features:
-            corrected = _moved_as(corrected, features, aligned)
+            corrected = _shifted_as(corrected, features, aligned)
         step = Step(
             index, aligned, replace(corrected, images=None), prediction, landmarks, matches, standing, tracking,
             state.atlas,
@@ -115,18 +118,17 @@ class Tracker:
 
     def update(self, state: State, step: Step) -> Step | Elsewhere:
         """Update the back end; `Elsewhere` in an unknown place."""
-        positions, localizer = _positions(state, step.matches.ids), self._session.localizer
-        dt = step.prediction.stamp - state.stamp
-        asked, left_out = localizer.informative(step.prediction, step.matches, positions, dt)
-        answer = state.backend.update(asked.observations(step.features), asked.T_world_left)
+        matches, standing = step.matches, step.standing
+        answer = state.backend.update(matches.observations(step.features), matches.T_world_left)
         report: UpdateReport = checked(state.backend, "update", answer)
-        stands = step.standing.stands
-        tracking = localizer.state_after(step.tracking, step.prediction, step.features, asked, report, stands)
+        tracking = self._session.localizer.state_after(
+            step.tracking, step.prediction, step.features, matches, report, standing.stands
+        )
         if state.begins_at(step.index):
             report = replace(report, reason=report.reason if len(step.landmarks) else NEW_MAP)
-        elif not step.standing.holds(tracking.lost) and self._session.may_begin_new_map(state, tracking):
+        elif not standing.holds(tracking.lost) and self._session.may_begin_new_map(state, tracking):
             return Elsewhere(None)
-        return replace(step, report=report, left_out=left_out, tracking=tracking)
+        return replace(step, report=report, tracking=tracking)
 
     def estimate(self, state: State, step: Step) -> Step:
         """The camera's pose after an update; the rig's uncertainty is propagated to it, and its calibration learns."""
@@ -140,17 +142,17 @@ class Tracker:
     def sort(self, state: State, step: Step) -> Step:
         """Which features move, and the moving bodies."""
         landmark, standing = step.matches.landmark_of(len(step.features)), step.standing
-        labels, objects = self.objects.step(
-            state.backend, step.features, step.estimate, landmark, standing.witnesses
-        )  # fmt: skip
+        labels, objects = self.objects.step(state.backend, step.features, step.estimate, landmark, standing.witnesses)
         labels = labels.with_undecided(standing.leaving(len(step.features)))
         return replace(step, labels=labels, objects=objects)
 
-    def manage(self, state: State, step: Step, frontend: Frontend | None) -> Step:
+    def manage(self, state: State, step: Step) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
         step = self._session.mapper.update(state.backend, step)
         seen, T = step.matches.joined(step.added), step.estimate.T_world_left
-        landmarks = self._aligner.with_patches(frontend, step.measured, seen, step.landmarks, T)
+        landmarks = step.landmarks
+        if self._aligning is not None:
+            landmarks = with_new_patches(self._aligning, step.measured, seen, landmarks, T)
         new = step.added.ids[~isin(step.added.ids, step.erased)]
         self._session.rig_error.uncertainty.change(new, _positions(state, new), step.erased)
         return replace(step, landmarks=landmarks)
@@ -184,7 +186,7 @@ class Tracker:
         return self._session.rig_error.added_to(checked(state.backend, "estimate", state.backend.estimate()))
 
 
-def _moved_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:
+def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:
     """Corrected features that move as the measured ones did: the correction is the same over so small a shift."""
     if corrected is before:
         return now
@@ -215,7 +217,8 @@ def frame_result(
         len(step.prediction.ids), step.matches.ids, step.matches.rows, step.added.ids, step.added.rows, step.erased,
         len(step.landmarks), dict(milliseconds), step.labels.moving, objects, revision=revision,
         T_map_odom=atlas.T_map_odom, loop=atlas.closed_in(step.index), refused_loop=atlas.refused_in(step.index),
-        keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index, returned=step.returned.ids,
+        keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
+        returned=np.union1d(step.returned.ids, step.joined),
         common=common if atlas.anchor is None else CommonError(),
     )  # fmt: skip
 

@@ -78,9 +78,10 @@ FAULTS = (
         "tests/backends/test_insert.py tests/backends/test_smoother.py",
     ),
     Fault(
-        "pixel noise not scaled to the rectified image", "backends/smoother/factors.py",
-        "self.sigma = models.pixel_sigma * stereo.scale", "self.sigma = models.pixel_sigma",
-        "tests/backends/test_same_uncertainty.py tests/backends/test_smoother.py tests/backends/test_agreement.py",
+        "pixel noise not scaled to the rectified image", "slam/input/rectification.py",
+        "return replace(models, pixel_sigma=models.pixel_sigma * scale, T_world_left=T.tolist(), objects=objects)",
+        "return replace(models, T_world_left=T.tolist(), objects=objects)",
+        "tests/slam/input/test_rectification.py",
     ),
     # the sliding window
     Fault(

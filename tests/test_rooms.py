@@ -40,18 +40,8 @@ MAY_IMPORT = {
 
 #: The root's modules by room; all others are "base".
 ROOT_ROOMS = {
-    "data": {
-        "checks",
-        "third_party",
-        "data",
-        "interfaces",
-        "models",
-        "object_data",
-        "object_models",
-        "rig_error",
-        "table",
-    },
-    "system": {"system", "session", "tracker", "config", "results"},
+    "data": {"checks", "third_party", "data", "interfaces", "models", "object_data", "rig_error", "table"},
+    "system": {"system", "session", "tracker", "config"},
     "commands": {"__main__"},
     "outside": {"__init__"},
 }

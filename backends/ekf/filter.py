@@ -70,7 +70,7 @@ class EkfBackend:
     both (`backends.ekf.angles`).
 
     Args:
-        rig: the cameras; measurements of any rig are rectified first.
+        rig: the cameras, rectified.
         models: noise, priors, motion and gate.
         form: makes what the filter is of, by models and options: the papers' Euler angles, or another camera.
         options: of the form; see `EkfConfig`.
@@ -203,7 +203,7 @@ class EkfBackend:
         s, stereo = replace(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
-            rows = np.flatnonzero(stereo.rectified_rig.rig.left.in_image(z[:, :2]))
+            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2]))
             z = stereo.corrected(self._form.name, z[rows], correct)
             points = se3.transform(s.pose, stereo.triangulate(z))
             good = np.isfinite(points).all(axis=1)
@@ -252,7 +252,7 @@ class EkfBackend:
         if not self._form.stereo:
             z[:, 2] = np.nan
         update = Update(
-            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure.sigma, self._measure.stereo,
+            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self.models.pixel_sigma, self._measure.stereo,
             self._coordinates, self._form.iterations, self.models.gate_probability, guess,
         )  # fmt: skip
         noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)

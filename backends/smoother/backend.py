@@ -37,7 +37,7 @@ class SmootherBackend:
     measurements put it, given the poses; covariances are gtsam's marginals.
 
     Args:
-        rig: the cameras; measurements of any rig are rectified first.
+        rig: the cameras, rectified.
         models: noise, priors, motion and gate.
         options: see `SmootherConfig`.
 

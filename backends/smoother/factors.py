@@ -71,12 +71,10 @@ class FactorMaker:
     """
 
     def __init__(self, stereo: RectifiedStereo, models: EstimatorModels) -> None:
-        self.sigma = models.pixel_sigma * stereo.scale
+        self.sigma = models.pixel_sigma
         self.stereo, self._models = stereo, models
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
-        rectified = stereo.rectified_rig.original.is_rectified
-        self._sensor = () if rectified else (to_pose3(stereo.rectified_rig.T_left_rectified),)
         self._quick = _parameters(gtsam.LinearizationMode.HESSIAN)
         self._careful = _parameters(gtsam.LinearizationMode.JACOBIAN_SVD)
 
@@ -123,7 +121,7 @@ class FactorMaker:
         Both modes give the same information; the careful one takes longer, and does not throw where the landmark lies
         behind a camera.
         """
-        factor = _Smart(self._noise, self._careful if careful else self._quick, *self._sensor)
+        factor = _Smart(self._noise, self._careful if careful else self._quick)
         factor.add(points, keys, self._K)
         return factor
 
@@ -131,10 +129,10 @@ class FactorMaker:
         """One measurement of a landmark that is a variable."""
         keys, uR = (pose_key(pose), landmark_key(landmark)), point.uR()
         if uR == uR:  # not NaN; NumPy's own test costs as much as the factor
-            return gtsam.GenericStereoFactor3D(point, self._noise, *keys, self._K, *self._sensor)
+            return gtsam.GenericStereoFactor3D(point, self._noise, *keys, self._K)
         K, noise = self._mono
         uv = np.array([point.uL(), point.v()])
-        return gtsam.GenericProjectionFactorCal3_S2(uv, noise, *keys, K, *self._sensor)
+        return gtsam.GenericProjectionFactorCal3_S2(uv, noise, *keys, K)
 
     def known(self, landmark: int, position: Array, covariance: Array) -> gtsam.NonlinearFactor:
         """A landmark variable is at a position (3,) in the world, with a covariance (3, 3)."""

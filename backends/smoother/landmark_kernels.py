@@ -11,12 +11,11 @@ from slam.runtime.compilation import kernel
 
 
 @kernel
-def information_of(camera, R_left, poses, frames, z, points, rows, sigma):
+def information_of(camera, poses, frames, z, points, rows, sigma):
     """What measurements say of landmarks, linearised at their positions.
 
     Args:
         camera: of the rectified rig (7,), see `slam.kernels.stereo`.
-        R_left: rotation (3, 3) from left-camera to rectified coordinates.
         poses: T_world_left (F, 4, 4).
         frames: in which each measurement was made (n,).
         z: measurements (n, 3), NaN where missing.
@@ -41,7 +40,7 @@ def information_of(camera, R_left, poses, frames, z, points, rows, sigma):
                 continue
             T = poses[frames[row]]
             transform_back(T, points[m], local)
-            if not residual(camera, R_left, local, z[row], r, J):
+            if not residual(camera, local, z[row], r, J):
                 behind[m] += 1
                 continue
             for c in range(3):  # uL, vL, uR

@@ -110,7 +110,7 @@ class SmootherLandmarks(LandmarkRows):
 
         def at(x: Array, m: IndexArray) -> tuple[Array, Array, Array]:
             information, gradient, squares, behind = information_of(
-                stereo.intrinsics, stereo.R_left, poses, frames, z, x, rows[m], sigma
+                stereo.intrinsics, poses, frames, z, x, rows[m], sigma
             )
             off = self.mean[m] - x
             pull = (self.information[m] @ off[:, :, None])[:, :, 0]
@@ -159,7 +159,7 @@ class SmootherLandmarks(LandmarkRows):
         frames, z = (self.pose - first).clip(0).ravel(), self.z.reshape(-1, 3)
         rows = np.where(self.pose >= 0, np.arange(self.pose.size).reshape(self.pose.shape), -1)[chosen]
         x, own = self.position[chosen], self.own[chosen]
-        information, *_ = information_of(stereo.intrinsics, stereo.R_left, poses, frames, z, x, rows, sigma)
+        information, *_ = information_of(stereo.intrinsics, poses, frames, z, x, rows, sigma)
         older = np.where(self.world[chosen, None, None], 0.0, self.information[chosen])
         J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
         n, width = len(chosen), len(joint)

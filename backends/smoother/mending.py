@@ -55,7 +55,8 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     before = s.poses[-1] if s.inside is False or len(moved) < 2 else s.poses[-2]
     after = moved[-1] if s.inside is False or len(moved) < 2 else moved[-2]
     last[0] = after @ inverse(before) @ s.last[0]
-    s = replace(s, poses=moved, last=last, landmarks=marks.refined(steps.stereo, steps.sigma, s.first, moved))
+    marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
+    s = replace(s, poses=moved, last=last, landmarks=marks)
     with suppress(SolverError):  # then the next update tries again
         graph.rebuilt(s)
     return s

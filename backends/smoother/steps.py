@@ -98,7 +98,7 @@ class Steps(RectifiedMeasurement):
         """The newest pose alone, with the motion model as its prior, and landmarks as they stand."""
         T, marks = s.last[1], s.landmarks
         local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
-        noise = pose_only.residual_noise(self.stereo, self.sigma, local, own, z)
+        noise = pose_only.residual_noise(self.stereo, self.models.pixel_sigma, local, own, z)
         P = s.covariance if s.inside or marks.world[rows].any() else s.own
         probability = self.models.gate_probability
         return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
@@ -176,7 +176,7 @@ class Steps(RectifiedMeasurement):
             pair[:6, :6] = relative_covariance(newest_first, poses[-1], last[0])
         last[1] = poses[-1]
         spread = np.concatenate([s.spread[:-1], P[None, -6:, -6:]])
-        marks = s.landmarks.refined(self.stereo, self.sigma, s.first, poses)
+        marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses)
         s = replace(s, poses=poses, last=last, pair=pair, spread=spread, landmarks=marks)
         return s if self.past is None or len(s.poses) < 1.5 * self.past else s.without_old(self.past)
 
@@ -227,7 +227,7 @@ class Steps(RectifiedMeasurement):
         """Covariances (M, 3, 3) of landmarks in the world."""
         first, joint = graph.joint_covariance(s)
         poses = s.poses[s.of(first) :]
-        return s.landmarks.covariances(self.stereo, self.sigma, rows, first, poses, joint)
+        return s.landmarks.covariances(self.stereo, self.models.pixel_sigma, rows, first, poses, joint)
 
 
 def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> SmootherState:

@@ -36,7 +36,7 @@ class WindowBackend:
     still revised, by what stayed, for `WindowConfig.lag` frames.
 
     Args:
-        rig: the cameras; measurements of any rig are rectified first.
+        rig: the cameras, rectified.
         models: noise, priors, motion and gate.
         options: see `WindowConfig`.
 

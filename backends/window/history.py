@@ -109,7 +109,7 @@ def state_corrected(s: WindowState, stereo: RectifiedStereo, correct: Callable[[
     T, marks = s.poses[-1], s.landmarks
     local = (marks.position - T[:3, 3]) @ T[:3, :3]
     z, _ = stereo.project(local)
-    seen = np.isfinite(z).all(axis=1) & stereo.rectified_rig.rig.left.in_image(z[:, :2])
+    seen = np.isfinite(z).all(axis=1) & stereo.rig.left.in_image(z[:, :2])
     seen &= marks.information[:, 0, 0] == 0  # what is known in the world stays
     there = local.copy()
     there[seen] = stereo.triangulate(stereo.corrected("window", z[seen], correct))

@@ -128,13 +128,15 @@ class Steps(RectifiedMeasurement):
 
     def _rows(self, s: WindowState, points: IndexArray, z: Array) -> Rows:
         """Measurements from the newest pose."""
-        return Rows(np.full(len(points), len(s.frames) - 1), points, z, np.full(len(points), 1 / self.sigma))
+        return Rows(
+            np.full(len(points), len(s.frames) - 1), points, z, np.full(len(points), 1 / self.models.pixel_sigma)
+        )
 
     def _agreement(self, s: WindowState, points: IndexArray, z: Array, guess: Array | None) -> Agreement:
         """Initial value of the newest pose, and which measurements agree with it."""
         T, position = s.poses[-1], s.landmarks.position[points]
         local, own = seen_from_newest(s, points)
-        noise = pose_only.residual_noise(self.stereo, self.sigma, local, own, z)
+        noise = pose_only.residual_noise(self.stereo, self.models.pixel_sigma, local, own, z)
         in_world = (s.landmarks.information[points, 0, 0] > 0).any() or s.solved == len(s.frames) - 1
         information = np.linalg.inv(s.covariance[-6:, -6:] if in_world else between(s, s.solved))
         one = pose_only.PoseProblem(self.stereo, position, z, noise, T, information, self.models.gate_probability)
@@ -176,8 +178,8 @@ class Steps(RectifiedMeasurement):
             solution = solve(w, close)
             w = solution.window
             distances = kernels.left_out_distances(
-                self.stereo.intrinsics, self.stereo.R_left, w.poses[-1], w.points[at], z,
-                solution.point_covariances(len(w.poses) - 1, at)[0], self.sigma, least,
+                self.stereo.intrinsics, w.poses[-1], w.points[at], z,
+                solution.point_covariances(len(w.poses) - 1, at)[0], self.models.pixel_sigma, least,
             )  # fmt: skip
             if np.isfinite(distances).all():
                 break

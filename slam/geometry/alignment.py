@@ -57,26 +57,22 @@ def align_positions(
     source, target = np.asarray(source, float), np.asarray(target, float)
     if source.shape != target.shape or source.ndim != 2 or not len(source):
         raise TrajectoryError(f"alignment: positions {source.shape} and {target.shape} do not go together")
-    if not (
-        np.abs(source).max() <= 1e100 and np.abs(target).max() <= 1e100
-    ):  # 1e100: position [m] whose square is a number
+    if not np.abs([source, target]).max() <= 1e100:  # 1e100: position [m] whose square is a number
         raise TrajectoryError("alignment: a position is not finite, or impossibly large")
     centre_s, centre_t = source.mean(axis=0), target.mean(axis=0)
-    s, t = source - centre_s, target - centre_t
-    dimensions = source.shape[1]
+    s, t, dimensions = source - centre_s, target - centre_t, source.shape[1]
     guide = np.eye(dimensions) if orientations is None else orientations.mean(axis=0)
     U, d, Vt = np.linalg.svd(t.T @ s / len(s))
+    signs = np.ones(dimensions)  # the weakest direction is turned round where U Vᵀ is a mirror
+    signs[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     if np.sqrt((s**2).mean() * (t**2).mean()) < _STILL or d[0] < _STILL:
-        rank, R = 0, nearest_rotation_any(guide)
+        rank, R = 0, nearest_rotation(guide)
     else:
         # 1e-12: second singular value by the first, below which positions lie on a line
-        rank = int((d > 1e-12 * d[0]).sum())
-        R = U @ _reflection(U, Vt) @ Vt
+        rank, R = int((d > 1e-12 * d[0]).sum()), U @ np.diag(signs) @ Vt
         if rank == 1 and dimensions == 3:
             R = _turn_about(U[:, 0], R, guide)
-    scale = 1.0
-    if with_scale and rank:
-        scale = float((d * np.diag(_reflection(U, Vt))).sum() / (s**2).sum(axis=1).mean())
+    scale = float((d * signs).sum() / (s**2).sum(axis=1).mean()) if with_scale and rank else 1.0
     return Alignment(R, centre_t - scale * R @ centre_s, scale, rank)
 
 
@@ -90,21 +86,6 @@ def align(estimate: Trajectory, truth: Trajectory, with_scale: bool = False) -> 
         raise TrajectoryError(f"alignment: {len(estimate)} estimated poses, {len(truth)} true ones")
     orientations = truth.poses[:, :3, :3] @ np.swapaxes(estimate.poses[:, :3, :3], 1, 2)
     return align_positions(estimate.positions, truth.positions, with_scale, orientations)
-
-
-def nearest_rotation_any(M: Array) -> Array:
-    """The proper rotation nearest to a matrix (D, D), D = 2 or 3."""
-    if M.shape == (3, 3):
-        return nearest_rotation(M)
-    U, _, Vt = np.linalg.svd(M)
-    return np.asarray(U @ _reflection(U, Vt) @ Vt, np.float64)
-
-
-def _reflection(U: Array, Vt: Array) -> Array:
-    """Diagonal matrix that makes ``U S Vᵀ`` a proper rotation: the weakest direction is turned round if need be."""
-    S = np.eye(len(U))
-    S[-1, -1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    return S
 
 
 def _turn_about(axis: Array, R: Array, guide: Array) -> Array:

@@ -24,11 +24,11 @@ def narrowed(values: np.ndarray, dtype: type[np.floating[Any]]) -> NDArray[Any]:
         return values.astype(dtype)
 
 
-def isin(ids: IdArray | IndexArray, others: IdArray | IndexArray) -> BoolArray:
+def isin(ids: IdArray | IndexArray, members: IdArray | IndexArray) -> BoolArray:
     """Which of `ids` (N,) are among `others` (M,): ``np.isin``, which takes several times as long for so few."""
-    if len(ids) + len(others) > 2 * 500:  # 500: NumPy is quicker with more
-        return np.isin(ids, others)
-    return np.fromiter(map(set(others.tolist()).__contains__, ids.tolist()), bool, len(ids))
+    if len(ids) + len(members) > 2 * 500:  # 500: NumPy is quicker with more
+        return np.isin(ids, members)
+    return np.fromiter(map(set(members.tolist()).__contains__, ids.tolist()), bool, len(ids))
 
 
 def among(count: int, rows: IndexArray | IdArray) -> BoolArray:

@@ -83,7 +83,7 @@ class PinholeCamera:
         Raises:
             CalibrationError: K is no camera matrix, or there are coefficients that are not supported.
         """
-        matrix, coefficients = _floats("camera matrix", K), _floats("distortion", D if D is not None else ()).ravel()
+        matrix, coefficients = floats("camera matrix", K), floats("distortion", D if D is not None else ()).ravel()
         if matrix.shape != (3, 3):
             raise CalibrationError(f"the camera matrix must be (3, 3), got {matrix.shape}")
         values = coefficients.tolist()
@@ -155,6 +155,10 @@ class PinholeCamera:
         distorted = (uv - (self.u0, self.v0)) / (self.fu, self.fv)
         return self._undistort(distorted) if self.has_distortion else distorted
 
+    def rays(self, uv: Array) -> Array:
+        """Rays (N, 3) = (x/z, y/z, 1) of pixels (N, 2)."""
+        return np.concatenate([self.normalise(uv), np.ones((len(uv), 1))], axis=1)
+
     def in_image(self, uv: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """Which pixels (N, 2) lie inside the image, `margin` [px] away from its border; NaN lies outside."""
         u, v = uv[:, 0], uv[:, 1]
@@ -176,9 +180,9 @@ class PinholeCamera:
             return ab, None
         if self.model == "equidistant":
             return _distort_equidistant(ab, np.asarray(self.distortion), jacobian)
-        from slam.geometry import lens_kernels
+        from slam.geometry import kernels
 
-        distorted, D = lens_kernels.distort(ab, self._coefficients, self._radius_limit, jacobian)
+        distorted, D = kernels.distort(ab, self._coefficients, self._radius_limit, jacobian)
         return distorted, D if jacobian else None
 
     @cached_property
@@ -202,9 +206,9 @@ class PinholeCamera:
         """Invert `_distort`; NaN where no ray leads to the pixel."""
         if self.model == "equidistant":
             return _undistort_equidistant(target, np.asarray(self.distortion))
-        from slam.geometry import lens_kernels
+        from slam.geometry import kernels
 
-        return np.asarray(lens_kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
+        return np.asarray(kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
 
 
 def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
@@ -222,7 +226,7 @@ def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     return ""
 
 
-def _floats(what: str, values: ArrayLike) -> Array:
+def floats(what: str, values: ArrayLike | None) -> Array:
     """An array of numbers.
 
     Raises:
@@ -231,7 +235,7 @@ def _floats(what: str, values: ArrayLike) -> Array:
     try:
         return np.array(values, float)
     except (TypeError, ValueError, OverflowError):
-        raise CalibrationError(f"{what}: no numbers") from None
+        raise CalibrationError(f"{what} must be numbers") from None
 
 
 def _undistort_equidistant(target: Array, coefficients: Array) -> Array:

@@ -140,13 +140,10 @@ def _some(mask: BoolArray) -> NDArray[np.intp]:
 
 def _refined(rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.intp], T: Array, steps: int) -> Array:
     """Least-squares poses (H, 4, 4) from poses T, each by the matches `rows` (H, K)."""
-    from slam.geometry.pose_kernels import gauss_newton
+    from slam.geometry.kernels import gauss_newton
 
-    T, one, nothing = T.copy(), np.eye(3), np.zeros((6, 6))
-    gauss_newton(
-        rig.rectified_parameters, one, points, measured, one[None], rows, nothing, nothing[0], T, np.inf, steps,
-        _CONVERGED,
-    )  # fmt: skip
+    T, one, none, camera = T.copy(), np.eye(3)[None], np.zeros((6, 6)), rig.rectified_parameters
+    gauss_newton(camera, points, measured, one, rows, none, none[0], T, np.inf, steps, _CONVERGED)
     return T
 
 
@@ -175,8 +172,8 @@ def _left_poses(rig: StereoRig, points: Array, measured: Array, triples: NDArray
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
             poses.append(inverse(T))
-    found = np.array(poses).reshape(-1, 4, 4)
-    return found[np.isfinite(found).all(axis=(1, 2))]
+    poses_left = np.array(poses).reshape(-1, 4, 4)
+    return poses_left[np.isfinite(poses_left).all(axis=(1, 2))]
 
 
 def rigid_fit(source: Array, target: Array) -> Array:
@@ -201,6 +198,6 @@ def _agreement(rig: StereoRig, points: Array, measured: Array, T: Array, thresho
 
 def _errors(rig: StereoRig, points: Array, measured: Array, T: Array) -> Array:
     """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
-    from slam.geometry.pose_kernels import errors
+    from slam.geometry.kernels import errors
 
-    return np.asarray(errors(rig.rectified_parameters, np.eye(3), points, measured, T))
+    return np.asarray(errors(rig.rectified_parameters, points, measured, T))

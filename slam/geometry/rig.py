@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam.errors import CalibrationError
-from slam.geometry.camera import PinholeCamera, size_doubt
+from slam.geometry.camera import PinholeCamera, floats, size_doubt
 from slam.geometry.se3 import Array, nearest_rotation
 
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
@@ -48,10 +48,7 @@ class StereoRig:
     def __post_init__(self) -> None:
         if not (isinstance(self.left, PinholeCamera) and isinstance(self.right, PinholeCamera)):
             raise CalibrationError("a stereo rig is made of two PinholeCamera")
-        try:
-            R, b = np.array(self.R, float), np.array(self.b, float).reshape(-1)
-        except (TypeError, ValueError, OverflowError):
-            raise CalibrationError("stereo extrinsics must be numbers") from None
+        R, b = floats("stereo extrinsics", self.R), floats("stereo extrinsics", self.b).reshape(-1)
         if R.shape != (3, 3) or b.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(b).all()):
             raise CalibrationError("stereo extrinsics must be a finite (3, 3) rotation and (3,) translation")
         if np.abs(R).max() > 1.1 or np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
@@ -148,15 +145,12 @@ class StereoRig:
         """
         if (T is None) == (baseline is None):
             raise CalibrationError("give either T or baseline: how far the cameras are apart")
-        left = PinholeCamera.from_matrix(K_left, D_left, size, fisheye)
-        right = left
+        left = right = PinholeCamera.from_matrix(K_left, D_left, size, fisheye)
         if K_right is not None or D_right is not None:
             right = PinholeCamera.from_matrix(K_left if K_right is None else K_right, D_right, size, fisheye)
-        try:
-            rotation = np.eye(3) if R is None else np.array(R, float)
-            offset = np.array([-baseline, 0.0, 0.0] if T is None else T, float).reshape(-1)  # type: ignore[operator]
-        except (TypeError, ValueError, OverflowError):
-            raise CalibrationError("stereo extrinsics must be numbers") from None
+        rotation = floats("stereo extrinsics", np.eye(3) if R is None else R)
+        offset = floats("stereo extrinsics", T if baseline is None else baseline).reshape(-1)
+        offset = offset * [-1.0, 0.0, 0.0] if T is None else offset
         if rotation.shape != (3, 3) or offset.shape != (3,):
             raise CalibrationError("stereo extrinsics must be a (3, 3) rotation and a (3,) translation")
         with np.errstate(all="ignore"):  # what is not finite is refused right away
@@ -215,7 +209,10 @@ class StereoRig:
         measurement. Rows of points behind a camera are NaN. With ``jacobian=False`` the Jacobian is empty.
         """
         if self.is_rectified:
-            return self._project_rectified(points, jacobian)
+            from slam.geometry.kernels import project_rectified
+
+            z, J = project_rectified(self.rectified_parameters, np.ascontiguousarray(points, float), jacobian)
+            return z, J
         left, J_left = self.left.project_with_jacobian(points, jacobian)
         right, J_right = self.right.project_with_jacobian((points + self.b) @ self.R.T, jacobian)
         z = np.concatenate([left, right[:, :1]], axis=1)
@@ -233,13 +230,6 @@ class StereoRig:
         a, c = self.left, self.right
         return np.array([a.fu, a.fv, a.u0, a.v0, c.fu, c.u0, self.b[0]])
 
-    def _project_rectified(self, points: Array, jacobian: bool) -> tuple[Array, Array]:
-        """`project_stereo` of a rectified rig."""
-        from slam.geometry.rig_kernels import project_rectified
-
-        z, J = project_rectified(self.rectified_parameters, np.ascontiguousarray(points, float), jacobian)
-        return z, J
-
     def triangulate(self, uv_left: Array, uv_right: Array) -> Array:
         """Points (N, 3) [m] in left-camera coordinates by paper A, Eqs. (8)-(9).
 
@@ -247,13 +237,11 @@ class StereoRig:
         parallel, whose depth comes out negative, or whose pixels are NaN are NaN.
         """
         if self.is_rectified:
-            from slam.geometry.rig_kernels import triangulate_rectified
+            from slam.geometry.kernels import triangulate_rectified
 
             left, right = np.ascontiguousarray(uv_left, float), np.ascontiguousarray(uv_right, float)
             return np.asarray(triangulate_rectified(self.rectified_parameters, left, right))
-        left = self.left.normalise(uv_left)
-        x_right = self.right.normalise(uv_right)[:, 0]
-        rays = np.concatenate([left, np.ones((len(left), 1))], axis=1)
+        rays, x_right = self.left.rays(uv_left), self.right.normalise(uv_right)[:, 0]
         d = self.R @ self.b  # Eq. (9b)
         k = rays @ self.R[0] - x_right * (rays @ self.R[2])  # Eq. (9a)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -324,38 +312,32 @@ class RectifiedRig:
 
     def rectify_left(self, uv: Array) -> Array:
         """Rectified left pixels (N, 2) of original left pixels (N, 2); the same array where the rig is rectified."""
-        return self._moved(self.original.left, self.rig.left, self.R_left, uv)
+        return self._along_rays(self.original.left, self.rig.left, self.R_left, uv)
 
     def rectify_right(self, uv: Array) -> Array:
         """Rectified right pixels (N, 2) of original right pixels (N, 2)."""
-        return self._moved(self.original.right, self.rig.right, self.R_right, uv)
+        return self._along_rays(self.original.right, self.rig.right, self.R_right, uv)
 
     def unrectify_left(self, uv: Array) -> Array:
         """Original left pixels (N, 2) of rectified left pixels (N, 2)."""
-        return self._moved(self.rig.left, self.original.left, self.R_left.T, uv)
+        return self._along_rays(self.rig.left, self.original.left, self.R_left.T, uv)
 
     def unrectify_right(self, uv: Array) -> Array:
         """Original right pixels (N, 2) of rectified right pixels (N, 2)."""
-        return self._moved(self.rig.right, self.original.right, self.R_right.T, uv)
+        return self._along_rays(self.rig.right, self.original.right, self.R_right.T, uv)
 
-    def _moved(self, source: PinholeCamera, target: PinholeCamera, R: Array, uv: Array) -> Array:
+    def _along_rays(self, source: PinholeCamera, target: PinholeCamera, R: Array, uv: Array) -> Array:
         """Pixels of `target` that look along the same rays as pixels of `source`, turned by R."""
-        if self.original is self.rig:
-            return uv
-        xy = source.normalise(uv)
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-        return target.project(rays @ R.T)
+        return uv if self.original is self.rig else target.project(source.rays(uv) @ R.T)
 
     @cached_property
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
         """Tables for ``cv2.remap``, left and right."""
         v, u = np.mgrid[: self.rig.height, : self.rig.width]
         grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
-        tables = []
-        for uv in (self.unrectify_left(grid), self.unrectify_right(grid)):
-            table = np.nan_to_num(uv, nan=-1.0).astype(np.float32).reshape(*u.shape, 2)
-            tables.append(np.ascontiguousarray(table))
-        return tables[0], tables[1]
+        pixels = self.unrectify_left(grid), self.unrectify_right(grid)
+        left, right = (np.nan_to_num(uv, nan=-1.0).astype(np.float32).reshape(*u.shape, 2) for uv in pixels)
+        return np.ascontiguousarray(left), np.ascontiguousarray(right)
 
 
 def rectify(rig: StereoRig) -> RectifiedRig:
@@ -366,36 +348,31 @@ def rectify(rig: StereoRig) -> RectifiedRig:
     """
     if rig.is_rectified:
         return RectifiedRig(rig, rig, np.eye(3), np.eye(3))
-    R_left, R_right, P_left, P_right = _stereo_rectify(rig)
-    f = float(P_left[0, 0])
-    if rig.left.model == "equidistant":
-        # A flat image cannot hold a fisheye's whole view: keep the middle at a useful resolution instead.
-        # 0.7: focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
-        f = max(f, 0.7 * rig.left.fu)
-        P_left[0, 2], P_left[1, 2] = (rig.width - 1) / 2, (rig.height - 1) / 2
-        P_right[0, 2] = P_left[0, 2]
-    if not (np.isfinite(P_left).all() and np.isfinite(P_right).all() and 0.05 * rig.left.fu < f < 20 * rig.left.fu):
-        doubt = size_doubt(rig.left, rig.right)
-        reason = doubt or "the two cameras share no usable view"
-        raise CalibrationError(f"stereo rig cannot be rectified: {reason}")
-    u0, v0, doffs = float(P_left[0, 2]), float(P_left[1, 2]), float(P_right[0, 2] - P_left[0, 2])
-    rectified_rig = StereoRig.rectified_pair(f, u0, v0, rig.baseline, rig.width, rig.height, doffs)
-    return RectifiedRig(rig, rectified_rig, R_left, R_right)
-
-
-def _stereo_rectify(rig: StereoRig) -> tuple[Array, Array, Array, Array]:
-    """Rotations and projection matrices of both rectified cameras, from OpenCV."""
     import cv2
 
-    a, c = rig.left, rig.right
-    size = (rig.width, rig.height)
-    D_left, D_right = np.array(a.distortion or (0.0,) * 4), np.array(c.distortion or (0.0,) * 4)
-    t = (rig.R @ rig.b).reshape(3, 1)
+    a, c, size, t = rig.left, rig.right, (rig.width, rig.height), (rig.R @ rig.b).reshape(3, 1)
     if "equidistant" in (a.model, c.model) and a.model != c.model:
         raise CalibrationError("one camera is a fisheye and the other is not: such a pair cannot be rectified")
+    fisheye = a.model == "equidistant"
+    D_left, D_right = (np.array(camera.distortion or (0.0,) * 4) for camera in (a, c))
+    stereo_rectify, options = (cv2.fisheye.stereoRectify, {}) if fisheye else (cv2.stereoRectify, {"alpha": 0})
     try:
-        if a.model == "equidistant":
-            return cv2.fisheye.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, _ZERO_DISPARITY)[:4]
-        return cv2.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, flags=_ZERO_DISPARITY, alpha=0)[:4]
+        R_left, R_right, P_left, P_right, *_ = stereo_rectify(
+            a.K, D_left, c.K, D_right, size, rig.R, t, flags=_ZERO_DISPARITY, **options
+        )
     except cv2.error as error:
         raise CalibrationError("stereo rig cannot be rectified") from error
+    f = float(P_left[0, 0])
+    if fisheye:
+        # A flat image cannot hold a fisheye's whole view: keep the middle at a useful resolution instead.
+        # 0.7: focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
+        f = max(f, 0.7 * a.fu)
+        P_left[0, 2], P_left[1, 2] = (rig.width - 1) / 2, (rig.height - 1) / 2
+        P_right[0, 2] = P_left[0, 2]
+    if not (np.isfinite(P_left).all() and np.isfinite(P_right).all() and 0.05 * a.fu < f < 20 * a.fu):
+        reason = size_doubt(a, c) or "the two cameras share no usable view"
+        raise CalibrationError(f"stereo rig cannot be rectified: {reason}")
+    u0, v0, doffs = float(P_left[0, 2]), float(P_left[1, 2]), float(P_right[0, 2] - P_left[0, 2])
+    return RectifiedRig(
+        rig, StereoRig.rectified_pair(f, u0, v0, rig.baseline, rig.width, rig.height, doffs), R_left, R_right
+    )

@@ -5,13 +5,15 @@ A tangent vector of SE(3) is ``[rotation (3), translation (3)]`` in radians and 
 ``T ← T exp(ξ)``; so do all pose covariances in this package. Functions accept leading batch dimensions where the
 docstring says (..., 3).
 
-A single rotation or pose is worked out in Python's floats, which takes a tenth of the time that NumPy needs for as many
+Each rotation or pose is worked out in Python's floats, which takes a tenth of the time that NumPy needs for as many
 operations on arrays of three numbers.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -38,77 +40,33 @@ def hat(w: Array) -> Array:
     return out
 
 
-def _coefficients(theta: Array) -> tuple[Array, Array, Array]:
-    """``sin θ/θ``, ``(1 − cos θ)/θ²`` and ``(θ − sin θ)/θ³``, accurate down to θ = 0."""
-    small = theta < _SMALL
-    t = np.where(small, 1.0, theta)
-    t2 = theta**2
-    a = np.where(small, 1 - t2 / 6, np.sin(t) / t)
-    b = np.where(small, 0.5 - t2 / 24, 2 * np.sin(t / 2) ** 2 / t**2)
-    c = np.where(theta < _SMALL_CUBIC, 1 / 6 - t2 / 120 + t2**2 / 5040, (t - np.sin(t)) / t**3)
-    return a, b, c
+def _each(function: Callable[[Any], Any], values: Array, shape: tuple[int, ...], result: tuple[int, ...]) -> Array:
+    """A function of lists, of one value of some shape after the other."""
+    values = np.asarray(values, float)
+    if values.shape == shape:
+        return np.array(function(values.tolist()))
+    batch = values.shape[: values.ndim - len(shape)]
+    return np.array([function(value) for value in values.reshape(-1, *shape).tolist()]).reshape(*batch, *result)
 
 
 def so3_exp(w: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues)."""
-    w = np.asarray(w, float)
-    if w.ndim == 1:
-        return np.array(_polynomial(w.tolist(), *_coefficients_of_one(w.tolist())[:2]))
-    a, b, _ = _coefficients(np.linalg.norm(w, axis=-1))
-    W = hat(w)
-    return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
+    return _each(lambda one: _polynomial(one, *_coefficients(one)[:2]), w, (3,), (3, 3))
 
 
 def so3_log(R: Array) -> Array:
     """Rotation vectors (..., 3) [rad], angle in [0, π], of rotation matrices (..., 3, 3)."""
-    R = np.asarray(R, float)
-    if R.ndim == 2:
-        return np.array(_rotation_vector(R.tolist()))
-    q = quaternion(R)
-    vector, scalar = q[..., :3], q[..., 3]
-    sine = np.linalg.norm(vector, axis=-1)
-    small = sine < _SMALL
-    factor = np.where(small, 2.0 + sine**2 / 3, 2 * np.arctan2(sine, scalar) / np.where(small, 1.0, sine))
-    return factor[..., None] * vector
+    return _each(_rotation_vector, R, (3, 3), (3,))
 
 
 def so3_left_jacobian(w: Array) -> Array:
     """Left Jacobian (..., 3, 3) of SO(3): ``exp(w + δ) ≈ exp(J δ) exp(w)``."""
-    w = np.asarray(w, float)
-    if w.ndim == 1:
-        return np.array(_polynomial(w.tolist(), *_coefficients_of_one(w.tolist())[1:]))
-    _, b, c = _coefficients(np.linalg.norm(w, axis=-1))
-    W = hat(w)
-    return np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
+    return _each(lambda one: _polynomial(one, *_coefficients(one)[1:]), w, (3,), (3, 3))
 
 
 def quaternion(R: Array) -> Array:
     """Unit quaternions (..., 4) as (x, y, z, w), w ≥ 0, of rotation matrices (..., 3, 3)."""
-    R = np.asarray(R, float)
-    if R.ndim == 2:
-        return np.array(_quaternion_of_one(R.tolist()))
-    m = R.reshape(-1, 3, 3)
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    # The largest of x², y², z², w² is found first: dividing by it never loses accuracy.
-    choice = np.argmax(np.stack([m[:, 0, 0], m[:, 1, 1], m[:, 2, 2], trace], axis=1), axis=1)
-    q = np.empty((len(m), 4))
-    for i in range(3):
-        rows = choice == i
-        j, k = (i + 1) % 3, (i + 2) % 3
-        r = m[rows]
-        q[rows, i] = 1 + r[:, i, i] - r[:, j, j] - r[:, k, k]
-        q[rows, j] = r[:, j, i] + r[:, i, j]
-        q[rows, k] = r[:, k, i] + r[:, i, k]
-        q[rows, 3] = r[:, k, j] - r[:, j, k]
-    rows = choice == 3
-    r = m[rows]
-    q[rows, 0] = r[:, 2, 1] - r[:, 1, 2]
-    q[rows, 1] = r[:, 0, 2] - r[:, 2, 0]
-    q[rows, 2] = r[:, 1, 0] - r[:, 0, 1]
-    q[rows, 3] = 1 + trace[rows]
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    q[q[:, 3] < 0] *= -1
-    return q.reshape(*R.shape[:-2], 4)
+    return _each(_quaternion, R, (3, 3), (4,))
 
 
 def rotation_from_quaternion(q: Array) -> Array:
@@ -120,9 +78,9 @@ def rotation_from_quaternion(q: Array) -> Array:
 
 
 def nearest_rotation(M: Array) -> Array:
-    """The rotation (3, 3) nearest to a matrix in the Frobenius norm (polar decomposition)."""
+    """The rotation (D, D), D = 2 or 3, nearest to a matrix in the Frobenius norm (polar decomposition)."""
     U, _, Vt = np.linalg.svd(M)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return np.asarray(U @ np.diag([*np.ones(len(M) - 1), np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def pose(R: Array, t: Array) -> Array:
@@ -154,24 +112,12 @@ def transform(T: Array, points: Array) -> Array:
 
 def exp(xi: Array) -> Array:
     """Poses (..., 4, 4) of tangent vectors (..., 6) = [rotation, translation]."""
-    xi = np.asarray(xi, float)
-    if xi.ndim == 1:
-        return np.array(_exp_of_one(*xi.tolist()))
-    a, b, c = (x[..., None, None] for x in _coefficients(np.linalg.norm(xi[..., :3], axis=-1)))
-    W = hat(xi[..., :3])
-    W2 = W @ W
-    R, V = np.eye(3) + a * W + b * W2, np.eye(3) + b * W + c * W2
-    return pose(R, (V @ xi[..., 3:, None])[..., 0])
+    return _each(_exp, xi, (6,), (4, 4))
 
 
 def log(T: Array) -> Array:
     """Tangent vectors (..., 6) = [rotation, translation] of poses (..., 4, 4)."""
-    T = np.asarray(T, float)
-    if T.ndim == 2:
-        return np.array(_log_of_one(T.tolist()))
-    w = so3_log(T[..., :3, :3])
-    t = np.linalg.solve(so3_left_jacobian(w), T[..., :3, 3, None])[..., 0]
-    return np.concatenate([w, t], axis=-1)
+    return _each(_log, T, (4, 4), (6,))
 
 
 def adjoint(T: Array) -> Array:
@@ -195,11 +141,11 @@ def rotation_angle(R: Array) -> Array:
     return np.linalg.norm(so3_log(R), axis=-1)
 
 
-# --- one rotation or pose, in Python's floats ---
+# --- one rotation or pose ---
 
 
-def _coefficients_of_one(w: list[float]) -> tuple[float, float, float]:
-    """`_coefficients` of one rotation vector; NaN where it is not finite."""
+def _coefficients(w: list[float]) -> tuple[float, float, float]:
+    """``sin θ/θ``, ``(1 − cos θ)/θ²`` and ``(θ − sin θ)/θ³`` of a rotation vector, NaN where it is not finite."""
     theta = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     if not math.isfinite(theta):
         return math.nan, math.nan, math.nan
@@ -220,7 +166,7 @@ def _polynomial(w: list[float], a: float, b: float) -> list[list[float]]:
     return [[1 - yy - zz, xy - az, xz + ay], [xy + az, 1 - xx - zz, yz - ax], [xz - ay, yz + ax, 1 - xx - yy]]
 
 
-def _quaternion_of_one(R: list[list[float]]) -> tuple[float, float, float, float]:
+def _quaternion(R: list[list[float]]) -> tuple[float, float, float, float]:
     """`quaternion` of one rotation."""
     (a, b, c), (d, e, f), (g, h, i) = R
     trace = a + e + i
@@ -241,16 +187,16 @@ def _quaternion_of_one(R: list[list[float]]) -> tuple[float, float, float, float
 
 def _rotation_vector(R: list[list[float]]) -> tuple[float, float, float]:
     """`so3_log` of one rotation."""
-    x, y, z, w = _quaternion_of_one(R)
+    x, y, z, w = _quaternion(R)
     sine2 = x * x + y * y + z * z
     sine = math.sqrt(sine2)
     factor = 2.0 + sine2 / 3 if sine < _SMALL else 2 * math.atan2(sine, w) / sine
     return factor * x, factor * y, factor * z
 
 
-def _exp_of_one(x: float, y: float, z: float, u: float, v: float, w: float) -> list[list[float]]:
-    """`exp` of one twist: rotation vector [x, y, z], translation [u, v, w]."""
-    a, b, c = _coefficients_of_one([x, y, z])
+def _exp(xi: list[float]) -> list[list[float]]:
+    x, y, z, u, v, w = xi
+    a, b, c = _coefficients([x, y, z])
     first, second, third = _polynomial([x, y, z], a, b)
     along, t2 = x * u + y * v + z * w, x * x + y * y + z * z
     first.append(u + b * (y * w - z * v) + c * (x * along - u * t2))
@@ -259,8 +205,8 @@ def _exp_of_one(x: float, y: float, z: float, u: float, v: float, w: float) -> l
     return [first, second, third, [0.0, 0.0, 0.0, 1.0]]
 
 
-def _log_of_one(T: list[list[float]]) -> tuple[float, float, float, float, float, float]:
-    """`log` of one pose; the inverse of the left Jacobian is ``1 − W/2 + k W²``."""
+def _log(T: list[list[float]]) -> tuple[float, float, float, float, float, float]:
+    """The inverse of the left Jacobian is ``1 − W/2 + k W²``."""
     x, y, z = _rotation_vector([row[:3] for row in T[:3]])
     u, v, w = T[0][3], T[1][3], T[2][3]
     t2 = x * x + y * y + z * z

@@ -13,7 +13,7 @@ import numpy as np
 from slam.errors import TrajectoryError
 from slam.files import read_text, write_text
 from slam.geometry.se3 import Array, pose, quaternion, rotation_from_quaternion
-from slam.showing import count, widest
+from slam.naming import count, widest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -40,7 +40,8 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
     stamp, threshold = _number("stamp", features.stamp), _number("threshold", features.threshold)
     if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP:
         raise MeasurementError(f"features: the stamp must be finite and within {LATEST_STAMP:g} s, got {stamp}")
-    columns: dict[str, Any] = {name: _column(name, getattr(features, name), len(features)) for name in _COLUMNS}
+    rows = len(features) if isinstance(features.uv_left, np.ndarray) and features.uv_left.ndim else 0
+    columns: dict[str, Any] = {name: _column(name, getattr(features, name), rows) for name in _COLUMNS}
     size = np.array([rig.width, rig.height])
     for name in ("uv_left", "uv_right"):
         if ((columns[name] < -size) | (columns[name] > 2 * size)).any():  # NaN compares false

@@ -23,33 +23,28 @@ def offsets(camera, x, y, depth):
 
 
 @helper
-def residual(camera, R_left, local, measured, r, J):
+def residual(camera, local, measured, r, J):
     """Measured less predicted r (3,), and derivatives J (3, 3) of the prediction by the point; whether it is in front.
 
-    ``J = Π R_left`` with the rows ``Π = [fu/z, 0, −(uL − u0)/z], [0, fv/z, −(vL − v0)/z], [f'/z, 0, −(uR − u0')/z]``.
+    J has the rows ``[fu/z, 0, −(uL − u0)/z], [0, fv/z, −(vL − v0)/z], [f'/z, 0, −(uR − u0')/z]``.
     A component that is not measured is NaN in r. Behind the camera all r are NaN, and J is zero.
 
     Args:
         camera: see the module.
-        R_left: rotation (3, 3) from left-camera to rectified axes.
         local: the point (3,) in left-camera coordinates.
-        measured: (3,) rectified pixels.
+        measured: (3,) pixels.
         r: filled in.
         J: filled in.
     """
-    x, y, depth = row_times(R_left, 0, local), row_times(R_left, 1, local), row_times(R_left, 2, local)
-    left, row, right, inverse = offsets(camera, x, y, depth)
-    front = depth > NEAREST
+    left, row, right, inverse = offsets(camera, local[0], local[1], local[2])
+    front = local[2] > NEAREST
     r[0], r[1] = measured[0] - (left + camera[2]), measured[1] - (row + camera[3])
     r[2] = measured[2] - (right + camera[5])
     if not front:
         inverse = left = row = right = 0.0
-    u, v, w = camera[0] * inverse, camera[1] * inverse, camera[4] * inverse
-    for k in range(3):
-        bend = inverse * R_left[2, k]
-        J[0, k] = u * R_left[0, k] - left * bend
-        J[1, k] = v * R_left[1, k] - row * bend
-        J[2, k] = w * R_left[0, k] - right * bend
+    J[0, 0], J[1, 1], J[2, 0] = camera[0] * inverse, camera[1] * inverse, camera[4] * inverse
+    J[0, 1] = J[1, 0] = J[2, 1] = 0.0
+    J[0, 2], J[1, 2], J[2, 2] = -left * inverse, -row * inverse, -right * inverse
     return front
 
 

@@ -28,7 +28,7 @@ from slam.geometry.se3 import Array, nearest_rotation
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import Keyframe, Loop
 from slam.mapping.known_landmarks import definite, require_known
-from slam.showing import count
+from slam.naming import count
 from slam.tracks.table import LandmarkTable
 from slam.version import __version__
 

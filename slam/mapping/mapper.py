@@ -88,12 +88,16 @@ class Mapper:
 
         They are in the present camera's coordinates, and keep the ids that they had. If the back end still holds such a
         landmark, at its old, drifted position, that one is erased first. Features that are landmarks of the map
-        already, or that move, are left out.
+        already, or that move, are left out; so are, where the map has no room for all, those least certain.
         """
         if not isinstance(backend, MapBackend):
             return step
         taken = np.concatenate([step.matches.rows, step.added.rows, step.withheld.rows, step.labels.moving])
         free = np.flatnonzero(~np.isin(place.rows, taken) & in_front(place.positions))
+        there = isin(place.landmarks.ids[free], step.landmarks.ids)
+        room = int(there.sum()) + max(self.config.max_landmarks - len(step.landmarks), 0)
+        variance = np.where(there, -1.0, np.trace(place.covariances[free], axis1=1, axis2=2))
+        free = np.sort(free[np.argsort(variance, kind="stable")[:room]])
         if not len(free):
             return step
         ids, rows = self._named(place.landmarks.ids[free]), place.rows[free]
@@ -141,7 +145,7 @@ class Mapper:
     def _count(self, landmarks: LandmarkTable, view: MapView, step: Step) -> LandmarkTable:
         """Count landmarks as seen or missed, unless the frame's pose was not measured."""
         m, matches = self.config, step.matches
-        measured = isin(matches.ids, np.concatenate([step.report.used, step.left_out]))
+        measured = isin(matches.ids, step.report.used)
         expected = landmarks.ids[:0]
         if not step.tracking.unmatched:
             size = (self.rig.width, self.rig.height)
@@ -196,6 +200,8 @@ class Mapper:
         local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
         P = frame_covariance(self.rig, local, stereo, self._localizer.pixel_sigma)
         rows, local, covariances = monocular.step(features, rows, T, P, step.index)
+        front = in_front(local)
+        rows, local, covariances = rows[front], local[front], covariances[front]
         wanted = max(self.config.target_in_view - len(matches) - len(added), 0)
         best = np.sort(np.argsort(-features.response[rows], kind="stable")[:wanted])
         if not len(best):

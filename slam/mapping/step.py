@@ -36,8 +36,6 @@ class Step:
     suspects: IdArray = field(default_factory=_NONE.copy)  # ids of landmarks that may move
     # those of them that were matched; they are withheld from the back end's update
     withheld: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
-    # ids of matched landmarks left out of the update, because others are more informative
-    left_out: IdArray = field(default_factory=_NONE.copy)
     report: UpdateReport = field(default_factory=lambda: UpdateReport.nothing(UpdateStatus.EMPTY, ""))  # of the update
     estimate: Estimate = _NOWHERE  # the camera's pose after the update
     labels: MotionLabels = field(default_factory=lambda: MotionLabels(_NONE, _NONE, _NONE))  # which features move
@@ -45,6 +43,7 @@ class Step:
     added: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)  # landmarks that joined the map
     # landmarks of a revisited place that rejoined the map, and the features that show them now
     returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+    joined: IdArray = field(default_factory=_NONE.copy)  # ids of those of a place at which another back end took over
     erased: IdArray = field(default_factory=_NONE.copy)  # ids of the landmarks that left the map
     # the part of the pose's error that other frames share; included in the covariance of `estimate`
     common: CommonError = field(default_factory=CommonError)

@@ -8,8 +8,8 @@ import numpy as np
 
 from slam.data import BoolArray, IdArray, RecentPoses
 from slam.geometry.se3 import Array
+from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
-from slam.object_models import ObjectModels
 from slam.window.marginal import marginalised
 from slam.window.problem import Carried, Places, RelativePrior, Rows, Window
 from slam.window.stereo import RectifiedStereo

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
-from slam.object_models import ObjectModels
+from slam.models import ObjectModels
 from slam.objects.belief import BodyBelief
 from slam.objects.existence import EVEN, when_measured, when_missed
 from slam.objects.track_kernels import windows_in_body

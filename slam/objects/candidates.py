@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
-from slam.geometry.gauss_kernels import near_pairs, squared_distances
+from slam.geometry.kernels import near_pairs, squared_distances
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array
 from slam.objects.points import MIN_POINTS

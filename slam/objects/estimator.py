@@ -73,16 +73,16 @@ class BodyEstimator:
     """Estimates bodies one by one; all that is known of one is its `BodyBelief`.
 
     Args:
-        rig: the cameras; measurements of any rig are rectified first.
+        rig: the cameras, rectified.
         models: pixel noise, gate, and how bodies move.
     """
 
     def __init__(self, rig: StereoRig, models: EstimatorModels) -> None:
         self.stereo = RectifiedStereo.of(rig)
-        self.sigma = models.pixel_sigma * self.stereo.scale
+        self.sigma = models.pixel_sigma
         self.models = models.objects
         self.gate = models.gate_probability
-        self.drift = self.models.drift * self.stereo.scale / self.stereo.f
+        self.drift = self.models.drift / self.stereo.f
 
     def updated(
         self, belief: BodyBelief | None, id: int, seen: ObjectObservations | None, cameras: RecentPoses
@@ -224,7 +224,7 @@ class BodyEstimator:
             local, _ = solution.point_covariances(len(b) - 1)
             w = solution.window
             distances = kernels.left_out_distances(
-                self.stereo.intrinsics, self.stereo.R_left, w.poses[-1], w.points[rows[used]], z[used],
+                self.stereo.intrinsics, w.poses[-1], w.points[rows[used]], z[used],
                 local[rows[used]], self.sigma, 0.0,
             )  # fmt: skip
             excess = distances / limits[used]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, points_by_pose
-from slam.object_models import ObjectModels
+from slam.models import ObjectModels
 from slam.objects import membership
 from slam.objects.bodies import Body, new_body
 from slam.objects.candidates import region_radius

@@ -44,14 +44,11 @@ def revise_tracks(
 
 def _shifts(points: Array, T_world_left: Array, rig: StereoRig, correct: CorrectRows) -> Array:
     """By what points (N, 3) seen from poses (N, 4, 4) move, in world coordinates (N, 3); not at all out of view."""
-    rectified = rig.rectified
-    T = T_world_left @ rectified.T_left_rectified
-    R = T[:, :3, :3]
-    z, J = rectified.rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T[:, :3, 3]))
+    R = T_world_left[:, :3, :3]
+    z, J = rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T_world_left[:, :3, 3]))
     shifts = np.zeros_like(points)
-    left = rectified.rig.left
-    seen = np.isfinite(z).all(axis=1) & left.in_image(z[:, :2])
-    good = np.flatnonzero(seen & (np.abs(z[:, 0] - z[:, 2]) < left.width))
+    seen = np.isfinite(z).all(axis=1) & rig.left.in_image(z[:, :2])
+    good = np.flatnonzero(seen & (np.abs(z[:, 0] - z[:, 2]) < rig.width))
     change = correct(z[good]) - z[good]
     finite = np.isfinite(change).all(axis=1)
     good, change = good[finite], change[finite]

@@ -27,8 +27,7 @@ from slam.files import read_bytes, whole_file
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.models import EstimatorModels, MotionModel, models_for
-from slam.object_models import ObjectModels
+from slam.models import EstimatorModels, MotionModel, ObjectModels, models_for
 from slam.run.recorded import RecordedFrame, Recording
 
 _FORMAT = "surf-stereo-slam recording"

@@ -17,9 +17,9 @@ from slam.geometry.rig import StereoRig, quarter_turn
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.naming import sequence_line
 from slam.sequences.faults import FaultLog
 from slam.sequences.images import read_image, recorded_size, size_text
-from slam.showing import sequence_line
 
 
 @runtime_checkable

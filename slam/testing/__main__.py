@@ -15,21 +15,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser("python -m slam.testing", description="How far a back end keeps the contract.")
     parser.add_argument("backend", help="name of a registered back end, or my_package.my_module:MyBackend")
     parser.add_argument("--tier", choices=list(TIERS), default="good", help="the last tier to check (default: good)")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        factory = registry.resolve("backends", given.backend)
+        factory = registry.resolve("backends", options.backend)
     except SlamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     tier, failures = "", 0
-    for found in findings(factory, given.tier):
-        if found.tier != tier:
-            tier = found.tier
+    for finding in findings(factory, options.tier):
+        if finding.tier != tier:
+            tier = finding.tier
             print(tier)
-        print(f"  {'fails ' if found.failure else 'passes'}  {found.check}")
-        if found.failure:
+        print(f"  {'fails ' if finding.failure else 'passes'}  {finding.check}")
+        if finding.failure:
             failures += 1
-            print(f"          {found.failure}.\n          Asked for: {found.demand}")
+            print(f"          {finding.failure}.\n          Asked for: {finding.demand}")
     print(f"{failures} failed" if failures else "all passed")
     return int(failures > 0)
 

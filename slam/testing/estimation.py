@@ -11,13 +11,11 @@ from slam.geometry import se3
 from slam.models import MotionModel
 from slam.testing.scene import (
     DT,
-    GENERAL_RIG,
     MODELS,
     RIG,
     SIGMA,
     Factory,
     Run,
-    Scene,
     all_but_the_last,
     assert_covariance,
     assert_near,
@@ -35,37 +33,29 @@ _OFTEN = 15  # measurements of a landmark
 def new_landmarks_are_triangulated(factory: Factory) -> None:
     """A landmark's first position and covariance are the stereo pair's."""
     backend, seen = started(factory)
-    found = backend.estimate()
-    require_same(found.ids, seen.ids, "ids of the landmarks that were added")
+    estimate = backend.estimate()
+    require_same(estimate.ids, seen.ids, "ids of the landmarks that were added")
     h = RIG.triangulate(seen.uv_left, seen.uv_right)
-    require_same(found.positions, h, "positions of landmarks seen once, against the stereo pair's", 0.02)
+    require_same(estimate.positions, h, "positions of landmarks seen once, against the stereo pair's", 0.02)
     expected = RIG.triangulation_covariance(h, SIGMA)
-    ratio = np.trace(found.covariances, axis1=1, axis2=2) / np.trace(expected, axis1=1, axis2=2)
+    ratio = np.trace(estimate.covariances, axis1=1, axis2=2) / np.trace(expected, axis1=1, axis2=2)
     middle = float(np.median(ratio))
     require(abs(middle - 1) < 0.2, f"variances of landmarks seen once are {middle:.3g} times those of the stereo pair")
 
 
 def follows_the_camera(factory: Factory) -> None:
     """Tracks a noisy scene: pose and landmarks near the truth, within what the covariances say."""
-    _follows(factory, make_scene())
-
-
-def follows_with_a_general_rig(factory: Factory) -> None:
-    """The same with an unrectified, distorted rig, in its own pixels."""
-    _follows(factory, make_scene(rig=GENERAL_RIG))
-
-
-def _follows(factory: Factory, scene: Scene) -> None:
+    scene = make_scene()
     run, reports = tracked(factory, scene)
-    found = run.backend.estimate()
-    assert_near(found.T_world_left, scene.poses[-1], "pose after the scene")
-    assert_covariance(found.covariance, (6, 6), "pose")
-    error = se3.log(se3.inverse(found.T_world_left) @ scene.poses[-1])
-    nees = float(error @ np.linalg.solve(found.covariance, error))
+    estimate = run.backend.estimate()
+    assert_near(estimate.T_world_left, scene.poses[-1], "pose after the scene")
+    assert_covariance(estimate.covariance, (6, 6), "pose")
+    error = se3.log(se3.inverse(estimate.T_world_left) @ scene.poses[-1])
+    nees = float(error @ np.linalg.solve(estimate.covariance, error))
     require(nees < 60, f"the pose's covariance is far too small: its NEES is {nees:.3g}, 6 expected")  # χ²₆: 1e-10
-    assert_covariance(found.covariances, (len(found.ids), 3, 3), "landmarks")
-    off = found.positions - scene.points[found.ids]
-    squared = np.einsum("ni,ni->n", off, np.linalg.solve(found.covariances, off[:, :, None])[:, :, 0])
+    assert_covariance(estimate.covariances, (len(estimate.ids), 3, 3), "landmarks")
+    off = estimate.positions - scene.points[estimate.ids]
+    squared = np.einsum("ni,ni->n", off, np.linalg.solve(estimate.covariances, off[:, :, None])[:, :, 0])
     middle = float(np.median(squared))
     require(middle < 12, f"covariances of landmarks are far too small: their median NEES is {middle:.3g}, 2.4 expected")
     for report, seen in zip(reports[1:], scene.frames[1:]):
@@ -89,15 +79,15 @@ def _is_in_order(report: UpdateReport, seen: Observations) -> None:
 def landmarks_are_corrected(factory: Factory) -> None:
     """Landmarks seen many times are known better than at their first sight, and the covariances say so."""
     scene = make_scene(25)
-    found = tracked(factory, scene)[0].backend.estimate()
+    estimate = tracked(factory, scene)[0].backend.estimate()
     ids, times = np.unique(np.concatenate([seen.ids for seen in scene.frames]), return_counts=True)
     often = np.intersect1d(scene.frames[0].ids, ids[times >= _OFTEN])  # first seen from the origin: no error of a pose
-    rows = np.searchsorted(found.ids, often)
+    rows = np.searchsorted(estimate.ids, often)
     first = RIG.triangulation_covariance(scene.points[often], SIGMA)
-    off = (found.positions[rows] - scene.points[often])[:, :, None]
+    off = (estimate.positions[rows] - scene.points[often])[:, :, None]
     left = float((np.swapaxes(off, 1, 2) @ np.linalg.solve(first, off)).mean()) / 3
     require(left < 0.4, f"squared errors of landmarks seen {_OFTEN} times are {left:.3g} of those at their first sight")
-    share = float(np.median(np.trace(found.covariances[rows], axis1=1, axis2=2) / np.trace(first, axis1=1, axis2=2)))
+    share = float(np.median(np.trace(estimate.covariances[rows], axis1=1, axis2=2) / np.trace(first, axis1=1, axis2=2)))
     require(share < 0.5, f"variances of landmarks seen {_OFTEN} times are {share:.3g} of those at their first sight")
 
 

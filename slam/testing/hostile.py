@@ -1,18 +1,31 @@
-"""Checks with calls that nobody should make: queries at every step, updates out of turn, and generated sequences."""
+"""Checks with calls that nobody should make: queries at every step, wrong rows, and generated sequences of calls."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import replace
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from slam.data import Estimate, IdArray, Observations, UpdateReport, UpdateStatus
+from slam.data import Estimate, IdArray, Observations, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
-from slam.testing.scene import DT, MODELS, RIG, Factory, Run, make_scene, raises, require, require_same, require_status
+from slam.testing.scene import (
+    DT,
+    MODELS,
+    RIG,
+    Factory,
+    Run,
+    cloud,
+    make_scene,
+    point,
+    require,
+    require_equal,
+    require_same,
+    require_status,
+)  # fmt: skip
 
 _SEQUENCES, _CALLS = 4, 60
 _SIZE = 6  # landmarks in one call
@@ -27,23 +40,22 @@ def queries_are_pure(factory: Factory) -> None:
     """Of two twins one is asked for everything at every step, the other never: they go on to the same bytes."""
     scene, dark = make_scene(14), (5, 6, 11)
     asked, silent = Run(factory), Run(factory)
+    other = "of a back end that was asked before, against one that was not"
     for k, seen in enumerate(scene.frames):
         seen = seen.select(np.zeros(0, np.intp)) if k in dark else seen
-        for run in (asked, silent):
-            prediction, report = run.step(k, seen, between=_ask if run is asked else None)
-            if k == 8:
-                gone = seen.ids[:4]
-                run.backend.remove(gone)
-                run.known -= set(gone.tolist())
-            if run is asked:
-                _ask(run.backend)
-                first = prediction, report
-        for what, a, b in zip(("prediction", "report"), first, (prediction, report)):
-            _require_equal(a, b, f"{what} of frame {k} of a back end that was asked before, against one that was not")
-        a, b = (run.backend.estimate(landmarks=False) for run in (asked, silent)) if k in dark else (None, None)
-        _require_equal(a, b, f"pose of frame {k} of a back end that was asked before, against one that was not")
-    _require_equal(asked.backend.trajectory(), silent.backend.trajectory(), "path of a back end that was asked before")
-    _require_equal(asked.backend.estimate(), silent.backend.estimate(), "estimate of a back end that was asked before")
+        answers = [run.step(k, seen, between=_ask if run is asked else None) for run in (asked, silent)]
+        if k == 8:
+            for run in (asked, silent):
+                run.backend.remove(seen.ids[:4])
+                run.in_backend -= set(seen.ids[:4].tolist())
+        _ask(asked.backend)
+        for what, a, b in zip(("prediction", "report"), *answers):
+            require_equal(a, b, f"{what} of frame {k} {other}")
+        if k in dark:
+            a, b = (run.backend.estimate(landmarks=False) for run in (asked, silent))
+            require_equal(a, b, f"pose of frame {k} {other}")
+    require_equal(asked.backend.trajectory(), silent.backend.trajectory(), f"path {other}")
+    require_equal(asked.backend.estimate(), silent.backend.estimate(), f"estimate {other}")
 
 
 def _ask(backend: Backend) -> None:
@@ -54,37 +66,6 @@ def _ask(backend: Backend) -> None:
         backend.trajectory()
         if hasattr(backend, "recent"):
             backend.recent(4)
-
-
-def _require_equal(found: Any, expected: Any, what: str) -> None:
-    """Fail unless two results have the same attributes, to the last bit."""
-    if found is None:
-        return
-    for name, value in vars(expected).items():
-        a, b = np.asarray(getattr(found, name)), np.asarray(value)
-        same = a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-        require(same, f"{what}: {name} differs")
-
-
-def a_stamp_has_one_update(factory: Factory) -> None:
-    """A second update of a stamp is refused, whatever came of the first; so is one after an add."""
-    scene, run = make_scene(4), Run(factory)
-    run.step(0, scene.frames[0])
-    seen = scene.frames[1].select(run.in_map(scene.frames[1]))
-    old, new = seen.select(np.arange(len(seen) - 3)), seen.select(np.arange(len(seen) - 3, len(seen)))
-    backend = run.backend
-    backend.remove(new.ids)
-    raises(MeasurementError, backend.update, old, what="an update of the first stamp after an add")
-    for k, (first, status) in enumerate([(old, UpdateStatus.OK), (Observations.empty(), UpdateStatus.EMPTY)]):
-        backend.predict(DT * (k + 1))
-        require_status(backend.update(first), status, "the first update of a stamp")
-        before = backend.estimate()
-        for again in (old, Observations.empty()):
-            raises(MeasurementError, backend.update, again, what="a second update of a stamp")
-        _require_equal(backend.estimate(), before, "estimate after a second update, which was refused")
-    backend.predict(DT * 3)
-    backend.add(new)
-    raises(MeasurementError, backend.update, old, what="an update after an add at the same stamp")
 
 
 def rows_that_no_point_explains_are_rejected(factory: Factory) -> None:
@@ -99,22 +80,8 @@ def rows_that_no_point_explains_are_rejected(factory: Factory) -> None:
     run.backend.predict(5 * DT)
     report = run.backend.update(replace(seen, uv_left=left, uv_right=right))
     require_status(report, UpdateStatus.OK, "an update with two wrong rows")
-    wrong = seen.ids[[1, 2]]
-    require(np.isin(wrong, report.rejected).all(), "a row that no point explains was not rejected")
+    require(np.isin(seen.ids[[1, 2]], report.rejected).all(), "a row that no point explains was not rejected")
     assert_sound(run.backend.estimate(), "after an update with two wrong rows")
-
-
-def landmarks_are_placed_in_front(factory: Factory) -> None:
-    """`place` refuses landmarks behind the camera; a back end without it has nothing to refuse."""
-    backend: Any = factory(RIG, models=MODELS)
-    if not hasattr(backend, "place"):
-        return
-    raises(MeasurementError, backend.place, *_cloud([7], [[0.0, 0.0, 5.0]]), what="place before the first predict")
-    backend.predict(0.0)
-    for depth in (-5.0, 0.0, float("nan")):
-        raises(MeasurementError, backend.place, *_cloud([7], [[0.0, 0.0, depth]]), what=f"place at a depth of {depth}")
-    backend.place(*_cloud([7], [[0.0, 0.0, 5.0]]))
-    assert_sound(backend.estimate(), "after a landmark was placed")
 
 
 def hostile_calls_have_one_meaning(factory: Factory) -> None:
@@ -131,27 +98,32 @@ def play(factory: Factory, seed: int, calls: int = _CALLS) -> None:
     """
     life = _Life(factory(RIG, models=MODELS), np.random.default_rng(seed))
     for number in range(calls):
-        what, refused, make, then = life.next()
-        where = f"sequence {seed}, call {number}, {what}"
+        call = life.next()
+        where = f"sequence {seed}, call {number}, {call.what}"
         try:
-            answer = make()
+            answer = call.make()
         except MeasurementError as error:
-            require(refused, f"{where}: was refused ({error})")
+            require(call.refused, f"{where}: was refused ({error})")
         except Exception as error:  # noqa: BLE001 - what somebody else's back end raises is the finding
             require(False, f"{where}: raised {type(error).__name__}: {error}")
         else:
-            require(not refused, f"{where}: was accepted, MeasurementError is expected")
-            then()
-            life.check(where, answer)
+            require(not call.refused, f"{where}: was accepted, MeasurementError is expected")
+            life.after(call)
+            life.check(where, call, answer)
 
 
-class _Call(NamedTuple):
-    """A call to make."""
+@dataclass(frozen=True)
+class _Call:
+    """A call to make, and what the interface says has changed where it is taken."""
 
     what: str  # its description
     refused: bool  # whether it must be refused
     make: Callable[[], Any]
-    then: Callable[[], None]  # what the interface says has changed, where it is taken
+    added: tuple[int, ...] = ()  # ids of landmarks
+    removed: tuple[int, ...] = ()
+    stamp: float | None = None  # to which it advances
+    measured: bool | None = None  # whether the stamp has no update any more; None for as before
+    empty: bool = False  # whether it is an update without rows
 
 
 class _Life:
@@ -170,21 +142,28 @@ class _Life:
         kinds += [self._revise] if hasattr(self.backend, "revise") else []
         return kinds[self.rng.integers(len(kinds))]()
 
-    def check(self, where: str, answer: Any) -> None:
+    def after(self, call: _Call) -> None:
+        """Keep count of a call that was taken."""
+        self.stamps += [] if call.stamp is None else [call.stamp]
+        self.ids = (self.ids | set(call.added)) - set(call.removed)
+        self.measured = self.measured if call.measured is None else call.measured
+
+    def check(self, where: str, call: _Call, answer: Any) -> None:
         """Fail unless everything that the back end says is finite and in order."""
+        if call.empty:
+            require_status(answer, UpdateStatus.EMPTY, "an update without rows")
         if hasattr(answer, "innovation"):
             assert_definite(answer.covariance[None], f"{where}: pose of the prediction")
             assert_definite(answer.innovation, f"{where}: innovations")
             require(set(answer.ids.tolist()) <= self.ids, f"{where}: predicts a landmark that is not in the map")
         if not self.stamps:
             return
-        if self.rng.random() < 0.5:
-            assert_sound(self.backend.estimate(landmarks=False), where)
-        else:
-            found = self.backend.estimate()
-            assert_sound(found, where)
-            require_same(found.ids, sorted(self.ids), f"{where}: landmarks")
-            require(np.isfinite(self.backend.positions(found.ids)).all(), f"{where}: a position is not finite")
+        whole = self.rng.random() >= 0.5
+        estimate = self.backend.estimate(landmarks=whole)
+        assert_sound(estimate, where)
+        if whole:
+            require_same(estimate.ids, sorted(self.ids), f"{where}: landmarks")
+            require(np.isfinite(self.backend.positions(estimate.ids)).all(), f"{where}: a position is not finite")
         if self.rng.random() < 0.3:
             path = self.backend.trajectory()
             require_same(path.stamps, self.stamps, f"{where}: stamps of the path")
@@ -194,77 +173,54 @@ class _Life:
         last = self.stamps[-1] if self.stamps else 0.0
         stamp = last + float(self.rng.choice(_STEPS if self.rng.random() < 0.8 else _NO_STEPS))
         refused = not np.isfinite(stamp) or bool(self.stamps and stamp <= last) or abs(stamp) > 1e12
-        return _Call(f"predict({stamp})", refused, lambda: self.backend.predict(stamp), lambda: self._predicted(stamp))
-
-    def _predicted(self, stamp: float) -> None:
-        self.stamps.append(stamp)
-        self.measured = False
+        make = lambda: self.backend.predict(stamp)  # noqa: E731
+        return _Call(f"predict({stamp})", refused, make, stamp=stamp, measured=False)
 
     def _update(self) -> _Call:
-        known = self.rng.permutation(sorted(self.ids))[: self.rng.integers(3 * _SIZE)].astype(np.int64)
-        unknown = self.rng.random() < 0.1
-        seen = self._pixels(np.append(known, 10**6).astype(np.int64) if unknown else known)
-        refused = not self.stamps or self.measured or unknown
-        return _Call(f"update with {len(seen)} rows", refused, lambda: self._report(seen), lambda: self._added(()))
-
-    def _report(self, seen: Observations) -> UpdateReport:
-        report = self.backend.update(seen)
-        if not len(seen):
-            require_status(report, UpdateStatus.EMPTY, "an update without rows")
-        return report
+        ids = self.rng.permutation(sorted(self.ids))[: self.rng.integers(3 * _SIZE)].astype(np.int64)
+        strange = self.rng.random() < 0.1
+        seen = self._pixels(np.append(ids, 10**6).astype(np.int64) if strange else ids)
+        refused, make = not self.stamps or self.measured or strange, lambda: self.backend.update(seen)
+        return _Call(f"update with {len(seen)} rows", refused, make, measured=True, empty=not len(seen))
 
     def _add(self) -> _Call:
         seen = self._pixels(self._new_ids())
-        if self.ids and self.rng.random() < 0.1:
-            seen = replace(seen, ids=np.append(seen.ids[1:], min(self.ids))) if len(seen) else seen
-        known = bool(self.ids & set(seen.ids.tolist()))
+        if len(seen) and self.ids and self.rng.random() < 0.1:
+            seen = replace(seen, ids=np.append(seen.ids[1:], min(self.ids)))
+        ids = tuple(seen.ids.tolist())
         flat = not (np.isfinite(seen.uv_right).all() and (seen.uv_left[:, 0] > seen.uv_right[:, 0]).all())
-        refused, ids = not self.stamps or known or flat, seen.ids
-        return _Call(
-            f"add of {len(ids)} landmarks", refused, lambda: self.backend.add(seen),
-            lambda: self._added(ids, self.measured or len(ids) > 0),
-        )  # fmt: skip
+        refused, make = not self.stamps or bool(self.ids & set(ids)) or flat, lambda: self.backend.add(seen)
+        return _Call(f"add of {len(ids)} landmarks", refused, make, added=ids, measured=self.measured or bool(ids))
 
     def _remove(self) -> _Call:
-        share = self.rng.choice([0.0, 0.2, 1.0])
-        ids = [i for i in sorted(self.ids) if self.rng.random() < share]
-        unknown = self.rng.random() < 0.2
-        ids += [10**6] if unknown else []
-        return _Call(
-            f"remove of {len(ids)} landmarks", unknown, lambda: self.backend.remove(ids),
-            lambda: self.ids.difference_update(ids),
-        )  # fmt: skip
+        share, strange = self.rng.choice([0.0, 0.2, 1.0]), self.rng.random() < 0.2
+        ids = [i for i in sorted(self.ids) if self.rng.random() < share] + ([10**6] if strange else [])
+        make = lambda: self.backend.remove(ids)  # noqa: E731
+        return _Call(f"remove of {len(ids)} landmarks", strange, make, removed=tuple(ids))
 
     def _place(self) -> _Call:
-        ids, local, covariances = _cloud(self._new_ids(), None, self.rng)
+        ids, local, covariances = cloud(self._new_ids(), None, self._variance())
         behind = self.rng.random() < 0.2 and len(ids) > 0
         if behind:
             local[0, 2] = self.rng.choice([-5.0, 0.0, float("nan")])
-        return _Call(
-            f"place of {len(ids)} landmarks", not self.stamps or behind,
-            lambda: self.backend.place(ids, local, covariances),
-            lambda: self._added(ids, self.measured or len(ids) > 0),
-        )  # fmt: skip
+        refused, make = not self.stamps or behind, lambda: self.backend.place(ids, local, covariances)
+        measured, added = self.measured or len(ids) > 0, tuple(ids.tolist())
+        return _Call(f"place of {len(ids)} landmarks", refused, make, added=added, measured=measured)
 
     def _insert(self) -> _Call:
-        ids, positions, covariances = _cloud(self._new_ids(), None, self.rng)
+        ids, positions, covariances = cloud(self._new_ids(), None, self._variance())
         flat = self.rng.random() < 0.2 and len(ids) > 0
         if flat:
             covariances[0] = self.rng.choice([0.0, -1.0]) * np.eye(3)
-        return _Call(
-            f"insert of {len(ids)} landmarks", flat, lambda: self.backend.insert(ids, positions, covariances),
-            lambda: self._added(ids, self.measured),
-        )  # fmt: skip
+        make = lambda: self.backend.insert(ids, positions, covariances)  # noqa: E731
+        return _Call(f"insert of {len(ids)} landmarks", flat, make, added=tuple(ids.tolist()))
 
     def _revise(self) -> _Call:
         shift = self.rng.choice([0.0, 0.01])
-        return _Call(
-            f"revise by {shift} px", False, lambda: self.backend.revise(lambda z: z + shift), lambda: self._added(())
-        )
+        return _Call(f"revise by {shift} px", False, lambda: self.backend.revise(lambda z: z + shift), measured=True)
 
-    def _added(self, ids: Iterable[int], measured: bool = True) -> None:
-        self.ids.update(int(i) for i in ids)
-        self.measured = measured
+    def _variance(self) -> float:
+        return float(self.rng.choice([1e-6, 0.01, 1.0]))
 
     def _new_ids(self) -> IdArray:
         count = int(self.rng.integers(_SIZE + 1))
@@ -274,8 +230,7 @@ class _Life:
     def _pixels(self, ids: IdArray) -> Observations:
         """Pixels of landmarks: those of one fixed world, or wherever."""
         wild = self.rng.random() < 0.3
-        points = np.array([_point(i) for i in ids.tolist()]).reshape(-1, 3)
-        left, right = RIG.project(points)
+        left, right = RIG.project(np.array([point(i) for i in ids.tolist()]).reshape(-1, 3))
         noise = self.rng.standard_normal((2, len(ids), 2))
         left, right = left + 0.5 * noise[0], right + 0.5 * noise[1]
         if wild and len(ids):
@@ -285,25 +240,12 @@ class _Life:
         return Observations(ids, left, right)
 
 
-def _point(number: int) -> Array:
-    """Position of a landmark [m] by its number."""
-    return np.random.default_rng(number).uniform((-3, -2, 4), (3, 2, 12))
-
-
-def _cloud(ids: Any, positions: Any = None, rng: np.random.Generator | None = None) -> tuple[IdArray, Array, Array]:
-    """Landmarks with known positions: ids (N,), positions (N, 3) [m] in front of the first camera, covariances."""
-    ids = np.asarray(ids, np.int64)
-    points = np.array([_point(i) for i in ids.tolist()] if positions is None else positions, float).reshape(-1, 3)
-    size = 0.01 if rng is None else float(rng.choice([1e-6, 0.01, 1.0]))
-    return ids, points, size * np.tile(np.eye(3), (len(ids), 1, 1))
-
-
-def assert_sound(found: Estimate, what: str) -> None:
+def assert_sound(estimate: Estimate, what: str) -> None:
     """Fail unless an estimate is finite and its covariances are positive definite."""
-    require(np.isfinite(found.T_world_left).all(), f"{what}: the pose is not finite")
-    require(np.isfinite(found.positions).all(), f"{what}: a landmark's position is not finite")
-    assert_definite(found.covariance[None], f"{what}: pose")
-    assert_definite(found.covariances, f"{what}: landmarks")
+    require(np.isfinite(estimate.T_world_left).all(), f"{what}: the pose is not finite")
+    require(np.isfinite(estimate.positions).all(), f"{what}: a landmark's position is not finite")
+    assert_definite(estimate.covariance[None], f"{what}: pose")
+    assert_definite(estimate.covariances, f"{what}: landmarks")
 
 
 def assert_definite(P: Array, what: str) -> None:

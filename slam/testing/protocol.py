@@ -1,4 +1,4 @@
-"""Checks of what a back end says and refuses, call by call."""
+"""Checks of the tiers ``"runs"`` and ``"right"``: what a back end answers and what it refuses, call by call."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import numpy as np
 from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
+from slam.interfaces import Backend
+from slam.registry import METHODS
+from slam.system import StereoSlam
 from slam.testing.scene import (
     DT,
     MODELS,
@@ -19,14 +22,61 @@ from slam.testing.scene import (
     Run,
     assert_covariance,
     assert_near,
+    cloud,
     make_scene,
     raises,
     require,
+    require_equal,
     require_same,
     require_status,
     started,
     tracked,
 )  # fmt: skip
+from slam.third_party import checked
+from slam.worlds import open_world
+
+_FRAMES = 8  # of the run in a world
+
+
+def every_method_is_there(factory: Factory) -> None:
+    """It is made as ``factory(rig, models=models)`` and has the seven methods of `slam.interfaces.Backend`."""
+    backend: Backend = factory(RIG, models=MODELS)
+    names = METHODS["backends"]
+    missing = [name for name in names if not callable(getattr(backend, name, None))]
+    require(not missing, f"{', '.join(missing)} missing: a back end has {', '.join(names)}")
+
+
+def answers_are_as_documented(factory: Factory) -> None:
+    """Its answers are of the types and shapes that the interface says, with what was added, until it is removed."""
+    backend, seen = started(factory)
+    prediction = checked(backend, "predict", backend.predict(DT))
+    require_same(prediction.stamp, DT, "stamp of the prediction")
+    require(np.isfinite(prediction.innovation).all(), "innovation of predict is not finite")
+    require(len(prediction.ids) > 0, "predict lists no landmark, but the camera has hardly moved since they were added")
+    require(np.isin(prediction.ids, seen.ids).all(), "predict lists a landmark that is not in the map")
+    second = make_scene(2).frames[1]
+    report = checked(backend, "update", backend.update(second.select(np.isin(second.ids, seen.ids))))
+    require_status(report, UpdateStatus.OK, "an update with good observations")
+    require(len(report.used) > 0 and np.isin(report.used, seen.ids).all(), "update used none of the good observations")
+    backend.predict(2 * DT)
+    require_status(backend.update(Observations.empty()), UpdateStatus.EMPTY, "a frame without observations")
+    estimate = checked(backend, "estimate", backend.estimate())
+    require_same(np.sort(estimate.ids), np.sort(seen.ids), "landmarks of the estimate, against those that were added")
+    positions = checked(backend, "positions", backend.positions(estimate.ids), n=len(seen))
+    require_same(positions, estimate.positions, "positions(ids), against those of the estimate", 0.1)
+    require_same(backend.estimate(landmarks=False).ids, NONE, "landmarks of estimate(landmarks=False)")
+    require_same(backend.trajectory().stamps, DT * np.arange(3), "stamps of the trajectory", 1e-12)
+    backend.remove(seen.ids[:3])
+    require_same(np.sort(backend.estimate().ids), np.sort(seen.ids[3:]), "landmarks after the first three were removed")
+
+
+def a_run_comes_to_its_end(factory: Factory) -> None:
+    """In `slam.StereoSlam` it tracks a short piece of a built-in world."""
+    world = open_world(f"aisle?frames={_FRAMES}")
+    system = StereoSlam(world.rig, None, factory(world.rig, models=MODELS))
+    results = [system.process_features(world.observations(k)) for k in range(_FRAMES)]
+    lost = [r for r in results[1:] if r.status != "tracked"]
+    require(not lost, f"a run over a built-in world: {len(lost)} of {_FRAMES - 1} frames not tracked")
 
 
 def first_prediction_is_the_start(factory: Factory) -> None:
@@ -39,19 +89,15 @@ def first_prediction_is_the_start(factory: Factory) -> None:
     expected = np.repeat([MODELS.initial_rotation_sigma, MODELS.initial_position_sigma], 3)
     near = np.allclose(sigma, expected, rtol=0.1)
     require(near, "the first covariance is not that of the models' initial_rotation_sigma and initial_position_sigma")
-    rows = len(prediction.ids) + len(prediction.uv_left) + len(prediction.uv_right) + len(prediction.innovation)
-    require(not rows, "the first prediction lists landmarks, but the map is empty")
+    require(not len(prediction.ids), "the first prediction lists landmarks, but the map is empty")
 
 
 def initial_pose_is_kept(factory: Factory) -> None:
     """The world may be any: the first pose is the models', and everything else follows in that world."""
-    T = se3.exp(np.array([0.4, -0.8, 2.0, 10.0, -20.0, 5.0]))
-    scene = make_scene()
-    run, _ = tracked(factory, scene, replace(MODELS, T_world_left=T.tolist()))
-    backend = run.backend
-    assert_near(backend.estimate().T_world_left, T @ scene.poses[-1], "pose in a turned world")
-    found = backend.estimate()
-    error = found.positions - se3.transform(T, scene.points[found.ids])
+    T, scene = se3.exp(np.array([0.4, -0.8, 2.0, 10.0, -20.0, 5.0])), make_scene()
+    estimate = tracked(factory, scene, replace(MODELS, T_world_left=T.tolist()))[0].backend.estimate()
+    assert_near(estimate.T_world_left, T @ scene.poses[-1], "pose in a turned world")
+    error = estimate.positions - se3.transform(T, scene.points[estimate.ids])
     require(np.median(np.linalg.norm(error, axis=1)) < 0.5, "landmarks are not in the initial pose's world")
 
 
@@ -63,22 +109,62 @@ def time_must_increase(factory: Factory) -> None:
     require_same(backend.predict(DT).stamp, DT, "stamp of a prediction after refused ones")
 
 
-def calls_before_the_first_prediction(factory: Factory) -> None:
-    """Nothing can be measured before the start."""
-    seen = make_scene(1).frames[0]
-    raises(MeasurementError, factory(RIG, models=MODELS).add, seen, what="add before predict")
-    raises(MeasurementError, factory(RIG, models=MODELS).update, seen, what="update before predict")
-
-
-def unknown_option_is_refused(factory: Factory) -> None:
-    """An option that does not exist is an error, not ignored."""
+def misuse_is_refused(factory: Factory) -> None:
+    """Calls before the start, unknown options and ids, known ids added again, and rows without depth are refused."""
     raises(ConfigurationError, factory, RIG, models=MODELS, no_such_option=1, what="unknown option")
+    backend, seen = started(factory)
+    for method, arguments in {"add": (seen,), "update": (seen,), "recent": (1,), "place": cloud([7])}.items():
+        if hasattr(backend, method):
+            fresh: Any = factory(RIG, models=MODELS)
+            raises(MeasurementError, getattr(fresh, method), *arguments, what=f"{method} before predict")
+    stranger, before = Observations(np.array([999]), seen.uv_left[:1], seen.uv_right[:1]), backend.estimate()
+    rows: list[tuple[str, str, Any]] = [
+        ("add", "of known ids", seen.select(np.arange(3))),
+        ("add", "without a right pixel", replace(stranger, uv_right=np.full((1, 2), np.nan))),
+        ("add", "with negative depth", replace(stranger, uv_right=stranger.uv_left + np.array([30.0, 0.0]))),
+        ("remove", "of an unknown id", [999]),
+        ("positions", "of an unknown id", np.array([999])),
+        ("predict", "", DT),
+        ("update", "with an unknown id", stranger),
+    ]
+    rows += [("recent", "(0)", 0)] if hasattr(backend, "recent") else []
+    for method, what, argument in rows:
+        if what:
+            raises(MeasurementError, getattr(backend, method), argument, what=f"{method} {what}")
+        else:
+            getattr(backend, method)(argument)
+    place: Any = getattr(backend, "place", None)
+    for depth in (-5.0, 0.0, float("nan")) if place is not None else ():
+        raises(MeasurementError, place, *cloud([7], [[0, 0, depth]]), what=f"place at a depth of {depth}")
+    after = backend.estimate()
+    require_same(after.ids, before.ids, "landmarks after calls that were refused")
+    require_same(after.positions, before.positions, "positions after calls that were refused", 1e-9)
+
+
+def a_stamp_has_one_update(factory: Factory) -> None:
+    """A second update of a stamp is refused, whatever came of the first; so is one after an add."""
+    scene, run = make_scene(4), Run(factory)
+    run.step(0, scene.frames[0])
+    seen = scene.frames[1].select(run.in_map(scene.frames[1]))
+    old, new = seen.select(np.arange(len(seen) - 3)), seen.select(np.arange(len(seen) - 3, len(seen)))
+    backend = run.backend
+    backend.remove(new.ids)
+    raises(MeasurementError, backend.update, old, what="an update of the first stamp after an add")
+    for k, (first, status) in enumerate([(old, UpdateStatus.OK), (Observations.empty(), UpdateStatus.EMPTY)]):
+        backend.predict(DT * (k + 1))
+        require_status(backend.update(first), status, "the first update of a stamp")
+        before = backend.estimate()
+        for again in (old, Observations.empty()):
+            raises(MeasurementError, backend.update, again, what="a second update of a stamp")
+        require_equal(backend.estimate(), before, "estimate after a second update, which was refused")
+    backend.predict(DT * 3)
+    backend.add(new)
+    raises(MeasurementError, backend.update, old, what="an update after an add at the same stamp")
 
 
 def nothing_seen_is_no_error(factory: Factory) -> None:
     """Frames without observations: the state is predicted, the status says so, uncertainty grows."""
-    scene = make_scene(6)
-    backend = tracked(factory, scene)[0].backend
+    backend = tracked(factory, make_scene(6))[0].backend
     before = backend.estimate()
     for k in range(6, 12):
         backend.predict(DT * k)
@@ -92,25 +178,6 @@ def nothing_seen_is_no_error(factory: Factory) -> None:
     grown = np.trace(after.covariance) > np.trace(before.covariance)
     require(grown, "the pose's covariance does not grow in frames without observations")
     require_same(after.ids, before.ids, "landmarks after frames without observations")
-
-
-def ids_must_fit_the_map(factory: Factory) -> None:
-    """Unknown ids, known ids added again, and rows without depth are refused and change nothing."""
-    backend, seen = started(factory)
-    before = backend.estimate()
-    stranger = Observations(np.array([999]), seen.uv_left[:1], seen.uv_right[:1])
-    blind = replace(stranger, uv_right=np.full((1, 2), np.nan))
-    behind = replace(stranger, uv_right=stranger.uv_left + np.array([30.0, 0.0]))
-    raises(MeasurementError, backend.add, seen.select(np.arange(3)), what="add of known ids")
-    raises(MeasurementError, backend.add, blind, what="add without a right pixel")
-    raises(MeasurementError, backend.add, behind, what="add with negative depth")
-    raises(MeasurementError, backend.remove, [999], what="remove of an unknown id")
-    raises(MeasurementError, backend.positions, np.array([999]), what="position of an unknown id")
-    backend.predict(DT)
-    raises(MeasurementError, backend.update, stranger, what="update with an unknown id")
-    after = backend.estimate()
-    require_same(after.ids, before.ids, "landmarks after calls that were refused")
-    require_same(after.positions, before.positions, "positions after calls that were refused", 1e-9)
 
 
 def estimate_is_in_order(factory: Factory) -> None:
@@ -149,37 +216,32 @@ def trajectory_has_every_stamp(factory: Factory) -> None:
 
 def recent_poses_fit_the_estimate(factory: Factory) -> None:
     """If it has `recent`: the last of the poses is the estimate's, and how they moved is as sure as it says."""
-    if not hasattr(factory(RIG, models=MODELS), "recent"):
-        return
-    backend: Any = factory(RIG, models=MODELS)
-    raises(MeasurementError, backend.recent, 1, what="recent before predict")
     scene = make_scene()
-    backend = tracked(factory, scene)[0].backend
-    raises(MeasurementError, backend.recent, 0, what="recent(0)")
+    backend: Any = tracked(factory, scene)[0].backend
+    if not hasattr(backend, "recent"):
+        return
     pose, stamps = backend.estimate(), DT * np.arange(len(scene.frames))
     for n in (1, 4, 100):
-        found = backend.recent(n)
-        k = len(found.stamps)
+        recent = backend.recent(n)
+        k = len(recent.stamps)
         require(0 < k <= n, f"recent({n}) returned {k} poses")
-        require_same(found.stamps, stamps[-k:], f"stamps of recent({n})", 1e-9)
-        require_same(found.poses[-1], pose.T_world_left, f"last pose of recent({n}) and the estimate's", 1e-9)
+        require_same(recent.stamps, stamps[-k:], f"stamps of recent({n})", 1e-9)
+        require_same(recent.poses[-1], pose.T_world_left, f"last pose of recent({n}) and the estimate's", 1e-9)
         scale = 0.01 * float(np.abs(pose.covariance).max())
-        require_same(found.covariance[-6:, -6:], pose.covariance, f"last covariance of recent({n})", scale)
-        assert_covariance(found.covariance, (6 * k, 6 * k), f"recent({n})")
+        require_same(recent.covariance[-6:, -6:], pose.covariance, f"last covariance of recent({n})", scale)
+        assert_covariance(recent.covariance, (6 * k, 6 * k), f"recent({n})")
         A = np.zeros((6, 6 * k))
-        step = se3.inverse(found.poses[0]) @ found.poses[-1]
+        step = se3.inverse(recent.poses[0]) @ recent.poses[-1]
         A[:, :6], A[:, -6:] = -se3.adjoint(se3.inverse(step)), A[:, -6:] + np.eye(6)
-        truth = se3.inverse(scene.poses[-k]) @ scene.poses[-1]
-        error = se3.log(se3.inverse(step) @ truth)
-        distance = float(error @ np.linalg.solve(A @ found.covariance @ A.T, error)) if k > 1 else 0.0
+        error = se3.log(se3.inverse(step) @ se3.inverse(scene.poses[-k]) @ scene.poses[-1])
+        distance = float(error @ np.linalg.solve(A @ recent.covariance @ A.T, error)) if k > 1 else 0.0
         require(distance < 40, f"over the poses of recent({n}) the motion is off by {distance:.3g} (χ² of six)")
 
 
 def results_are_the_callers_own(factory: Factory) -> None:
     """Writing into what a back end returned does not reach its state."""
     backend = tracked(factory, make_scene(4))[0].backend
-    before = backend.estimate()
-    names = ("T_world_left", "positions", "covariance")
+    before, names = backend.estimate(), ("T_world_left", "positions", "covariance")
     copies, returned = [getattr(before, name).copy() for name in names], backend.estimate()
     for array in (*(getattr(returned, name) for name in names), backend.trajectory().poses):
         if array.flags.writeable:
@@ -196,13 +258,13 @@ def removed_landmarks_are_gone(factory: Factory) -> None:
     run, _ = tracked(factory, replace(scene, frames=scene.frames[:8]))
     backend = run.backend
     ids = backend.estimate().ids
-    gone, kept = ids[::3], np.setdiff1d(ids, ids[::3])
-    before = backend.positions(kept)
+    gone, rest = ids[::3], np.setdiff1d(ids, ids[::3])
+    before = backend.positions(rest)
     backend.remove(gone)
-    run.known -= set(gone.tolist())
+    run.in_backend -= set(gone.tolist())
     backend.remove(NONE)
-    require_same(backend.estimate().ids, kept, "landmarks after a removal")
-    require_same(backend.positions(kept), before, "positions of those that stay after a removal", 1e-6)
+    require_same(backend.estimate().ids, rest, "landmarks after a removal")
+    require_same(backend.positions(rest), before, "positions of those that stay after a removal", 1e-6)
     raises(MeasurementError, backend.positions, gone[:1], what="position of a removed landmark")
     for k in range(8, len(scene.frames)):
         prediction, report = run.step(k, scene.frames[k])

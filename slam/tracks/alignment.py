@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from slam.data import IdArray, Patches, StereoFeatures
 from slam.errors import SlamError
 from slam.geometry.arrays import Array, isin
 from slam.geometry.rig import StereoRig
-from slam.interfaces import AligningFrontend, Frontend
+from slam.interfaces import AligningFrontend
 from slam.third_party import checked
 from slam.tracks.localizer import LandmarkMatches
 from slam.tracks.table import LandmarkTable, Patch
@@ -27,111 +26,81 @@ _RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken again, so that ano
 _FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
 
 
-class Aligner:
-    """Moves landmarks' features to the surface points first seen, if the front end can align patches.
+def align(
+    rig: StereoRig, frontend: AligningFrontend, features: StereoFeatures, matches: LandmarkMatches,
+    landmarks: LandmarkTable, positions: Callable[[IdArray], Array],
+) -> tuple[StereoFeatures, LandmarkTable]:  # fmt: skip
+    """Move landmarks' features to where the landmarks' patches are found; those without a patch are unchanged.
 
     Args:
         rig: the cameras.
-        enabled: see `slam.tracks.config.AssociationConfig.align`; if False, features are left unchanged.
+        frontend: which made the features.
+        features: of the frame, as measured.
+        matches: landmarks that were found, and the pose on which they agree; without a pose nothing is aligned.
+        landmarks: the map.
+        positions: returns landmarks' positions (M, 3) [m] in the world by their ids (M,).
+
+    Returns:
+        the features, and the map without the patches that are to be taken anew.
+
+    Raises:
+        SlamError: the front end does not return pixels.
     """
-
-    def __init__(self, rig: StereoRig, enabled: bool) -> None:
-        self._rig = rig
-        self._enabled = enabled
-
-    def align(
-        self,
-        frontend: Frontend | None,
-        features: StereoFeatures,
-        matches: LandmarkMatches,
-        landmarks: LandmarkTable,
-        positions: Callable[[IdArray], Array],
-    ) -> tuple[StereoFeatures, LandmarkTable]:
-        """Move landmarks' features to where the landmarks' patches are found; those without a patch are unchanged.
-
-        Args:
-            frontend: which made the features.
-            features: of the frame, as measured.
-            matches: landmarks that were found, and the pose on which they agree; without a pose nothing is aligned.
-            landmarks: the map.
-            positions: returns landmarks' positions (M, 3) [m] in the world by their ids (M,).
-
-        Returns:
-            the features, and the map without the patches that are to be taken anew.
-
-        Raises:
-            SlamError: the front end does not return pixels.
-        """
-        if not self._enabled or not isinstance(frontend, AligningFrontend):
-            return features, landmarks
-        has_patch = landmarks.has_patch
-        landmarks = landmarks.with_patches(np.flatnonzero(has_patch & (landmarks.unseen > _FORGOTTEN)), None)
-        at = landmarks.rows(matches.ids)
-        known = (has_patch & (landmarks.unseen <= _FORGOTTEN))[at]
-        if matches.T_world_left is None or features.images is None or not known.any():
-            return features, landmarks
-        rows, at = matches.rows[known], at[known]
-        patches, poses = _stacked(landmarks.patches[at].tolist())
-        warps = warps_of(self._rig, poses, matches.T_world_left, positions(landmarks.ids[at]))
-        growth = np.sqrt(np.abs(np.linalg.det(warps)))
-        similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
-        outgrown = (growth > _RENEWED) | (growth * _RENEWED < 1)
-        start = features.uv_left[rows], features.uv_right[rows]
-        left, right = _pixels(frontend, frontend.align(features.images, patches, warps, *start), len(rows))
-        stereo = features.has_stereo[rows]
-        found = similar & self._rig.left.in_image(left) & (self._rig.right.in_image(right) | ~stereo)
-        right[~stereo] = np.nan
-        uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
-        uv_left[rows[found]], uv_right[rows[found]] = left[found], right[found]
-        return replace(features, uv_left=uv_left, uv_right=uv_right), landmarks.with_patches(
-            at[~found | outgrown], None
-        )
-
-    def with_patches(
-        self, frontend: Frontend | None, features: StereoFeatures, seen: LandmarkMatches, landmarks: LandmarkTable,
-        T_world_left: Array,
-    ) -> LandmarkTable:  # fmt: skip
-        """The map, in which landmarks that were seen and have no patch get one.
-
-        Args:
-            frontend: which made the features.
-            features: of the frame, as measured and aligned.
-            seen: landmarks and their features.
-            landmarks: the map.
-            T_world_left: the frame's pose (4, 4).
-
-        Raises:
-            SlamError: the front end returns no patches, or not one for each landmark.
-        """
-        if not self._enabled or not isinstance(frontend, AligningFrontend) or features.images is None:
-            return landmarks
-        at = np.flatnonzero(isin(landmarks.ids, seen.ids) & ~landmarks.has_patch)
-        if not len(at):
-            return landmarks
-        rows = seen.rows_of(landmarks.ids[at])
-        sizes = {"n": len(at)}
-        one = next((patch for patch in landmarks.patches.tolist() if patch is not None), None)
-        if one is not None:
-            sizes["s"] = len(one.image)
-        answer = frontend.patches(features.images, features.uv_left[rows], features.scale[rows])
-        taken: Patches = checked(frontend, "patches", answer, **sizes)
-        new = [Patch(*of_one, T_world_left) for of_one in zip(taken.images, taken.centres, taken.size)]
-        return landmarks.with_patches(at, new)
+    has_patch = landmarks.has_patch
+    landmarks = landmarks.with_patches(np.flatnonzero(has_patch & (landmarks.unseen > _FORGOTTEN)), None)
+    at = landmarks.rows(matches.ids)
+    usable = (has_patch & (landmarks.unseen <= _FORGOTTEN))[at]
+    if matches.T_world_left is None or features.images is None or not usable.any():
+        return features, landmarks
+    rows, at = matches.rows[usable], at[usable]
+    names = ("image", "centre", "size", "T_world_left")
+    images, centres, size, poses = (np.array([getattr(p, name) for p in landmarks.patches[at]]) for name in names)
+    warps = warps_of(rig, poses, matches.T_world_left, positions(landmarks.ids[at]))
+    growth = np.sqrt(np.abs(np.linalg.det(warps)))
+    similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
+    outgrown = (growth > _RENEWED) | (growth * _RENEWED < 1)
+    start = features.uv_left[rows], features.uv_right[rows]
+    answer = frontend.align(features.images, Patches(images, centres, size), warps, *start)
+    if (got := [np.shape(uv) for uv in checked(frontend, "align", answer)]) != 2 * [start[0].shape]:
+        what = f"{type(frontend).__name__}.align: must give left and right pixels {start[0].shape}"
+        raise SlamError(f"{what}, got {got}")
+    left, right = answer
+    stereo = features.has_stereo[rows]
+    aligned = similar & rig.left.in_image(left) & (rig.right.in_image(right) | ~stereo)
+    right[~stereo] = np.nan
+    uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
+    uv_left[rows[aligned]], uv_right[rows[aligned]] = left[aligned], right[aligned]
+    return replace(features, uv_left=uv_left, uv_right=uv_right), landmarks.with_patches(at[~aligned | outgrown], None)
 
 
-def _stacked(patches: list[Patch]) -> tuple[Patches, Array]:
-    """Patches as the front end wants them, and the poses (N, 4, 4) from which they were taken."""
-    columns = ([getattr(patch, name) for patch in patches] for name in ("image", "centre", "size", "T_world_left"))
-    images, centres, size, poses = map(np.array, columns)
-    return Patches(images, centres, size), poses
+def with_new_patches(
+    frontend: AligningFrontend, features: StereoFeatures, seen: LandmarkMatches, landmarks: LandmarkTable,
+    T_world_left: Array,
+) -> LandmarkTable:  # fmt: skip
+    """The map, in which landmarks that were seen and have no patch get one.
 
+    Args:
+        frontend: which made the features.
+        features: of the frame, as measured and aligned.
+        seen: landmarks and their features.
+        landmarks: the map.
+        T_world_left: the frame's pose (4, 4).
 
-def _pixels(frontend: AligningFrontend, answer: Any, count: int) -> tuple[Array, Array]:
-    """Left and right pixels (N, 2) that a front end has found; raises SlamError where it answered something else."""
-    both = [np.shape(uv) for uv in checked(frontend, "align", answer)]
-    if both != 2 * [(count, 2)]:
-        raise SlamError(f"{type(frontend).__name__}.align: must give left and right pixels ({count}, 2), got {both}")
-    return answer[0], answer[1]
+    Raises:
+        SlamError: the front end returns no patches, or not one for each landmark.
+    """
+    at = np.flatnonzero(isin(landmarks.ids, seen.ids) & ~landmarks.has_patch)
+    if features.images is None or not len(at):
+        return landmarks
+    rows, sizes = seen.rows_of(landmarks.ids[at]), {"n": len(at)}
+    one = next((patch for patch in landmarks.patches.tolist() if patch is not None), None)
+    if one is not None:
+        sizes["s"] = len(one.image)
+    answer = frontend.patches(features.images, features.uv_left[rows], features.scale[rows])
+    taken: Patches = checked(frontend, "patches", answer, **sizes)
+    return landmarks.with_patches(
+        at, [Patch(*each, T_world_left) for each in zip(taken.images, taken.centres, taken.size)]
+    )
 
 
 def warps_of(rig: StereoRig, poses: Array, T_world_left: Array, positions: Array) -> Array:

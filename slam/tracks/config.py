@@ -38,8 +38,6 @@ class AssociationConfig:
         view_ratio: likewise, largest factor by which the distance may have changed.
         align: shift landmarks' features to where the surrounding image matches that at the landmark's first sight (see
             `slam.tracks.alignment`), if the front end can do that.
-        measured: largest number of matches given to the back end in a frame: those most informative of the camera's
-            motion (see `slam.tracks.informative`); 0 for all.
     """
 
     windows: str = "covariance"
@@ -55,7 +53,6 @@ class AssociationConfig:
     view_angle: float = 20.0
     view_ratio: float = 1.4
     align: bool = True
-    measured: int = 0
 
     #: As `d_match` and `ratio`, for matching against the whole map without windows.
     wide_d_match: ClassVar[float] = 0.4
@@ -100,7 +97,5 @@ class AssociationConfig:
             raise ConfigurationError("association: ratio must lie in (0, 1]")
         if self.view_ratio < 1:
             raise ConfigurationError("association: view_ratio must be at least 1")
-        if 0 < self.measured < 10:
-            raise ConfigurationError("association: measured must be 0, for all matches, or at least 10")
         if self.kidnapped_after < 1:
             raise ConfigurationError("association: kidnapped_after must be at least 1")

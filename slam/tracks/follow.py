@@ -14,24 +14,18 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.se3 import Array
+from slam.table import Table
 from slam.tracks.config import AssociationConfig
 
 Descriptors = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(Table):
     """Pairs of a landmark and a feature."""
 
     landmarks: NDArray[np.intp]  # rows of the landmarks (K,)
     features: NDArray[np.intp]  # rows of the features (K,)
-
-    def __len__(self) -> int:
-        return len(self.landmarks)
-
-    def select(self, rows: NDArray) -> Matches:
-        """The pairs of these rows (a mask or indices)."""
-        return Matches(self.landmarks[rows], self.features[rows])
 
 
 def follow(
@@ -129,12 +123,12 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
     return rows[:count], order.take(places[:count])
 
 
-def crowded(uv: Array, others: Array, radius: float) -> BoolArray:
+def crowded(uv: Array, neighbours: Array, radius: float) -> BoolArray:
     """Which pixels (N, 2) lie within `radius` [px] of any of `others` (M, 2)."""
-    if not len(others):
+    if not len(neighbours):
         return np.zeros(len(uv), bool)
-    rows, columns = pairs_in_boxes(uv, np.full((len(uv), 2), radius), others)
-    gap = (uv[rows] - others[columns]).astype(np.float32)
+    rows, columns = pairs_in_boxes(uv, np.full((len(uv), 2), radius), neighbours)
+    gap = (uv[rows] - neighbours[columns]).astype(np.float32)
     out = np.zeros(len(uv), bool)
     out[rows[np.square(gap).sum(axis=1) < radius * radius]] = True
     return out

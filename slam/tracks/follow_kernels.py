@@ -92,7 +92,22 @@ def product(a, b):
 
 
 @kernel
-def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows, uv, others, other_signs, order, pairs):
+def follow(
+    pixels,
+    innovation,
+    bounds,
+    sizes,
+    limits,
+    ratio,
+    looks,
+    signs,
+    rows,
+    uv,
+    feature_looks,
+    feature_signs,
+    order,
+    pairs,
+):
     """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
 
     Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows; their half axes
@@ -124,7 +139,7 @@ def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows,
         while place < len(order) and uv[order[place], 0] <= x + reach_u:
             feature = order[place]
             place += 1
-            if abs(uv[feature, 1] - y) > reach_v or other_signs[feature] != signs[rows[row]]:
+            if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[rows[row]]:
                 continue
             du, dv = np.float32(uv[feature, 0] - x), np.float32(uv[feature, 1] - y)
             if bounds[1] > 0:
@@ -141,7 +156,7 @@ def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows,
                 a, b, level = grown(a, room), grown(b, room), grown(level, room)
             a[count], b[count], level[count] = row, feature, smallest
             count += 1
-    found = 0  # tracks that look alike to the bit may share a feature
+    matched = 0  # tracks that look alike to the bit may share a feature
     done, taken = np.zeros(len(pixels), np.bool_), np.zeros(len(uv), np.bool_)
     allowed, good = np.empty(count, np.bool_), np.empty(count, np.bool_)
     distance = np.empty(count, np.float32)
@@ -149,25 +164,25 @@ def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows,
         for p in range(count):
             allowed[p] = level[p] <= number and not done[a[p]] and not taken[b[p]]
             if allowed[p] and level[p] == number:  # in a larger window, of tracks that are not found yet alone
-                likeness = product(looks[rows[a[p]]], others[b[p]])
+                likeness = product(looks[rows[a[p]]], feature_looks[b[p]])
                 distance[p] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
         best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[number], ratio, good)
         for p in range(count):
             if good[p]:
                 done[a[p]] = taken[b[p]] = True
-                pairs[0, found], pairs[1, found] = a[p], b[p]
-                found += 1
-    return found
+                pairs[0, matched], pairs[1, matched] = a[p], b[p]
+                matched += 1
+    return matched
 
 
 @kernel
-def nearest(points, order, places, radius, looks, others, alike):
+def nearest(points, order, places, radius, looks, place_looks, alike):
     """Of each place (M, 2 or more) the nearest point (N, 2 or more) that has it as its own nearest place; −1 for none.
 
     Both are less than `radius` apart, and their descriptors (N, D), (M, D) less than `alike`; `order` is that of the
     places' columns.
     """
-    found, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
+    matched, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
     for n in range(len(points)):
         x, y, best, least = points[n, 0], points[n, 1], -1, radius * radius
         place, end = 0, len(order)
@@ -186,10 +201,10 @@ def nearest(points, order, places, radius, looks, others, alike):
         if best >= 0 and least < gaps[best]:
             off = np.float32(0.0)
             for k in range(looks.shape[1]):
-                off += (looks[n, k] - others[best, k]) ** 2
+                off += (looks[n, k] - place_looks[best, k]) ** 2
             if off < alike * alike:
-                found[best], gaps[best] = n, least
-    return found
+                matched[best], gaps[best] = n, least
+    return matched
 
 
 @helper

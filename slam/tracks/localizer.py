@@ -1,4 +1,4 @@
-"""Matches landmarks with a frame: by search windows, agreement on one camera pose, and the whole map as a last resort.
+"""Finds landmarks in a frame: by search windows, agreement on one camera pose, and the whole map as a last resort.
 
 The same for every back end, which supplies predictions and positions, and is given matches that agree with each other.
 """
@@ -19,7 +19,6 @@ from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import Matches, follow, match_everywhere
-from slam.tracks.informative import most_informative
 from slam.tracks.standing import Standing
 from slam.tracks.state import NO_POSE, PoseHypotheses, TrackingState
 from slam.tracks.table import LandmarkTable
@@ -41,13 +40,9 @@ class LandmarkMatches:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def without(self, ids: IdArray) -> LandmarkMatches:
-        """A copy without some landmarks."""
-        return self.select(~isin(self.ids, ids))
-
-    def joined(self, other: LandmarkMatches) -> LandmarkMatches:
-        """These and others, of other landmarks."""
-        ids, rows = np.concatenate([self.ids, other.ids]), np.concatenate([self.rows, other.rows])
+    def joined(self, more: LandmarkMatches) -> LandmarkMatches:
+        """These and matches of other landmarks."""
+        ids, rows = np.concatenate([self.ids, more.ids]), np.concatenate([self.rows, more.rows])
         return replace(self, ids=ids, rows=rows)
 
     def select(self, rows: NDArray) -> LandmarkMatches:
@@ -76,7 +71,7 @@ class LandmarkMatches:
 
 
 class Localizer:
-    """Finds landmarks in frames, and decides whether the pose that they give is credible.
+    """How landmarks are searched for in frames, and when the pose that they give is credible.
 
     Args:
         rig: the cameras.
@@ -88,117 +83,25 @@ class Localizer:
     def __init__(self, rig: StereoRig, config: AssociationConfig, models: EstimatorModels, lost_after: int = 5) -> None:
         self.rig = rig
         self.config = config
+        self.models = models
         self.pixel_sigma = models.pixel_sigma
-        self._models = models
         self._lost_after = lost_after
 
-    def follow(
-        self,
-        prediction: Prediction,
-        landmarks: LandmarkTable,
-        positions: Array,
-        features: StereoFeatures,
-        tracking: TrackingState,
-        standing: Standing,
-        seed: int,
-        elsewhere: Callable[[], Array | None],
-    ) -> tuple[LandmarkMatches, TrackingState, Standing]:
-        """Landmarks found in a frame, with which poses are doubted and believed then, and whether the camera stands.
+    def match(
+        self, prediction: Prediction, landmarks: LandmarkTable, positions: Array, features: StereoFeatures, seed: int
+    ) -> LandmarkMatches:
+        """Landmarks whose features agree with one camera pose; for arguments see `Search`, whose `match` it is."""
+        return Search(self, prediction, landmarks, positions, features, seed).match()
 
-        `localize`, unless the camera stands in spite of the pose on which landmarks agree: then what stays is matched.
-        """
-        if standing.stands:
-            found = self.match(prediction, landmarks, positions, features, seed)
-            if found.T_world_left is not None:
-                standing = standing.contested(self.rig, self.pixel_sigma, features, found.rows, found.T_world_left)
-            if standing.stands:
-                if 2 * isin(found.rows, standing.witnesses).sum() <= len(found):
-                    at, witnessed = standing.T_world_left, standing.witnessed(features)
-                    found = self.match_around(at, prediction, landmarks, positions, witnessed, seed)
-                    found = replace(found, rows=standing.witnesses[found.rows])
-                if len(found) or standing.holds(tracking.lost):
-                    return found, tracking, standing
-        found, tracking = self.localize(prediction, landmarks, positions, features, tracking, seed, elsewhere)
-        return found, tracking, standing
-
-    def localize(
-        self,
-        prediction: Prediction,
-        landmarks: LandmarkTable,
-        positions: Array,
-        features: StereoFeatures,
-        tracking: TrackingState,
-        seed: int,
-        elsewhere: Callable[[], Array | None] = lambda: None,
-    ) -> tuple[LandmarkMatches, TrackingState]:
-        """`match`, but a pose farther from the prediction than its uncertainty allows needs proof.
-
-        Either most of what is in view from there agrees on it, and a camera may have moved so far since its last
-        measured pose; or several frames agree on it, wherever it is. Until then nothing counts as matched; in the last
-        of these frames the matches have a pose, no landmarks, and the mark `kidnapped`. If nothing matches, the atlas
-        is asked for a pose, which is treated likewise, but is accepted at once if the prediction allows it and enough
-        landmarks match around it.
-        """
-        doubtful = tracking.unmatched > 0
-        matches = self.match(prediction, landmarks, positions, features, seed, doubtful)
-        T, farthest = matches.T_world_left, self.config.lost_jump if doubtful else self.config.max_jump
-        here = prediction, landmarks, positions, features, seed
-        if T is None:
-            T = elsewhere()
-            if T is None:
-                return matches, replace(tracking, doubted=NO_POSE)
-            if jump(prediction, T) <= farthest:
-                matches = self.match_around(T, *here)
-        carried = tracking.carried(T)
-        if carried:  # two, so that the place does not count as unknown: it is what hides the view
-            none = replace(LandmarkMatches.nothing(), doubted=len(matches))
-            return none, replace(tracking, doubted=PoseHypotheses(2, features.stamp, T))
-        hidden_at = tracking.hidden_at if carried is None else None
-        allowed = jump(prediction, T) <= farthest
-        if not allowed and tracking.believed.after(T, features.stamp, self._models).count > 1:
-            around = self.match_around(T, *here)
-            allowed = self._most_agree(around, landmarks, positions, features)
-            matches = around if allowed else matches
-        if allowed and len(matches):
-            return matches, tracking.believing(T, features.stamp, hidden_at)
-        doubted = tracking.doubted.after(T, features.stamp, self._models)
-        if doubted.count < self.config.kidnapped_after:
-            return replace(LandmarkMatches.nothing(), doubted=len(matches)), replace(tracking, doubted=doubted)
-        nothing = replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
-        return nothing, tracking.believing(T, features.stamp)
-
-    def _most_agree(
-        self, matches: LandmarkMatches, landmarks: LandmarkTable, positions: Array, features: StereoFeatures
-    ) -> bool:
-        """Whether most of the landmarks in view from a pose agree on it, or of the features where these are fewer."""
-        if matches.T_world_left is None:
-            return False
-        view = self.rig.left.in_image(self.rig.left.project(transform(inverse(matches.T_world_left), positions)))
-        shown = view & self._looked_for(matches.T_world_left, landmarks, positions)
-        # 0.5: share of what is in view that makes a majority
-        enough = max(0.5 * min(int(shown.sum()), len(features)), 2 * self.config.minimum_consistent)
-        return len(matches) >= enough
-
-    def informative(
-        self, prediction: Prediction, matches: LandmarkMatches, positions: Array, dt: float
-    ) -> tuple[LandmarkMatches, IdArray]:
-        """The matches at `positions` (K, 3) [m] to give to the back end, and the ids of the others."""
-        most = self.config.measured
-        if not most or len(matches) <= most or not np.isfinite(dt):
-            return matches, matches.ids[:0]
-        rows = most_informative(self.rig, self._models, prediction, matches.ids, positions, dt, most)
-        others = np.setdiff1d(matches.ids, matches.ids[rows])
-        return matches.without(others), others
+    def similar_view(self, T_world_left: Array, landmarks: LandmarkTable, positions: Array) -> BoolArray:
+        """Which landmarks (N,) at `positions` are seen from this pose (4, 4) much as they were at first sight."""
+        limits = self.config.view_angle, self.config.view_ratio
+        return similar_view(positions, landmarks.seen_from, T_world_left[:3, 3], *limits)
 
     def state_after(
-        self,
-        tracking: TrackingState,
-        prediction: Prediction,
-        features: StereoFeatures,
-        matches: LandmarkMatches,
-        report: UpdateReport,
-        stands: bool,
-    ) -> TrackingState:
+        self, tracking: TrackingState, prediction: Prediction, features: StereoFeatures, matches: LandmarkMatches,
+        report: UpdateReport, stands: bool,
+    ) -> TrackingState:  # fmt: skip
         """The tracking state after a frame, by whether its pose was measured.
 
         It was not measured if the back end used less than half of the landmarks that agree with each other; a lost
@@ -208,143 +111,177 @@ class Localizer:
         least = self.config.minimum_consistent if tracking.lost else MINIMAL_POINTS
         measured = len(report.used) >= least and 2 * len(report.used) >= len(matches)
         uncertain = median_deviation(prediction) > self.config.tight_window
-        enough = 0 if tracking.doubted.count > 1 else int(features.has_stereo.sum())
-        return tracking.after(measured, stands, uncertain, enough, self._lost_after)
+        stereo = 0 if tracking.doubted.count > 1 else int(features.has_stereo.sum())
+        return tracking.after(measured, stands, uncertain, stereo, self._lost_after)
 
-    def match(
-        self,
-        prediction: Prediction,
-        landmarks: LandmarkTable,
-        positions: Array,
-        features: StereoFeatures,
-        seed: int,
-        doubtful: bool = False,
-    ) -> LandmarkMatches:
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The search for landmarks in one frame."""
+
+    localizer: Localizer
+    prediction: Prediction  # of the back end
+    landmarks: LandmarkTable  # the map's bookkeeping (N rows)
+    positions: Array  # of the landmarks (N, 3) [m] in world coordinates
+    features: StereoFeatures  # of the frame
+    seed: int  # of the random choice in the geometric check
+
+    @property
+    def config(self) -> AssociationConfig:
+        """The settings."""
+        return self.localizer.config
+
+    def follow(
+        self, tracking: TrackingState, standing: Standing, elsewhere: Callable[[], Array | None]
+    ) -> tuple[LandmarkMatches, TrackingState, Standing]:
+        """Matches, the poses doubted and believed after them, and whether the camera stands.
+
+        `localize`, unless the camera stands in spite of the pose on which landmarks agree: then what stays is matched.
+        """
+        if standing.stands:
+            matches = self.match()
+            if matches.T_world_left is not None:
+                rig, sigma = self.localizer.rig, self.localizer.pixel_sigma
+                standing = standing.contested(rig, sigma, self.features, matches.rows, matches.T_world_left)
+            if standing.stands:
+                if 2 * isin(matches.rows, standing.witnesses).sum() <= len(matches):
+                    staying = replace(self, features=self.features.select(standing.witnesses))
+                    matches = staying.match_around(standing.T_world_left)
+                    matches = replace(matches, rows=standing.witnesses[matches.rows])
+                if len(matches) or standing.holds(tracking.lost):
+                    return matches, tracking, standing
+        return *self.localize(tracking, elsewhere), standing
+
+    def localize(
+        self, tracking: TrackingState, elsewhere: Callable[[], Array | None] = lambda: None
+    ) -> tuple[LandmarkMatches, TrackingState]:
+        """`match`, but a pose farther from the prediction than its uncertainty allows needs proof.
+
+        Either most of what is in view from there agrees on it, and a camera may have moved so far since its last
+        measured pose; or several frames agree on it, wherever it is. Until then nothing counts as matched; in the last
+        of these frames the matches have a pose, no landmarks, and the mark `kidnapped`. If nothing matches, the atlas
+        is asked for a pose, which is treated likewise, but is accepted at once if the prediction allows it and enough
+        landmarks match around it.
+        """
+        models, stamp, doubtful = self.localizer.models, self.features.stamp, tracking.unmatched > 0
+        matches, farthest = self.match(doubtful), self.config.lost_jump if doubtful else self.config.max_jump
+        T = matches.T_world_left
+        if T is None:
+            T = elsewhere()
+            if T is None:
+                return matches, replace(tracking, doubted=NO_POSE)
+            if jump(self.prediction, T) <= farthest:
+                matches = self.match_around(T)
+        carried = tracking.carried(T)
+        if carried:  # two, so that the place does not count as unknown: it is what hides the view
+            none = replace(LandmarkMatches.nothing(), doubted=len(matches))
+            return none, replace(tracking, doubted=PoseHypotheses(2, stamp, T))
+        hidden_at = tracking.hidden_at if carried is None else None
+        allowed = jump(self.prediction, T) <= farthest
+        if not allowed and tracking.believed.after(T, stamp, models).count > 1:
+            around = self.match_around(T)
+            allowed = self._most_agree(around)
+            matches = around if allowed else matches
+        if allowed and len(matches):
+            return matches, tracking.believing(T, stamp, hidden_at)
+        doubted = tracking.doubted.after(T, stamp, models)
+        if doubted.count < self.config.kidnapped_after:
+            return replace(LandmarkMatches.nothing(), doubted=len(matches)), replace(tracking, doubted=doubted)
+        nothing = replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
+        return nothing, tracking.believing(T, stamp)
+
+    def match(self, doubtful: bool = False) -> LandmarkMatches:
         """Landmarks whose features agree with one camera pose.
 
         First in windows around the predictions. If these are wide, or too few matches agree, a pose is computed by
         consensus from the matches in windows or, without windows, against the whole map; the other landmarks are then
         searched for in small windows around the pixels that this pose predicts.
 
-        Args:
-            prediction: of the back end.
-            landmarks: the map's bookkeeping (N rows).
-            positions: the landmarks' positions (N, 3) in world coordinates.
-            features: of the frame.
-            seed: of the random choice in the geometric check.
-            doubtful: nothing was matched in the last frame, so that a pose from the whole map needs more matches, see
-                `AssociationConfig.wide_share`.
+        `doubtful` says that nothing was matched in the last frame, so that a pose from the whole map needs more
+        matches, see `AssociationConfig.wide_share`.
         """
-        if not len(landmarks) or not len(features):
+        if not len(self.landmarks) or not len(self.features):
             return LandmarkMatches.nothing()
-        rows = landmarks.rows(prediction.ids)
-        looked_for = self._looked_for(prediction.T_world_left, landmarks, positions)[rows]
-        matches = self._in_windows(_select(prediction, looked_for), landmarks, rows[looked_for], features)
-        consensus = self._consensus(matches, positions, features, prediction.T_world_left, seed)
-        tight = median_deviation(prediction) <= self.config.tight_window
+        c, p = self.config, self.prediction
+        rows = self.landmarks.rows(p.ids)
+        searched = self._searched_for(p.T_world_left)[rows]
+        matches = self._in_windows(p.uv_left[searched], p.innovation[searched], rows[searched])
+        consensus = self._consensus(matches, p.T_world_left)
+        tight = median_deviation(p) <= c.tight_window
         least = 0.0
-        if consensus.inliers.sum() < self.config.minimum_consistent:
-            matches_wide = match_everywhere(landmarks.descriptors, landmarks.laplacian, features, self.config)
-            wide = self._consensus(matches_wide, positions, features, prediction.T_world_left, seed, wide=True)
-            if wide.inliers.sum() >= self.config.minimum_consistent:
+        if consensus.inliers.sum() < c.minimum_consistent:
+            matches_wide = match_everywhere(self.landmarks.descriptors, self.landmarks.laplacian, self.features, c)
+            wide = self._consensus(matches_wide, p.T_world_left, wide=True)
+            if wide.inliers.sum() >= c.minimum_consistent:
                 matches, consensus, tight = matches_wide, wide, False
-                least = self.config.wide_share if doubtful else 0.0
+                least = c.wide_share if doubtful else 0.0
             elif not tight:
                 return LandmarkMatches.nothing()
         if not tight or consensus.inliers.sum() < CLEAR_MAJORITY * len(matches):
-            expected = self._expected(consensus.T_world_left, prediction, landmarks, positions)
-            matches, consensus = self._again(consensus, matches, expected, landmarks, positions, features, seed)
-            if consensus.inliers.sum() < least * min(len(expected.ids), len(features)):
+            again, expected = self._around(consensus.T_world_left)
+            consensus_again = self._consensus(again, consensus.T_world_left)
+            if consensus_again.inliers.sum() >= consensus.inliers.sum():  # the better ones of both
+                matches, consensus = again, consensus_again
+            if consensus.inliers.sum() < least * min(expected, len(self.features)):
                 return LandmarkMatches.nothing()
-        return _matches_of(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
+        return self._agreeing(matches, consensus)
 
-    def match_around(
-        self,
-        T_world_left: Array,
-        prediction: Prediction,
-        landmarks: LandmarkTable,
-        positions: Array,
-        features: StereoFeatures,
-        seed: int,
-    ) -> LandmarkMatches:
+    def match_around(self, T_world_left: Array) -> LandmarkMatches:
         """Match landmarks in small windows around a known pose (4, 4); nothing if too few of them agree."""
-        expected = self._expected(T_world_left, prediction, landmarks, positions)
-        matches = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
-        consensus = self._consensus(matches, positions, features, T_world_left, seed)
+        matches, _ = self._around(T_world_left)
+        consensus = self._consensus(matches, T_world_left)
         if consensus.inliers.sum() < self.config.minimum_consistent:
             return LandmarkMatches.nothing()
-        return _matches_of(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
+        return self._agreeing(matches, consensus)
 
-    def similar_view(self, T_world_left: Array, landmarks: LandmarkTable, positions: Array) -> BoolArray:
-        """Which landmarks (N,) at `positions` are seen from this pose (4, 4) much as they were at first sight."""
-        limits = self.config.view_angle, self.config.view_ratio
-        return similar_view(positions, landmarks.seen_from, T_world_left[:3, 3], *limits)
+    def _most_agree(self, matches: LandmarkMatches) -> bool:
+        """Whether most of the landmarks in view from a pose agree on it, or of the features where these are fewer."""
+        T, left = matches.T_world_left, self.localizer.rig.left
+        if T is None:
+            return False
+        view = left.in_image(left.project(transform(inverse(T), self.positions)))
+        shown = view & self._searched_for(T)
+        # 0.5: share of what is in view that makes a majority
+        enough = max(0.5 * min(int(shown.sum()), len(self.features)), 2 * self.config.minimum_consistent)
+        return len(matches) >= enough
 
-    def _looked_for(self, T_world_left: Array, landmarks: LandmarkTable, positions: Array) -> BoolArray:
+    def _searched_for(self, T_world_left: Array) -> BoolArray:
         """Which landmarks (N,) are searched for in windows: those in a similar view, and those long out of view."""
-        alike = self.similar_view(T_world_left, landmarks, positions)
-        return alike | landmarks.long_out_of_view(self.config.rematch_after)
+        alike = self.localizer.similar_view(T_world_left, self.landmarks, self.positions)
+        return alike | self.landmarks.long_out_of_view(self.config.rematch_after)
 
-    def _in_windows(
-        self, prediction: Prediction, landmarks: LandmarkTable, rows: NDArray[np.intp], features: StereoFeatures
-    ) -> Matches:
-        """Matches by rows of the whole map."""
-        looks = landmarks.descriptors, landmarks.laplacian
-        return follow(prediction.uv_left, prediction.innovation, *looks, features, self.config, rows)
+    def _in_windows(self, uv: Array, innovation: Array, rows: NDArray[np.intp]) -> Matches:
+        """Matches of the landmarks at `rows` (M,), in windows around their pixels (M, 2)."""
+        looks = self.landmarks.descriptors, self.landmarks.laplacian
+        return follow(uv, innovation, *looks, self.features, self.config, rows)
 
-    def _consensus(
-        self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False
-    ) -> PoseConsensus:
-        """The pose on which matches agree."""
-        rows, points = matches.features, positions[matches.landmarks]
-        measured = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-        threshold = self.config.consistency_sigmas * self.pixel_sigma
-        if wide and len(matches) < self.config.minimum_consistent:
-            return PoseConsensus(guess, np.zeros(len(matches), bool))
-        hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses
-        return find_consensus(self.rig, points, measured, guess, threshold, hypotheses, seed)
-
-    def _expected(
-        self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkTable, positions: Array
-    ) -> Prediction:
-        """The prediction for another pose, with small windows."""
-        left, right = self.rig.project(transform(inverse(T_world_left), positions))
-        looked_for = self._looked_for(T_world_left, landmarks, positions)
-        view = np.flatnonzero(self.rig.left.in_image(left) & looked_for)
+    def _around(self, T_world_left: Array) -> tuple[Matches, int]:
+        """Matches in small windows around a pose, and the number of landmarks searched for."""
+        left = self.localizer.rig.left
+        uv = left.project(transform(inverse(T_world_left), self.positions))
+        view = np.flatnonzero(left.in_image(uv) & self._searched_for(T_world_left))
         innovation = np.tile(np.eye(2) * self.config.refined_window**2, (len(view), 1, 1))
-        return replace(
-            prediction,
-            T_world_left=T_world_left,
-            ids=landmarks.ids[view],
-            uv_left=left[view],
-            uv_right=right[view],
-            innovation=innovation,
-        )
+        return self._in_windows(uv[view], innovation, view), len(view)
 
-    def _again(
-        self,
-        consensus: PoseConsensus,
-        matches: Matches,
-        expected: Prediction,
-        landmarks: LandmarkTable,
-        positions: Array,
-        features: StereoFeatures,
-        seed: int,
-    ) -> tuple[Matches, PoseConsensus]:
-        """Search again in small windows around the consensus pose's predictions; returns the better matches of both."""
-        matches_again = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
-        consensus_again = self._consensus(matches_again, positions, features, consensus.T_world_left, seed)
-        if consensus_again.inliers.sum() < consensus.inliers.sum():
-            return matches, consensus
-        return matches_again, consensus_again
+    def _consensus(self, matches: Matches, guess: Array, wide: bool = False) -> PoseConsensus:
+        """The pose on which matches agree."""
+        c, rows = self.config, matches.features
+        if wide and len(matches) < c.minimum_consistent:
+            return PoseConsensus(guess, np.zeros(len(matches), bool))
+        measured = measurement_rows(self.features.uv_left[rows], self.features.uv_right[rows])
+        threshold, hypotheses = c.consistency_sigmas * self.localizer.pixel_sigma, c.hypotheses
+        return find_consensus(
+            self.localizer.rig, self.positions[matches.landmarks], measured, guess, threshold,
+            c.wide_hypotheses if wide else hypotheses, self.seed,
+        )  # fmt: skip
 
-
-def _select(prediction: Prediction, keep: BoolArray) -> Prediction:
-    """Some of the landmarks of a prediction."""
-    p = prediction
-    return replace(
-        p, ids=p.ids[keep], uv_left=p.uv_left[keep], uv_right=p.uv_right[keep], innovation=p.innovation[keep]
-    )
+    def _agreeing(self, matches: Matches, consensus: PoseConsensus) -> LandmarkMatches:
+        """The matches that agree with a pose, by ascending id."""
+        matches = matches.select(consensus.inliers)
+        if not len(matches):
+            return LandmarkMatches.nothing()
+        matches = matches.select(np.argsort(matches.landmarks, kind="stable"))
+        return LandmarkMatches(self.landmarks.ids[matches.landmarks], matches.features, consensus.T_world_left)
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:
@@ -361,13 +298,6 @@ def median_deviation(prediction: Prediction) -> float:
     S = prediction.innovation
     largest = 0.5 * (S[:, 0, 0] + S[:, 1, 1]) + np.hypot(0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1])
     return float(np.sqrt(median(largest)))
-
-
-def _matches_of(landmarks: LandmarkTable, matches: Matches, T_world_left: Array) -> LandmarkMatches:
-    if not len(matches):
-        return LandmarkMatches.nothing()
-    order = np.argsort(matches.landmarks, kind="stable")
-    return LandmarkMatches(landmarks.ids[matches.landmarks[order]], matches.features[order], T_world_left)
 
 
 def nowhere(stamp: float, T_world_left: Array) -> Prediction:

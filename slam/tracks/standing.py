@@ -19,6 +19,7 @@ from slam.geometry.arrays import median
 from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.table import Table
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
@@ -31,7 +32,7 @@ _BLIND = (
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class Places(Table):
     """Features that may stay at their pixels, a row each."""
 
     z: Array  # mean (uL, vL, uR) of their first sights (K, 3) [px]
@@ -51,9 +52,10 @@ class Places:
         from slam.tracks.follow_kernels import nearest
 
         # 0.5: largest distance of descriptors of one feature in unchanged light
-        found = nearest(z, np.argsort(self.z[:, 0], kind="stable"), self.z, radius, descriptors, self.descriptors, 0.5)
-        places = np.flatnonzero(found >= 0)
-        return places, found[places]
+        order = np.argsort(self.z[:, 0], kind="stable")
+        rows = nearest(z, order, self.z, radius, descriptors, self.descriptors, 0.5)
+        places = np.flatnonzero(rows >= 0)
+        return places, rows[places]
 
     def after(self, places: NDArray, rows: NDArray, z: Array, descriptors: NDArray[np.float32]) -> Places:
         """The places after a frame with features (N,), of which `rows` were found at `places` again."""
@@ -66,11 +68,7 @@ class Places:
         keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
         keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:3000])  # 3000: features
         new = np.delete(np.arange(len(z)), rows)
-        return Places(
-            np.concatenate([mean[keep], z[new]]), np.concatenate([self.descriptors[keep], descriptors[new]]),
-            np.concatenate([sights[keep], np.ones(len(new), np.int64)]),
-            np.concatenate([missed[keep], np.zeros(len(new), np.int64)]),
-        )  # fmt: skip
+        return Places(mean, self.descriptors, sights, missed).select(keep).joined(Places.of(z[new], descriptors[new]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,12 +112,12 @@ class Standing:
         if not (self.stands or most):
             return begun
         witnesses = stereo[rows[self.places.sights[places] >= _FRAMES]]
-        known = self.places.after(places, rows, z, descriptors)
+        places_after = self.places.after(places, rows, z, descriptors)
         at_rest, variance = _at_rest(rig, self.places.z[places], shift, self.variance)
         if at_rest:
-            return Standing(known, self.frames + 1, witnesses, variance, self.T_world_left)
+            return Standing(places_after, self.frames + 1, witnesses, variance, self.T_world_left)
         if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, _BLIND):
-            return replace(self, places=known, witnesses=witnesses, blind=self.blind + 1)
+            return replace(self, places=places_after, witnesses=witnesses, blind=self.blind + 1)
         return begun
 
     def contested(
@@ -135,7 +133,7 @@ class Standing:
             T_world_left: that pose (4, 4).
         """
         motion = inverse(T_world_left) @ self.T_world_left
-        landmarks, witnesses = (_moved(rig, sigma, features, rows, motion) for rows in (matched, self.witnesses))
+        landmarks, witnesses = (_moved_share(rig, sigma, features, rows, motion) for rows in (matched, self.witnesses))
         # 0.1: share of landmarks that a motion must move, for it to be one
         return self.moving() if landmarks > 0.1 and witnesses < 0.5 else self
 
@@ -148,13 +146,15 @@ class Standing:
         return features.select(self.witnesses)
 
 
-def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array) -> float:
+def _moved_share(
+    rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array
+) -> float:
     """Share of some features that a motion (4, 4) of what they see would move by more than noise."""
     local = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
     seen = np.isfinite(local).all(axis=1)
     z = measurement_rows(features.uv_left[rows[seen]], features.uv_right[rows[seen]])
-    moved, _ = rig.project_stereo(transform(motion, local[seen]), jacobian=False)
-    return float((((moved - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2).mean()) if seen.any() else 0.0
+    pixels, _ = rig.project_stereo(transform(motion, local[seen]), jacobian=False)
+    return float((((pixels - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2).mean()) if seen.any() else 0.0
 
 
 def _at_rest(rig: StereoRig, before: Array, d: Array, variance: float) -> tuple[bool, float]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.geometry.arrays import ascending, isin
+from slam.geometry.arrays import among, ascending, isin
 from slam.geometry.se3 import Array, transform
-from slam.showing import count
+from slam.naming import count
+from slam.table import Table
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,47 +27,29 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkTable:
-    """Landmarks in the map, a row each, ids ascending.
+class LandmarkTable(Table):
+    """Landmarks in the map, a row each, ids ascending."""
 
-    Attributes:
-        ids: landmark ids (N,).
-        descriptors: (N, D) float32.
-        laplacian: signs of the Laplacian (N,) int8.
-        seen: number of frames in which it was measured (N,).
-        in_view: number of frames in which it should have been detected or was (N,).
-        missed: number of such frames since it was last measured (N,).
-        last_seen: frame index (N,).
-        seen_from: where the camera was at its first sight (N, 3) [m], in world coordinates; NaN where not known.
-        out_of_view: number of frames in which it was outside of the image since it was last measured (N,).
-        unseen: number of frames since it was last measured (N,); only frames count in which some landmark was measured
-            and this one was not withheld as possibly moving.
-        patches: `Patch` of each at first sight (N,), or None; for alignment.
-    """
-
-    ids: IdArray
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    seen: IdArray
-    in_view: IdArray
-    missed: IdArray
-    last_seen: IdArray
-    seen_from: Array = field(default=None)  # type: ignore[arg-type]
-    out_of_view: IdArray = field(default=None)  # type: ignore[arg-type]
-    unseen: IdArray = field(default=None)  # type: ignore[arg-type]
-    patches: NDArray[np.object_] = field(default=None)  # type: ignore[arg-type]
+    ids: IdArray  # landmark ids (N,)
+    descriptors: NDArray[np.float32]  # (N, D)
+    laplacian: NDArray[np.int8]  # signs of the Laplacian (N,)
+    seen: IdArray  # number of frames in which it was measured (N,)
+    in_view: IdArray  # number of frames in which it should have been detected or was (N,)
+    missed: IdArray  # number of such frames since it was last measured (N,)
+    last_seen: IdArray  # frame index (N,)
+    seen_from: Array = None  # type: ignore[assignment]  # camera at first sight (N, 3) [m], in the world; NaN: unknown
+    out_of_view: IdArray = None  # type: ignore[assignment]  # frames outside of the image since last measured (N,)
+    # frames since it was last measured (N,), of those in which some landmark was measured and this one not withheld
+    # as possibly moving
+    unseen: IdArray = None  # type: ignore[assignment]
+    patches: NDArray[np.object_] = None  # type: ignore[assignment]  # `Patch` at first sight (N,), or None
 
     def __post_init__(self) -> None:
-        for name in ("out_of_view", "unseen"):
+        n = len(self.ids)
+        empty = {"seen_from": np.full((n, 3), np.nan), "patches": np.full(n, None)}
+        for name in ("seen_from", "out_of_view", "unseen", "patches"):
             if getattr(self, name) is None:
-                object.__setattr__(self, name, np.zeros(len(self.ids), np.int64))
-        if self.seen_from is None:
-            object.__setattr__(self, "seen_from", np.full((len(self.ids), 3), np.nan))
-        if self.patches is None:
-            object.__setattr__(self, "patches", np.full(len(self.ids), None))
-
-    def __len__(self) -> int:
-        return len(self.ids)
+                object.__setattr__(self, name, empty.get(name, np.zeros(n, np.int64)))
 
     def __repr__(self) -> str:
         return f"LandmarkTable({count(len(self), 'landmark')}, {self.descriptors.shape[1]}-D)"
@@ -103,12 +87,9 @@ class LandmarkTable:
         back = np.zeros(len(self), bool) if withheld is None else isin(self.ids, withheld)
         view, hit = self.rows(in_view), self.rows(measured)
         view = view[~back[view]]
-        seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))
-        views[view] += 1
+        seen, missed, last_seen = self.seen.copy(), self.missed.copy(), self.last_seen.copy()
+        views = self.in_view + (among(len(self), view) | among(len(self), hit))
         missed[view] += 1
-        unexpected = np.zeros(len(self), bool)
-        unexpected[hit], unexpected[view] = True, False
-        views += unexpected  # measured although not expected
         seen[hit] += 1
         missed[hit] = 0
         last_seen[hit] = frame
@@ -146,39 +127,19 @@ class LandmarkTable:
         return np.asarray((self.last_seen < 0) | (self.out_of_view >= after))
 
     def with_new(
-        self,
-        frame: int,
-        ids: IdArray,
-        features: StereoFeatures,
-        feature_rows: NDArray[np.intp],
-        camera: Array | None = None,
+        self, frame: int, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], camera: Array | None = None
     ) -> LandmarkTable:
-        """The rows with new landmarks, seen from `camera` (3,)."""
+        """The rows with new landmarks, by their ids (M,) and rows of features, seen from `camera` (3,)."""
         once = np.ones(len(ids), np.int64)
-        new = LandmarkTable(
-            ids,
-            features.descriptors[feature_rows],
-            features.laplacian[feature_rows],
-            once,
-            once,
-            once * 0,
-            once * frame,
-            None if camera is None else np.tile(camera, (len(ids), 1)),  # type: ignore[arg-type]
-        )
-        return self.joined(new)
+        seen_from = np.full((len(ids), 3), np.nan) if camera is None else np.tile(camera, (len(ids), 1))
+        looks = features.descriptors[rows], features.laplacian[rows]
+        return self.joined(LandmarkTable(ids, *looks, once, once, 0 * once, frame * once, seen_from))
 
-    def joined(self, other: LandmarkTable) -> LandmarkTable:
+    def joined(self, other: Self) -> Self:
         """These and others, ids ascending; none may be in both."""
-        both = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(LandmarkTable))
-        whole = LandmarkTable(*both)
+        whole = super().joined(other)
         return whole if ascending(whole.ids) else whole.select(np.argsort(whole.ids, kind="stable"))
 
-    def moved(self, T: Array) -> LandmarkTable:
+    def in_world(self, T: Array) -> LandmarkTable:
         """The same in another world frame; `T` (4, 4) transforms coordinates to it."""
         return replace(self, seen_from=transform(T, self.seen_from))
-
-    def select(self, keep: BoolArray | NDArray[np.intp]) -> LandmarkTable:
-        """Some of the rows, in order."""
-        if keep.dtype == bool and keep.all():
-            return self
-        return LandmarkTable(*(getattr(self, f.name)[keep] for f in fields(LandmarkTable)))

@@ -20,7 +20,7 @@ def squared_distances(residuals: Array, covariances: Array) -> Array:
 
     A row that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
     """
-    from slam.geometry import gauss_kernels as kernels
+    from slam.geometry import kernels
 
     distance = kernels.squared_distances(np.ascontiguousarray(residuals), np.ascontiguousarray(covariances))
     return np.asarray(np.where(np.isfinite(distance), distance, np.inf))
@@ -45,7 +45,7 @@ def whiteners(covariances: Array) -> Array:
     Raises:
         numpy.linalg.LinAlgError: a covariance is not positive definite.
     """
-    from slam.geometry import gauss_kernels as kernels
+    from slam.geometry import kernels
 
     W = np.asarray(kernels.whiteners(np.ascontiguousarray(covariances)))
     if not np.isfinite(W).all():

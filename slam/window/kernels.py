@@ -120,10 +120,10 @@ def relative_charts(T, points):
 
 
 @kernel
-def linearise(camera, R_left, poses, column, points, place, E, pose, point, z, weight, whole, H, b):
+def linearise(camera, poses, column, points, place, E, pose, point, z, weight, whole, H, b):
     """Add the rows' normal equations: their squared whitened residuals (M,), information, gradient and cross.
 
-    `camera` (7,) and `R_left` (3, 3) are as in `slam.kernels.stereo`; `z` is (uL, vL, uR) (M, 3), NaN where missing,
+    `camera` (7,) is as in `slam.kernels.stereo`; `z` is (uL, vL, uR) (M, 3), NaN where missing,
     and `weight` 1 / σ (M,), zero for a row that does not count. Unless
     `whole`, H is left as it is.
     """
@@ -136,7 +136,7 @@ def linearise(camera, R_left, poses, column, points, place, E, pose, point, z, w
         if w == 0.0:
             continue
         transform_back(poses[pose[m]], points[point[m]], q)
-        if not residual(camera, R_left, q, z[m], r, D):
+        if not residual(camera, q, z[m], r, D):
             squares[m] = _BEHIND
             continue
         for i in range(3):
@@ -400,7 +400,7 @@ def _displace(p, E, d, out):
 
 
 @kernel
-def left_out_distances(camera, R_left, T, points, z, covariances, sigma, least):
+def left_out_distances(camera, T, points, z, covariances, sigma, least):
     """Squared distance (M,) of each row from what all others predict for it, at the solution, with 3 or 2 numbers.
 
     With r the residual, ``rᵀ (σ² 1 − J C Jᵀ)⁻¹ r``, C the point's covariance (3, 3) in the newest camera T, in which
@@ -411,7 +411,7 @@ def left_out_distances(camera, R_left, T, points, z, covariances, sigma, least):
     S, inverse = np.empty((3, 3)), np.empty((3, 3))
     for m in range(len(points)):
         transform_back(T, points[m], q)
-        if not residual(camera, R_left, q, z[m], r, D):
+        if not residual(camera, q, z[m], r, D):
             out[m] = np.inf
             continue
         if np.isnan(r[2]):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.data import BoolArray
-from slam.geometry import pose_kernels as kernels
+from slam.geometry import kernels
 from slam.geometry.pnp import STEPS
 from slam.geometry.se3 import Array, inverse, log
 from slam.window.gating import chi_square_gate, whiteners
@@ -73,7 +73,7 @@ def whitened_residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
 def residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
     """Measured less predicted (M, 3), NaN where missing, and the prediction's Jacobians (M, 3, 6) by the pose."""
     stereo = problem.stereo
-    r, J = kernels.residuals(stereo.intrinsics, stereo.R_left, problem.points, problem.z, T)
+    r, J = kernels.residuals(stereo.intrinsics, problem.points, problem.z, T)
     return r, J
 
 
@@ -95,7 +95,7 @@ def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: Boo
     stereo, T = problem.stereo, start[None].copy()
     rows = np.arange(len(problem.points)) if used is None else np.flatnonzero(used)
     kernels.gauss_newton(
-        stereo.intrinsics, stereo.R_left, problem.points, problem.z, whitener, rows[None], problem.information,
+        stereo.intrinsics, problem.points, problem.z, whitener, rows[None], problem.information,
         log(inverse(problem.predicted) @ start), T, _HUBER if used is None else np.inf, STEPS, _CONVERGED,
     )  # fmt: skip
     return np.asarray(T[0])

@@ -98,7 +98,6 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
     E = kernels.charts(w.poses, centre, w.points, w.place, w.basis, 0)
     squares, information, gradient, cross = kernels.linearise(
         w.stereo.intrinsics,
-        w.stereo.R_left,
         w.poses,
         w.column,
         w.points,

@@ -1,7 +1,7 @@
-"""Stereo measurements in the rectified rig, in which estimators work.
+"""Stereo measurements as estimators take them.
 
-A measurement is (uL, vL, uR) in rectified pixels, uR shifted so that both cameras share one u0; uR is NaN where there
-is no right pixel. The body frame is the rig's own left camera, the sensor its rectified rig.
+A measurement is (uL, vL, uR) in pixels of a rectified rig, uR shifted so that both cameras share one u0; uR is NaN
+where there is no right pixel.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 from slam.data import IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
-from slam.geometry.rig import RectifiedRig, StereoRig
-from slam.geometry.rig_kernels import project_rectified, triangulate_rectified
+from slam.geometry.kernels import project_rectified, triangulate_rectified
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.models import EstimatorModels
 from slam.window.agreement import landmarks_pose
@@ -24,57 +24,30 @@ from slam.window.gating import with_noise
 
 @dataclass(frozen=True, eq=False)
 class RectifiedStereo:
-    """Projection by a rectified rig, and the way from the original rig's pixels to its.
+    """Projection by a rectified rig."""
 
-    Attributes:
-        rectified_rig: the rectified rig.
-        f, u0, v0, baseline: of the rectified rig [px], [m].
-        doffs: u0 of the right camera less that of the left [px].
-        scale: rectified pixels per original pixel, on average over the image.
-    """
-
-    rectified_rig: RectifiedRig
-    f: float
-    u0: float
+    rig: StereoRig
+    intrinsics: Array  # as `StereoRig.rectified_parameters` (7,), where both cameras have one u0
+    f: float  # focal length [px]
+    u0: float  # principal point [px]
     v0: float
-    baseline: float
-    doffs: float
-    scale: float
-
-    @cached_property
-    def intrinsics(self) -> Array:
-        """Of the rectified rig (7,), as `StereoRig.rectified_parameters`, where both cameras have one u0."""
-        return np.array([self.f, self.f, self.u0, self.v0, self.f, self.u0, -self.baseline])
-
-    @cached_property
-    def R_left(self) -> Array:
-        """Rotation (3, 3) from left-camera to rectified axes."""
-        return np.ascontiguousarray(self.rectified_rig.R_left)
+    baseline: float  # [m]
+    doffs: float  # u0 of the right camera less that of the left [px]
 
     @classmethod
     def of(cls, rig: StereoRig) -> RectifiedStereo:
-        """For a rig as calibrated."""
-        rectified_rig = rig.rectified
-        left, right = rectified_rig.rig.left, rectified_rig.rig.right
-        return cls(
-            rectified_rig,
-            left.fu,
-            left.u0,
-            left.v0,
-            rectified_rig.rig.baseline,
-            right.u0 - left.u0,
-            rectified_rig.scale,
-        )
+        """For a rectified rig.
+
+        Raises:
+            CalibrationError: the rig is not rectified.
+        """
+        f, _, u0, v0, _, right_u0, shift = rig.rectified_parameters.tolist()
+        return cls(rig, np.array([f, f, u0, v0, f, u0, shift]), f, u0, v0, -shift, right_u0 - u0)
 
     def measure(self, observations: Observations) -> Array:
-        """Measurements (M, 3) = (uL, vL, uR) of observations in the rig's own pixels."""
+        """Measurements (M, 3) = (uL, vL, uR) of observations."""
         z = np.empty((len(observations), 3))
-        if self.rectified_rig.original.is_rectified:
-            z[:, :2], z[:, 2] = observations.uv_left, observations.uv_right[:, 0]
-        else:
-            z[:, :2] = self.rectified_rig.rectify_left(observations.uv_left)
-            z[:, 2] = self.rectified_rig.rectify_right(observations.uv_right)[:, 0]
-        z[:, 2] -= self.doffs
+        z[:, :2], z[:, 2] = observations.uv_left, observations.uv_right[:, 0] - self.doffs
         return z
 
     @staticmethod
@@ -94,15 +67,14 @@ class RectifiedStereo:
 
         Points that are not in front of the camera give NaN measurements and zero Jacobians.
         """
-        R = self.rectified_rig.R_left
-        z, J = project_rectified(self.intrinsics, local @ R.T, True)
+        z, J = project_rectified(self.intrinsics, np.ascontiguousarray(local), True)
         J[np.isnan(z[:, 0])] = 0
-        return z, J if self.rectified_rig.original.is_rectified else J @ R
+        return z, J
 
     def triangulate(self, z: Array) -> Array:
         """Points (N, 3) in the left camera's coordinates; NaN where the disparity is not positive or missing."""
-        points = triangulate_rectified(self.intrinsics, np.ascontiguousarray(z[:, :2]), np.ascontiguousarray(z[:, 2:]))
-        return np.asarray(points @ self.rectified_rig.R_left)
+        left, right = np.ascontiguousarray(z[:, :2]), np.ascontiguousarray(z[:, 2:])
+        return np.asarray(triangulate_rectified(self.intrinsics, left, right))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +86,8 @@ class RectifiedMeasurement:
 
     @cached_property
     def stereo(self) -> RectifiedStereo:
-        """The rectified rig that measures."""
+        """Projection by the rig."""
         return RectifiedStereo.of(self.rig)
-
-    @cached_property
-    def sigma(self) -> float:
-        """Noise of rectified pixels [px]."""
-        return self.models.pixel_sigma * self.stereo.scale
 
     def first_sight(self, ids: IdArray, z: Array, farthest: float = np.inf) -> tuple[Array, Array]:
         """New landmarks in the left camera's coordinates (M, 3) [m], with covariances (M, 3, 3) (paper A, Eqs. 8, 10).
@@ -139,7 +106,7 @@ class RectifiedMeasurement:
             raise MeasurementError(f"landmark {ids[bad][0]} has no right pixel or no positive depth")
         local = local * np.minimum(1.0, farthest / np.maximum(local[:, 2:], 1e-300))
         back = np.linalg.inv(self.stereo.project(local)[1])
-        return local, self.sigma**2 * back @ np.swapaxes(back, 1, 2)
+        return local, self.models.pixel_sigma**2 * back @ np.swapaxes(back, 1, 2)
 
     def visible(self, T: Array, points: Array) -> IndexArray:
         """Which points (N, 3) in the world are in the angle of view from a pose T (4, 4) (paper A, Fig. 3)."""
@@ -163,10 +130,7 @@ class RectifiedMeasurement:
             T: guess of the pose (4, 4).
             seed: of the random choice.
         """
-        rectified = self.stereo.rectified_rig
-        rows, turned = z + np.array([0.0, 0.0, self.stereo.doffs]), T @ rectified.T_left_rectified
-        found = landmarks_pose(rectified.rig, points, rows, self.models, turned, seed)
-        return None if found is None else found @ inverse(rectified.T_left_rectified)
+        return landmarks_pose(self.rig, points, z + np.array([0.0, 0.0, self.stereo.doffs]), self.models, T, seed)
 
 
 def relative_covariance(P: Array, earlier: Array, later: Array) -> Array:

@@ -17,7 +17,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
-from slam.showing import sequence_line
+from slam.naming import sequence_line
 from slam.worlds.observe import Appearance, SimulatedFeatures, appearance, simulate
 from slam.worlds.options import Faults
 from slam.worlds.world import World

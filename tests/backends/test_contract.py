@@ -14,7 +14,7 @@ from slam import registry
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.interfaces import Backend
-from slam.testing import BACKEND_CHECKS, RIG, RIGHT, RUNS, check_backend, estimation, findings, hostile
+from slam.testing import BACKEND_CHECKS, RIG, RIGHT, RUNS, check_backend, estimation, findings, hostile, protocol
 from slam.testing.__main__ import main
 from tests.backends.fixed_map import FixedMapBackend
 from tests.backends.scenes import path, scene
@@ -150,16 +150,14 @@ def test_a_status_that_is_a_word_is_told_from_the_right_one():
             return replace(report, status=str(report.status))
 
     failed = {found.check: found.failure for found in findings(Wordy, "runs") if found.failure}
-    assert failed["updates_are_reported"] == (
-        "status of an update with good observations is 'ok', a str, not slam.data.UpdateStatus.OK"
-    )
+    assert failed["answers_are_as_documented"].endswith("Wordy.update: status must be a UpdateStatus, got str")
 
 
 @pytest.mark.parametrize(
     ("broken", "check"),
     [
         (Nosy, hostile.queries_are_pure),
-        (Twice, hostile.a_stamp_has_one_update),
+        (Twice, protocol.a_stamp_has_one_update),
         (FixedMapBackend, estimation.landmarks_are_corrected),  # it never updates its landmarks
     ],
 )

@@ -7,9 +7,7 @@ import pytest
 
 import backends
 from backends.smoother.landmarks import SmootherLandmarks
-from slam.data import Observations
 from slam.geometry import se3
-from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
 from tests.backends.scenes import RIG, path, scene, step
@@ -43,27 +41,6 @@ def test_frames_that_see_nothing_at_uneven_times_leave_the_same_uncertainty(name
     np.testing.assert_allclose(deviations(other), deviations(filtered), rtol=0.02)
     off = se3.log(se3.inverse(filtered.estimate().T_world_left) @ other.estimate().T_world_left)
     assert np.abs(off / deviations(filtered)).max() < 0.02
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_the_noise_is_that_of_the_rigs_own_pixels(name):
-    """Rectified pixels of this rig are a quarter finer than those of the left camera, and as fine as the right one's.
-
-    The filter measures in the rig's own pixels; the others take all rectified ones to be as noisy as the left ones.
-    """
-    left, right = PinholeCamera(400, 400, 320, 240, 641, 481), PinholeCamera(500, 500, 320, 240, 641, 481)
-    rig = StereoRig(left, right, se3.so3_exp(np.array([0.01, 0.02, 0.0])), np.array([-0.3, 0.0, 0.0]))
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-1, 1, (40, 2)), rng.uniform(3, 6, 40)])
-    seen = Observations(np.arange(40), *rig.project(points))
-    filtered, other = (made(each, rig) for each in ("ekf", name))
-    for backend in (filtered, other):
-        backend.predict(0.0)
-        backend.add(seen)
-        backend.predict(0.1)
-        backend.update(seen)
-    ratio = deviations(other) / deviations(filtered)
-    assert ratio.min() > 0.98 and ratio.max() < 1.28, ratio
 
 
 def test_drift_adds_up_while_a_landmark_is_not_seen():

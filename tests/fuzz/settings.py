@@ -18,8 +18,7 @@ from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.mapping.selection import MapConfig
-from slam.models import EstimatorModels, MotionModel
-from slam.object_models import ObjectModels
+from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam
 from slam.tracks.config import AssociationConfig

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 
+import numpy as np
 import pytest
 
 from slam.errors import SlamError
+from tests.fuzz.bookkeeping import MENDED, keep_books
 from tests.fuzz.catalogue import SUBJECTS
 from tests.fuzz.harness import Broken, Subject, run_case, warm_up
 
@@ -23,6 +25,11 @@ def test_what_is_promised_of_hostile_input(subject, part):
     numbers = range(first) if part == "first" else range(first, subject.short)
     failures = [f for number in numbers if (f := run_case(subject, 0, number)) is not None]
     assert not failures, "\n".join(f"case {f.number}: {f.signature}" for f in failures)
+
+
+@pytest.mark.parametrize("seed", MENDED)
+def test_what_bookkeeping_found_stays_mended(seed, tmp_path):
+    keep_books(np.random.default_rng(seed), tmp_path)
 
 
 def _wait(rng, folder):

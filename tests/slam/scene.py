@@ -6,9 +6,18 @@ import numpy as np
 
 from slam.data import StereoFeatures
 from slam.geometry import se3
+from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 
 RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
+
+#: Distorted, with the right camera turned and shifted.
+GENERAL_RIG = StereoRig(
+    PinholeCamera(410.0, 405.0, 310.0, 245.0, 640, 480, "radtan", (-0.1, 0.02, 1e-3, -5e-4)),
+    PinholeCamera(400.0, 402.0, 325.0, 238.0, 640, 480, "radtan", (-0.08, 0.01, -5e-4, 1e-3)),
+    se3.so3_exp(np.array([0.01, -0.03, 0.005])),
+    np.array([-0.2, 0.004, -0.006]),
+)
 
 
 class Cloud:

@@ -78,7 +78,7 @@ def aligning(**answers) -> StereoSlam:
 
 WRONG = [
     ("patches", lambda p: None, "patches: must give a Patches"),
-    ("patches", lambda p: p.select(np.arange(1)), "patches: images must be"),
+    ("patches", lambda p: replace(p, images=p.images[:1]), "patches: images must be|patches: centres"),
     ("patches", lambda p: Patches(p.images, p.centres[:, :1], p.size), "patches: centres"),
     ("align", lambda f: None, "align: must give a tuple"),
     ("align", lambda f: (f[0][:-1], f[1]), "align: must give left and right"),

@@ -1,12 +1,18 @@
+"""Settings: from text and files to their place, with types and ranges."""
+
 from __future__ import annotations
 
 import json
 import re
+from dataclasses import fields
 
+import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.errors import ConfigurationError
+from slam.errors import ConfigurationError, SlamError, one_line
+from slam.mapping.config import MapConfig
+from tests.fuzz.settings import CLASSES
 
 
 def test_settings_reach_their_place():
@@ -27,9 +33,10 @@ def test_settings_reach_their_place():
 
 @pytest.mark.parametrize("kind", ["driving", "handheld"])
 def test_json_and_back(kind):
-    config = SystemConfig.for_kind(kind).with_settings(["backend.iterations=3"])
+    pose = "[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
+    config = SystemConfig.for_kind(kind).with_settings(["backend.iterations=3", f"models.T_world_left={pose}"])
     tree = json.loads(json.dumps(config.to_json()))
-    assert SystemConfig.from_json(tree) == config
+    assert SystemConfig.from_json(tree) == config and config.models.initial_pose[0, 3] == 2
 
 
 @pytest.mark.parametrize(
@@ -54,6 +61,9 @@ def test_json_and_back(kind):
         ("association.d_match=[NaN, 0.2]", "d_match must be finite"),
         ("association.consistency_sigmas=-3", "consistency_sigmas must be finite and not negative"),
         ("models.T_world_left=[[1, 2], [3, 4]]", "T_world_left must be"),
+        ("map.max_landmark=3", "did you mean 'max_landmarks'?"),
+        ("mpa.monocular=true", "did you mean 'map.monocular'?"),
+        ("map.max_speed=3", "did you mean 'objects.max_speed'?"),  # not that of the models, which cannot be set
     ],
 )
 def test_bad_settings(setting, message):
@@ -61,20 +71,43 @@ def test_bad_settings(setting, message):
         SystemConfig.for_kind("handheld").with_settings([setting])
 
 
-def test_a_first_pose_comes_through():
-    pose = "[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
-    config = SystemConfig.for_kind("handheld").with_settings([f"models.T_world_left={pose}"])
-    assert config.models.initial_pose[0, 3] == 2
-    assert SystemConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
-
-
-def test_unknown_kind():
+def test_unknown_kind_and_unknown_key_in_a_file():
     with pytest.raises(ConfigurationError, match="known: handheld, driving"):
         SystemConfig.for_kind("flying")
-
-
-def test_unknown_key_in_a_file():
     tree = SystemConfig().to_json()
     tree["map"]["colour"] = 1
     with pytest.raises(ConfigurationError, match=r"map\.colour"):
         SystemConfig.from_json(tree)
+
+
+HOSTILE = (None, "x", b"x", [], {}, 1j, 10**23, 10**400, 1e308, -1e308, np.nan, np.inf, -1, (1, 2, 3, 4), object())
+
+
+@pytest.mark.parametrize("kind", CLASSES, ids=lambda k: k.__name__)
+def test_every_field_of_every_class_refuses_what_it_cannot_be(kind):
+    for f in fields(kind):
+        refused = 0
+        for value in HOSTILE:
+            try:
+                kind(**{f.name: value})
+            except ConfigurationError as error:
+                refused += 1
+                assert "\n" not in str(error) and len(str(error)) < 700 and f.name in str(error)
+        assert refused >= 8, f"{kind.__name__}.{f.name} takes nearly anything"
+
+
+def test_a_setting_of_any_length_is_refused_in_one_line():
+    for text in ("map.grid=" + "[" * 100_000, "x" * 100_000, "models.pixel_sigma=" + "9" * 5000):
+        with pytest.raises(ConfigurationError) as caught:
+            SystemConfig().with_settings([text])
+        assert len(str(caught.value)) < 700
+
+
+def test_numpys_numbers_and_lists_are_taken():
+    assert MapConfig(grid=[8, 4], max_landmarks=np.int64(500), spacing=np.float32(0.5), separation=3)
+
+
+def test_one_line():
+    assert one_line("a\nb\x1b[1mc\0") == r"a b\x1b[1mc\x00"
+    assert len(one_line("x" * 10_000)) < 700 and "…" in one_line("x" * 10_000)
+    assert str(SlamError("a\r\nb")) == r"a\r b"

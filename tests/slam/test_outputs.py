@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from slam.errors import SlamError
-from slam.files import RowFile, note_input, noting_inputs, read_bytes, write_png, write_text
+from slam.files import RowFile, write_png, write_text
 from slam.outputs import Output, require_outputs
 
 
@@ -102,15 +102,6 @@ def test_something_else_in_place_of_a_file_of_a_folder(tmp_path):
     (tmp_path / "a.txt").rmdir()
     (tmp_path / "runs").write_text("x")
     refused([folder(tmp_path)], "not a folder", overwrite=True)
-
-
-def test_what_is_read_is_noted(tmp_path):
-    (tmp_path / "a").write_text("x")
-    with noting_inputs() as found:
-        read_bytes(tmp_path / "a", 10)
-        note_input(tmp_path)
-    read_bytes(tmp_path / "a", 10)
-    assert found == [tmp_path / "a", tmp_path]
 
 
 def test_what_a_link_points_to_is_left_alone(tmp_path):

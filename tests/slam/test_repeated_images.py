@@ -61,17 +61,6 @@ def test_a_camera_that_stands_still_is_tracked_by_its_noise():
     assert {r.status for r in results[1:]} == {FrameStatus.TRACKED} and s.warnings == []
 
 
-def test_buffers_that_are_filled_again_are_new_images_and_copies_are_old_ones():
-    s, left, right = system(), FRAMES[0].left.copy(), FRAMES[0].right.copy()
-    results = []
-    for k in (0, 1, 2):
-        left[:], right[:] = FRAMES[k].left, FRAMES[k].right
-        results.append(s.process(left, right, k / 30))
-    assert repeats(results) == []
-    assert repeats([s.process(left.copy(), np.asfortranarray(right), 0.1)]) == [3]
-    assert repeats([s.process(FRAMES[3].left, right, 0.2)]) == []  # one image of the two is new
-
-
 def test_what_another_thread_has_read_ahead_is_not_taken_for_the_frame_before():
     frames = shown([0, 1, 2])
     s = system()

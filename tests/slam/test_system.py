@@ -11,7 +11,6 @@ from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
-from slam.objects.modes import NoDetector
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
@@ -60,13 +59,6 @@ def test_frames_with_nothing_to_see_are_predicted(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_starts_late_where_the_first_frames_are_empty(backend):
-    _, results, _ = run(backend, frames=8, change=nothing_at(0, 1, 2))
-    statuses = [r.status.value for r, _ in results]
-    assert statuses == ["predicted"] * 3 + ["started"] + ["tracked"] * 4
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_new_map_forgets_what_the_rig_s_error_does_to_the_landmarks_of_the_old_one(backend):
     """By a baseline 33 times too long nothing is tracked, and map follows map, while the calibration goes on."""
     sequence = slam.open_sequence("synthetic:desk?frames=12&baseline=0.075")
@@ -89,11 +81,10 @@ def test_time_must_increase():
 
 def test_landmarks_held_in_suspicion_stay_and_are_not_counted():
     cloud = Cloud(150)
-    system = StereoSlam(RIG, None, "ekf", config=CONFIG)
+    system = StereoSlam(RIG, None, "ekf", config=CONFIG.with_settings(["objects.mode=off"]))
     held = np.zeros(0, np.int64)
     for k, T in enumerate(path(20)):
         if k == 5:
-            system.objects = NoDetector()
             held = system.objects.suspects = system.landmarks.ids[:6].copy()
             before = system.landmarks.select(np.arange(6))
         result = system.process_features(cloud.features(T, k / 30, 0.3)[0])

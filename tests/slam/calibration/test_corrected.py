@@ -11,8 +11,8 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
 from slam.sequences.rigs import write_kalibr, write_opencv
-from slam.testing import GENERAL_RIG
 from tests.slam.calibration.drives import CAR
+from tests.slam.scene import GENERAL_RIG
 
 OFF = np.random.default_rng(0).normal(0, 3e-4, len(RigModel.names))
 

@@ -11,10 +11,9 @@ from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.system import StereoSlam
-from slam.testing import GENERAL_RIG
-from slam.tracker import _moved_as
+from slam.tracker import _shifted_as
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
-from tests.slam.scene import RIG, Cloud
+from tests.slam.scene import GENERAL_RIG, RIG, Cloud
 
 #: A turn of the right camera after a knock [rad].
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
@@ -173,9 +172,9 @@ def test_features_that_move_are_corrected_as_they_were():
     moved = replace(before, uv_left=before.uv_left.copy(), uv_right=before.uv_right.copy())
     moved.uv_left[3] += 0.4
     moved.uv_right[5:7] = np.nan
-    assert _moved_as(before, before, moved) is moved  # nothing is known yet
+    assert _shifted_as(before, before, moved) is moved  # nothing is known yet
     calibration.applied = RigCorrection(RigModel(RIG), parameters(right_cx=2e-3, yaw=1e-3))
-    again, whole = _moved_as(calibration.correct(before), before, moved), calibration.correct(moved)
+    again, whole = _shifted_as(calibration.correct(before), before, moved), calibration.correct(moved)
     np.testing.assert_allclose(again.uv_left, whole.uv_left, atol=1e-3)
     np.testing.assert_allclose(again.uv_right, whole.uv_right, atol=1e-3)
 

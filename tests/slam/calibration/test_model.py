@@ -8,8 +8,8 @@ from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from slam.testing import GENERAL_RIG
 from tests.slam.calibration.drives import CAR, parameters, residual_field
+from tests.slam.scene import GENERAL_RIG
 
 MODEL = RigModel(CAR)
 F = MODEL.focal

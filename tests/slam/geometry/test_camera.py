@@ -69,15 +69,6 @@ def test_behind_the_camera_is_nan_and_not_in_view(camera):
     assert not camera.in_view(points).any()
 
 
-def test_angle_of_view(camera):
-    _, points = points_in_view(camera, 10)
-    assert camera.in_view(points).all()
-    outside = points * np.array([1, 1, -1])
-    assert not camera.in_view(outside).any()
-    assert not camera.in_image(np.array([[-0.1, 5], [5, -0.1], [camera.width - 0.9, 5], [5, camera.height]])).any()
-    assert camera.in_image(np.array([[0.0, 0.0], [camera.width - 1, camera.height - 1]])).all()
-
-
 def test_far_rays_are_not_folded_back_into_the_image():
     camera = CAMERAS["radtan5"]
     a = np.linspace(0.0, 4.0, 400)

@@ -19,12 +19,6 @@ def measured_from(T, count=80, noise=0.0, seed=0):
 T_TRUE = se3.exp(np.array([0.05, -0.1, 0.03, 0.2, -0.1, 0.15]))
 
 
-def test_exact_measurements_give_the_exact_pose():
-    points, z = measured_from(T_TRUE)
-    found = find_consensus(RIG, points, z, np.eye(4), threshold=2.0, hypotheses=100, seed=0)
-    np.testing.assert_allclose(found.T_world_left, T_TRUE, atol=1e-9)
-
-
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
 def test_consensus_among_wrong_matches(share):
     points, z = measured_from(T_TRUE, noise=0.3)
@@ -39,13 +33,6 @@ def test_consensus_among_wrong_matches(share):
     # 0.3 px at f = 300 and 3.5 m, over at least 30 points: 0.3/300/√30 rad and 3.5 m times that; 4 sigmas of it.
     assert np.abs(error[:3]).max() < 4 * 0.3 / 300 / np.sqrt(30) * 2
     assert np.abs(error[3:]).max() < 4 * 3.5 * 0.3 / 300 / np.sqrt(30) * 2
-
-
-def test_a_far_guess_does_not_matter():
-    points, z = measured_from(T_TRUE, noise=0.3)
-    guess = se3.exp(np.array([0.3, 0.8, -0.5, 2.0, 1.0, -1.0]))
-    found = find_consensus(RIG, points, z, guess, threshold=2.0, hypotheses=100, seed=0)
-    assert found.inliers.mean() > 0.98
 
 
 def test_monocular_rows_count_by_their_left_pixel():

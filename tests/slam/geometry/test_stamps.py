@@ -28,18 +28,6 @@ def test_increasing_drops_as_few_rows_as_any_choice_could(stamps: list[int]) -> 
     assert len(rows) == longest
 
 
-def test_increasing_forgives_one_leap_ahead() -> None:
-    assert increasing([1, 2, 99, 3, 4]).tolist() == [0, 1, 3, 4]
-    assert increasing([1, 1, 1]).tolist() in ([0], [1], [2])
-    assert increasing([]).tolist() == []
-
-
-def test_increasing_is_quick_for_long_lists() -> None:
-    stamps = np.arange(50_000)
-    stamps[100] = 10**9  # forces the slow way; quadratic time would take many seconds
-    assert len(increasing(stamps)) == 49_999
-
-
 @given(KEYS, KEYS, st.integers(0, 10))
 def test_pairs_are_near_and_unique_and_none_is_forgotten(left: list[int], right: list[int], tolerance: int) -> None:
     a, c = np.array(left, int), np.array(right, int)

@@ -11,8 +11,7 @@ from slam.geometry.rig import StereoRig
 from slam.input.rectification import Rectification
 from slam.models import models_for
 from slam.system import StereoSlam
-from slam.testing import GENERAL_RIG
-from tests.slam.scene import Cloud
+from tests.slam.scene import GENERAL_RIG, Cloud
 
 
 def test_a_rig_with_lenses_gives_what_its_rectified_pair_gives():

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from slam.data import Estimate, StereoFeatures
-from slam.models import EstimatorModels, MotionModel
-from slam.object_models import ObjectModels
+from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.objects.bodies import hidden, new_body
 from slam.objects.config import ObjectsConfig
 from slam.objects.detector import MovingObjectDetector

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.geometry.gauss_kernels import near_pairs
+from slam.geometry.kernels import near_pairs
 from slam.geometry.se3 import exp
 from slam.objects import scene_kernels, track_kernels
 

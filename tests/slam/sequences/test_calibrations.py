@@ -352,7 +352,7 @@ def test_what_is_no_calibration_is_one_line(tmp_path: Path, two_folders: Path) -
         ({"R": np.eye(4)}, r"\(3, 3\) rotation"),
         ({"R": np.full((3, 3), np.nan)}, "finite"),
         ({"D_left": np.ones(14)}, "thin prisms"),
-        ({"D_left": "none"}, "no numbers"),
+        ({"D_left": "none"}, "must be numbers"),
         ({"K_right": np.eye(2)}, r"\(3, 3\)"),
         ({"size": (64, 0)}, "size must be positive"),
     ],

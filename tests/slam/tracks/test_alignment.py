@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import slam
-from slam.config import SystemConfig
 from slam.data import IdArray, ImagePair, Patches
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.tracks.alignment import Aligner, warps_of
+from slam.tracks import alignment
+from slam.tracks.alignment import warps_of
 from slam.tracks.localizer import LandmarkMatches
 from slam.tracks.table import LandmarkTable, Patch
 
@@ -81,24 +81,15 @@ def frame(right: bool = True) -> slam.StereoFeatures:
     return replace(_features(4), uv_left=uv, uv_right=uv_right, scale=np.full(4, 15.0), images=pair)
 
 
-def align(features: slam.StereoFeatures, landmarks: LandmarkTable, seen: LandmarkMatches = SEEN, enabled: bool = True):
+def align(features: slam.StereoFeatures, landmarks: LandmarkTable, seen: LandmarkMatches = SEEN):
     places = dict(zip(IDS.tolist(), POINTS))
-    aligner = Aligner(RIG, enabled)
-    return aligner.align(Shifting(), features, seen, landmarks, lambda ids: np.array([places[i] for i in ids.tolist()]))
+    positions = lambda ids: np.array([places[i] for i in ids.tolist()])  # noqa: E731
+    return alignment.align(RIG, Shifting(), features, seen, landmarks, positions)
 
 
 @pytest.mark.parametrize("right", [True, False])
 def test_features_move_to_their_patches_also_without_a_right_image(right):
     features = frame(right)
-    aligned, landmarks = align(features, rows(IDS, np.eye(4)))
-    np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
-    np.testing.assert_allclose(aligned.uv_right, features.uv_right + SHIFT)
-    assert landmarks.has_patch.all()
-
-
-def test_a_feature_that_has_no_right_pixel_is_aligned_in_the_left_image():
-    features = frame()
-    features.uv_right[2] = np.nan
     aligned, landmarks = align(features, rows(IDS, np.eye(4)))
     np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
     np.testing.assert_allclose(aligned.uv_right, features.uv_right + SHIFT)
@@ -112,7 +103,7 @@ def test_a_patch_that_is_not_found_or_of_another_scale_is_taken_anew(nearer, siz
     aligned, landmarks = align(features, rows(IDS, then, size))
     np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
     assert not landmarks.has_patch.any()
-    landmarks = Aligner(RIG, True).with_patches(Shifting(), aligned, SEEN, landmarks, np.eye(4))
+    landmarks = alignment.with_new_patches(Shifting(), aligned, SEEN, landmarks, np.eye(4))
     assert [(p.size, p.T_world_left.tolist()) for p in landmarks.patches] == 4 * [(15.0, np.eye(4).tolist())]
 
 
@@ -129,7 +120,6 @@ def test_without_a_pose_or_images_nothing_moves_and_what_was_not_seen_for_long_i
     for aligned, after in (
         align(features, landmarks, replace(SEEN, T_world_left=None)),
         align(replace(features, images=None), landmarks),
-        align(features, landmarks, enabled=False),
     ):
         np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
         assert after.has_patch.all()
@@ -137,31 +127,3 @@ def test_without_a_pose_or_images_nothing_moves_and_what_was_not_seen_for_long_i
     assert after.has_patch.tolist() == [True, False, True, True]
     moved = np.abs(aligned.uv_left - features.uv_left).max(axis=1) > 0
     assert moved[SEEN.rows].tolist() == [True, False, True, True]
-
-
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_features_slide_less(backend):
-    """Reprojection errors of the true path are half as large; all else is the same."""
-    sequence = slam.open_sequence("synthetic:desk?frames=8")
-    config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-    true = sequence.ground_truth.poses
-    slid = {}
-    for aligned in (False, True):
-        association = replace(config.association, align=aligned)
-        system = slam.StereoSlam(sequence.rig, backend=backend, config=replace(config, association=association))
-        first: dict[int, np.ndarray] = {}  # where the landmarks are, by their first sight and the true pose
-        errors = []
-        for k, frame in enumerate(sequence):
-            result = system.process(frame)
-            assert result.features.images is None  # a result does not hold the images
-            z = result.features
-            known = np.array([i in first for i in result.matched.tolist()], bool)
-            if known.any():
-                points = np.array([first[i] for i in result.matched[known].tolist()])
-                expected = sequence.rig.left.project(se3.transform(se3.inverse(true[k]), points))
-                errors.append(np.linalg.norm(z.uv_left[result.matched_features[known]] - expected, axis=1))
-            rows = result.added_features
-            world = se3.transform(true[k], sequence.rig.triangulate(z.uv_left[rows], z.uv_right[rows]))
-            first |= dict(zip(result.added.tolist(), world))
-        slid[aligned] = np.median(np.concatenate(errors))
-    assert slid[True] < 0.7 * slid[False]

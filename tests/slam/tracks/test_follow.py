@@ -9,7 +9,7 @@ from slam.data import Prediction, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.tracks.config import AssociationConfig
-from slam.tracks.follow import crowded, follow, match_everywhere, match_in_boxes
+from slam.tracks.follow import follow, match_everywhere, match_in_boxes
 from tests.slam.scene import RIG, Cloud
 
 CONFIG = AssociationConfig()
@@ -36,15 +36,6 @@ def test_every_landmark_finds_its_own_feature():
     matches = found(cloud, prediction, features)
     assert len(matches) == len(ids)
     np.testing.assert_array_equal(prediction.ids[matches.landmarks], ids[matches.features])
-
-
-def test_larger_window_finds_what_the_smallest_does_not():
-    cloud = Cloud()
-    features, ids = cloud.features(np.eye(4), 0.0)
-    prediction = predicted(cloud, np.eye(4), offset=(8.0, 0.0))  # 4 sigmas: outside of 2.5, inside of 5
-    assert len(found(cloud, prediction, features)) == len(ids)
-    small = AssociationConfig(window_sigmas=(2.5,), d_match=(0.55,))
-    assert len(found(cloud, prediction, features, small)) == 0
 
 
 def test_fixed_windows_do_not_care_for_the_covariance():
@@ -154,12 +145,6 @@ def test_nothing_to_match():
     assert len(match_everywhere(cloud.descriptors, cloud.laplacian, nothing, CONFIG)) == 0
     features, _ = cloud.features(np.eye(4), 0.0)
     assert len(match_everywhere(cloud.descriptors[:0], cloud.laplacian[:0], features, CONFIG)) == 0
-
-
-def test_crowded():
-    uv = np.array([[0.0, 0], [10, 0], [20, 0]])
-    assert crowded(uv, np.array([[1.0, 1.0], [19.0, 0.0]]), 3).tolist() == [True, False, True]
-    assert not crowded(uv, np.zeros((0, 2)), 3).any()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
-from slam.tracks.localizer import Localizer, jump
+from slam.tracks.localizer import Localizer, Search, jump
 from slam.tracks.state import TrackingState
 from slam.tracks.table import LandmarkTable
 from tests.slam.scene import RIG, Cloud
@@ -35,17 +35,18 @@ def prediction(positions: np.ndarray, deviation: float, window: float) -> Predic
     return Prediction(1.0, np.eye(4), deviation**2 * np.eye(6), view, left[view], right[view], innovation)
 
 
-def localizer() -> Localizer:
-    return Localizer(RIG, AssociationConfig(), EstimatorModels(pixel_sigma=0.5))
+def search(expected: Prediction, landmarks: LandmarkTable, positions: np.ndarray, features: StereoFeatures) -> Search:
+    localizer = Localizer(RIG, AssociationConfig(), EstimatorModels(pixel_sigma=0.5))
+    return Search(localizer, expected, landmarks, positions, features, 0)
 
 
 def test_an_allowed_place_is_believed_at_once_where_landmarks_are_found_around_it():
     landmarks, positions, features = scene()
     expected = prediction(positions, 0.2, 400.0)
     assert jump(expected, T_TRUE) < AssociationConfig().max_jump
-    alone, _ = localizer().localize(expected, landmarks, positions, features, TrackingState(), 0)
+    alone, _ = search(expected, landmarks, positions, features).localize(TrackingState())
     assert not len(alone)
-    found, _ = localizer().localize(expected, landmarks, positions, features, TrackingState(), 0, lambda: T_TRUE)
+    found, _ = search(expected, landmarks, positions, features).localize(TrackingState(), lambda: T_TRUE)
     assert len(found) > 30
     assert not found.kidnapped
     assert np.abs(se3.log(se3.inverse(T_TRUE) @ found.T_world_left)).max() < 0.01
@@ -55,13 +56,12 @@ def test_an_allowed_place_is_believed_at_once_where_landmarks_are_found_around_i
 def test_other_places_wait_for_several_frames(far):
     """Far beyond what the prediction allows; or allowed, where no landmark is found."""
     shift = se3.exp(np.array([0, 0, 0, 1.0, 0.8, 0])) if not far else np.eye(4)
-    own, tracking = localizer(), TrackingState()
+    tracking = TrackingState()
     for frame in range(AssociationConfig().kidnapped_after):
         landmarks, positions, features = scene(frame)
         expected = prediction(positions, 0.2 if not far else 0.005, 400.0)
         assert (jump(expected, T_TRUE @ shift) > AssociationConfig().max_jump) == far
-        seen = expected, landmarks, positions, features
-        found, tracking = own.localize(*seen, tracking, 0, lambda: T_TRUE @ shift)
+        found, tracking = search(expected, landmarks, positions, features).localize(tracking, lambda: T_TRUE @ shift)
         assert not len(found)
         assert found.kidnapped == (frame == AssociationConfig().kidnapped_after - 1)
 
@@ -75,5 +75,5 @@ def test_places_are_not_asked_for_where_landmarks_are_found():
         raise AssertionError
 
     expected = prediction(cloud.points[ids], 0.01, 5.0)
-    found, _ = localizer().localize(expected, landmarks, cloud.points[ids], features, TrackingState(), 0, never)
+    found, _ = search(expected, landmarks, cloud.points[ids], features).localize(TrackingState(), never)
     assert len(found) > 50

@@ -1,0 +1,253 @@
+"""The compiled face of this room: cameras, poses from known points, and many small Gaussians.
+
+`camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`; points (M, 3) of a pose are in world coordinates;
+measurements z (M, 3) are (uL, vL, uR), NaN where missing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.kernels.linear import factorise, solve_factorised, squared_distance, trace, whitener
+from slam.kernels.se3 import move, transform_back
+from slam.kernels.stereo import by_pose, offsets, residual
+from slam.runtime.compilation import helper, kernel
+
+
+@kernel
+def project_rectified(camera, points, jacobian):
+    """Pixels (uL, vL, uR) (N, 3) of points (N, 3) in left-camera coordinates; NaN behind the camera.
+
+    Second, if `jacobian`, the derivatives (N, 3, 3) by the points; else no rows.
+    """
+    z, J = np.empty((len(points), 3)), np.zeros((len(points) if jacobian else 0, 3, 3))
+    for n in range(len(points)):
+        u, v, right_u, inverse = offsets(camera, points[n, 0], points[n, 1], points[n, 2])
+        z[n, 0], z[n, 1], z[n, 2] = u + camera[2], v + camera[3], right_u + camera[5]
+        if jacobian:
+            J[n, 0, 0], J[n, 1, 1], J[n, 2, 0] = camera[0] * inverse, camera[1] * inverse, camera[4] * inverse
+            J[n, 0, 2], J[n, 1, 2], J[n, 2, 2] = -u * inverse, -v * inverse, -right_u * inverse
+    return z, J
+
+
+@kernel
+def triangulate_rectified(camera, uv_left, uv_right):
+    """Points (N, 3) in left-camera coordinates of pixels (N, 2); NaN where these say no positive depth."""
+    fu, fv, u0, v0, right_fu, right_u0, shift = camera
+    points = np.full((len(uv_left), 3), np.nan)
+    for n in range(len(uv_left)):
+        x = (uv_left[n, 0] - u0) / fu
+        depth = -shift / (x - (uv_right[n, 0] - right_u0) / right_fu)
+        if depth > 0 and np.isfinite(depth):
+            points[n, 0], points[n, 1], points[n, 2] = x * depth, (uv_left[n, 1] - v0) / fv * depth, depth
+    return points
+
+
+# --- the lens by Brown and Conrady; coefficients (8,): k1, k2, p1, p2, k3, k4, k5, k6 ---
+
+
+@kernel
+def distort(ab, coefficients, limit, jacobian):
+    """Distorted normalised coordinates (N, 2), and derivatives (N, 2, 2), or (0, 2, 2) if they are not asked for.
+
+    `limit` is the radius beyond which the polynomial folds rays back into the image: NaN there.
+    """
+    out, D, one = np.empty_like(ab), np.empty((len(ab) if jacobian else 0, 2, 2)), np.empty((2, 2))
+    for i in range(len(ab)):
+        a, b = ab[i, 0], ab[i, 1]
+        if np.sqrt(a * a + b * b) > limit:
+            a = b = np.nan
+        out[i, 0], out[i, 1] = _distorted(coefficients, a, b, one)
+        if jacobian:
+            D[i, 0, 0], D[i, 0, 1], D[i, 1, 0], D[i, 1, 1] = one[0, 0], one[0, 1], one[1, 0], one[1, 1]
+    return out, D
+
+
+@kernel
+def undistort(target, coefficients, limit):
+    """Normalised coordinates (N, 2) of distorted ones, by Newton's method; NaN where no ray leads there."""
+    out, D = np.empty_like(target), np.empty((2, 2))
+    for i in range(len(target)):
+        a, b, step = target[i, 0], target[i, 1], np.inf
+        for _ in range(50):  # 50: Newton steps at most
+            x, y = _distorted(coefficients, a, b, D)
+            x, y = x - target[i, 0], y - target[i, 1]
+            det = D[0, 0] * D[1, 1] - D[0, 1] * D[1, 0]
+            da, db = (D[1, 1] * x - D[0, 1] * y) / det, (D[0, 0] * y - D[1, 0] * x) / det
+            a, b, step = a - da, b - db, max(abs(da), abs(db))
+            if not step > 1e-13:  # 1e-13: a step below it is the last
+                break
+        # 1e-9: a last step above it means that no ray leads to the pixel
+        if not (step < 1e-9 and np.sqrt(a * a + b * b) <= limit):
+            a = b = np.nan
+        out[i, 0], out[i, 1] = a, b
+    return out
+
+
+@helper
+def _distorted(coefficients, a, b, D):
+    """One pair of coordinates, distorted, and its derivatives D (2, 2)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    r2 = a * a + b * b
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / denominator
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
+    slope *= 2 / denominator  # d radial / d a = slope · a
+    D[0, 0] = radial + a * a * slope + 2 * p1 * b + 6 * p2 * a
+    D[0, 1] = D[1, 0] = a * b * slope + 2 * p1 * a + 2 * p2 * b
+    D[1, 1] = radial + b * b * slope + 6 * p1 * b + 2 * p2 * a
+    x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    return x, b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+
+
+# --- one pose and known points ---
+
+
+@kernel
+def moved(poses, steps):
+    """Poses (n, 4, 4) changed on the right by tangent vectors (n, 6)."""
+    out = poses.copy()
+    for i in range(len(out)):
+        move(out[i], steps[i])
+    return out
+
+
+@kernel
+def residuals(camera, points, z, T):
+    """Measured less predicted (M, 3), NaN where missing or behind, and the prediction's Jacobians (M, 3, 6) by T."""
+    r, J = np.empty((len(points), 3)), np.empty((len(points), 3, 6))
+    local, by_local = np.empty(3), np.empty((3, 3))
+    for m in range(len(points)):
+        _residual(camera, points[m], z[m], T, local, by_local, r[m], J[m])
+    return r, J
+
+
+@kernel
+def errors(camera, points, z, poses):
+    """Largest error of uL, vL, uR (H, M) [px] under each pose (H, 4, 4); NaN behind the camera."""
+    out, local, r, J = np.empty((len(poses), len(points))), np.empty(3), np.empty(3), np.empty((3, 3))
+    for h in range(len(poses)):
+        for m in range(len(points)):
+            transform_back(poses[h], points[m], local)
+            residual(camera, local, z[m], r, J)
+            largest = abs(r[0])
+            for i in range(1, 3):
+                if abs(r[i]) > largest or (i == 1 and np.isnan(r[i])):
+                    largest = abs(r[i])
+            out[h, m] = largest
+    return out
+
+
+@helper
+def _residual(camera, point, z, T, local, by_local, r, J):
+    """Measured less predicted r (3,) and derivatives J (3, 6) of the prediction by T; zero where it is behind."""
+    transform_back(T, point, local)
+    residual(camera, local, z, r, by_local)
+    for i in range(3):
+        by_pose(by_local[i], local, J[i])
+
+
+@kernel
+def gauss_newton(camera, points, z, whitener, rows, information, prior, poses, huber, steps, enough):
+    """Poses (H, 4, 4), in place, by at most `steps` steps of Gauss-Newton.
+
+    Lightly damped, so that a degenerate set yields a bad pose and no error.
+
+    `whitener` is of the residuals (M, 3, 3), or one for all (1, 3, 3); `rows` (H, K) are the measurements that count
+    for each pose; `information` (6, 6) and the start beside the mean, `prior` (6,), are of the prior. A whitened
+    residual beyond `huber` pulls no more than one there; a step smaller than `enough` [rad, m] is the last.
+    """
+    off, r, J, white, G = np.empty(6), np.empty(3), np.empty((3, 6)), np.empty(3), np.empty((3, 6))
+    local, by_local = np.empty(3), np.empty((3, 3))
+    H, step = np.empty((6, 6)), np.empty(6)
+    for h in range(len(poses)):
+        for i in range(6):  # a slice would take longer to compile
+            off[i] = prior[i]
+        for _ in range(steps):
+            for i in range(6):
+                step[i] = 0.0
+                for j in range(6):
+                    H[i, j] = information[i, j]
+                    step[i] -= information[i, j] * off[j]
+            for k in range(rows.shape[1]):
+                m = rows[h, k]
+                _residual(camera, points[m], z[m], poses[h], local, by_local, r, J)
+                _whiten(whitener[m if len(whitener) > 1 else 0], r, J, white, G)
+                size = np.sqrt(white[0] * white[0] + white[1] * white[1] + white[2] * white[2])
+                weight = 1.0 if size <= huber else huber / size
+                for i in range(6):
+                    step[i] += weight * (G[0, i] * white[0] + G[1, i] * white[1] + G[2, i] * white[2])
+                    for j in range(i + 1):
+                        H[i, j] += weight * (G[0, i] * G[0, j] + G[1, i] * G[1, j] + G[2, i] * G[2, j])
+            for i in range(6):
+                H[i, i] += 1e-12 + 1e-9 * H[i, i]
+            factorise(H, 6)
+            solve_factorised(H, 6, step)
+            move(poses[h], step)
+            largest = 0.0
+            for i in range(6):
+                off[i] += step[i]  # exact to first order: enough for a prior that only keeps few rows in bounds
+                largest = max(largest, abs(step[i]))
+            if largest < enough:
+                break
+
+
+@helper
+def _whiten(W, r, J, white, G):
+    """Residual and derivatives of a measurement times its whitener; components that are missing count for nothing."""
+    for i in range(3):
+        white[i] = 0.0
+        for j in range(6):
+            G[i, j] = 0.0
+        for k in range(3):
+            if not np.isnan(r[k]):
+                white[i] += W[i, k] * r[k]
+                for j in range(6):
+                    G[i, j] += W[i, k] * J[k, j]
+
+
+# --- many small Gaussians ---
+
+
+@kernel
+def squared_distances(gaps, covariances):
+    """``gᵀ C⁻¹ g`` (N,) of gaps (N, 3) with covariances (N, 3, 3), by Cholesky; NaN where one is not positive definite.
+
+    Only the lower triangle is read. Where the third entry of a gap is NaN, the first two count alone.
+    """
+    out = np.empty(len(gaps))
+    for i in range(len(gaps)):
+        out[i] = squared_distance(gaps[i], covariances[i])
+    return out
+
+
+@kernel
+def whiteners(covariances):
+    """Inverses (N, 3, 3) of the Cholesky factors of covariances (N, 3, 3); NaN where one is not positive definite."""
+    out = np.empty(covariances.shape)
+    for i in range(len(covariances)):
+        whitener(covariances[i], out[i])
+    return out
+
+
+@kernel
+def near_pairs(limit, first, covariances, second, others):
+    """Which of some Gaussians (N, 3) are nearer to which others (M, 3) than a limit of χ² (N, M)."""
+    near = np.zeros((len(first), len(second)), np.bool_)
+    gap, C = np.empty(3), np.empty((3, 3))
+    for n in range(len(first)):
+        P = covariances[n]
+        own = trace(P)
+        for m in range(len(second)):
+            Q = others[m]
+            square = 0.0
+            for i in range(3):
+                gap[i] = first[n, i] - second[m, i]
+                square += gap[i] * gap[i]
+            # No variance is larger than the trace: most pairs are too far apart, whatever their covariances are.
+            if square < limit * (own + trace(Q)):
+                for i in range(3):
+                    for j in range(i + 1):
+                        C[i, j] = P[i, j] + Q[i, j]
+                near[n, m] = squared_distance(gap, C) < limit
+    return near
