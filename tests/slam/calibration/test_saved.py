@@ -17,6 +17,11 @@ from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, p
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
 
 
+def scaled(evidence, factor):
+    """The evidence of a recording with `factor` times the information."""
+    return evidence._replace(whole=evidence.whole.scaled(factor), motion=evidence.motion.scaled(factor))
+
+
 @pytest.fixture(scope="module")
 def first():
     return drive(TURNED, seed=1, frames=20)
@@ -120,7 +125,7 @@ def test_recordings_together_are_surer_and_agree(first):
 @pytest.mark.parametrize("share", [1.0, 0.1, 0.001])
 def test_recordings_that_say_more_and_less_are_never_worse_than_the_one_alone(first, share):
     """Sums of evidence whose systematic errors are ignored are far surer in some directions than they may be."""
-    other = drive(TURNED, seed=2, frames=6).evidence().scaled(share)
+    other = scaled(drive(TURNED, seed=2, frames=6).evidence(), share)
     alone, both = (
         joint_calibration(first.model, parts, first.config.systematic).posterior
         for parts in ([first.evidence()], [first.evidence(), other])
@@ -139,7 +144,7 @@ def test_recordings_of_another_rig_do_not_agree(first):
 
 def test_the_prior_that_recordings_share_is_no_agreement(first):
     """Two that say next to nothing are both near the calibration as delivered."""
-    silent = [d.evidence().scaled(1e-9) for d in (first, drive(TURNED + parameters(roll=3e-3), seed=2, frames=20))]
+    silent = [scaled(d.evidence(), 1e-9) for d in (first, drive(TURNED + parameters(roll=3e-3), seed=2, frames=20))]
     found = agreement(first.model, silent, first.config.systematic)
     assert np.isnan(found.largest).all() and found.words.startswith("Nothing can be said")
     half = agreement(first.model, [first.evidence(), silent[1]], first.config.systematic)
