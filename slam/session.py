@@ -133,7 +133,7 @@ class Session:
         self.calibration = calibration
         self.rig_error = RemainingRigError(self.calibration, c.models)
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
-        self.mapper = Mapper(rig, c.map, self.localizer, first)
+        self.mapper = Mapper(rig, c.map, self.localizer)
         self.loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
 
     def begin(self, first: Backend, prior_map: SavedMap | None) -> State:

@@ -17,7 +17,7 @@ _FREE = ("frontend", "backend")  # their options are checked by the front end or
 SETTABLE: dict[str, tuple[str, ...]] = {
     "models": ("motion.acceleration", "motion.angular_acceleration", "pixel_sigma"),
     "association": ("align",),
-    "map": ("target_in_view", "max_landmarks", "max_depth_error", "monocular", "restart_after"),
+    "map": ("target_in_view", "max_landmarks", "max_depth_error", "restart_after"),
     "atlas": ("enabled", "give_back"),
     "self_calibration": ("enabled", "systematic"),
     "objects": ("mode", "max_speed", "min_speed", "database"),

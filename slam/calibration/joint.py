@@ -70,7 +70,9 @@ class Agreement:
         least = f"the largest difference is {self.largest[worst]:.1f} sigma, in {self.names[worst]}"
         differing = ", ".join(name for name, z in zip(self.names, self.largest) if z > _AGREES)
         if not differing:
-            return f"The recordings agree in all {known.sum()} of {len(known)} parameters that two of them show: {least}."
+            return (
+                f"The recordings agree in all {known.sum()} of {len(known)} parameters that two of them show: {least}."
+            )
         if self.largest[worst] <= _DIFFERS:
             return f"The recordings agree, but for {differing}, where chance may do it: {least}."
         return f"The recordings do not agree in {differing}: {least}. Is it one rig, and has it not changed?"

@@ -70,7 +70,9 @@ class Prior:
 def factory_prior(model: RigModel) -> Prior:
     """Prior of a calibration as delivered, by how calibrations are usually made."""
     spread = np.linalg.inv(prior_information(model))
-    drift, zoom = (np.outer(sigma, sigma) for sigma in (OFFSET * along(model, "right_cx"), FOCAL * along(model, *FOCALS)))
+    drift, zoom = (
+        np.outer(sigma, sigma) for sigma in (OFFSET * along(model, "right_cx"), FOCAL * along(model, *FOCALS))
+    )
     # (0.02, 0.1, 0.3, 1.0): Scales of the prior, equally probable a priori: of all errors of a calibration, from none
     # to as large as allowed.
     # (0.1, 1.0): the same of a common error of the focal lengths

@@ -34,8 +34,6 @@ class MapConfig:
         restart_after: after this many unmatched frames with enough features to be localised in a known place, a new map
             begins at the predicted pose; again after as many more.
         max_landmarks: largest size of the map; beyond it, the landmarks measured longest ago are erased.
-        monocular: features without a stereo match become landmarks too, once two views give a depth (paper B, 2.2):
-            in every frame, never, or, for null (in Python None), in frames in which no feature has one.
     """
 
     target_in_view: int = 80
@@ -51,7 +49,6 @@ class MapConfig:
     lost_after: int = 5
     restart_after: int = 5
     max_landmarks: int = 1000
-    monocular: bool | None = None
 
     #: Distance from the image's border [px] within which a landmark may go undetected.
     view_margin: ClassVar[float] = 16.0

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
-from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
@@ -17,7 +16,6 @@ from slam.interfaces import Backend, MapBackend
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.known_landmarks import in_front
-from slam.mapping.monocular import MonocularDepth, frame_covariance, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
 from slam.tracks.localizer import LandmarkMatches, Localizer
@@ -48,29 +46,21 @@ class Mapper:
         rig: the cameras.
         config: settings.
         localizer: says which landmarks are seen from a similar viewpoint as before.
-        backend: the first one; it must have `place` if `config.monocular` is true.
-
-    Raises:
-        ConfigurationError: the back end cannot place landmarks.
     """
 
-    def __init__(self, rig: StereoRig, config: MapConfig, localizer: Localizer, backend: Backend) -> None:
+    def __init__(self, rig: StereoRig, config: MapConfig, localizer: Localizer) -> None:
         self.rig = rig
         self.config = config
         self.next_id = 0
         self._localizer = localizer
-        self._monocular: MonocularDepth | None = None
-        if config.monocular and not isinstance(backend, MapBackend):
-            raise ConfigurationError("map.monocular: this back end cannot place landmarks")
-        if config.monocular is not False and isinstance(backend, MapBackend):
-            self._monocular = self._new_monocular()
 
     def update(self, backend: Backend, step: Step) -> Step:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
-        view = self._view(backend, step.landmarks, step)
+        positions, pose = backend.positions(step.landmarks.ids), step.estimate.T_world_left
+        view = MapView.of(self.rig, pose, positions, step.features, self._localizer.pixel_sigma)
         landmarks = self._count(step.landmarks, view, step)
         bad = isin(landmarks.ids, step.labels.landmarks)
-        if step.features.has_stereo.any() or not len(step.features):  # else little can take their place
+        if step.features.has_stereo.any() or not len(step.features):  # else nothing can take their place
             bad |= bad_landmarks(landmarks, self.config)
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
@@ -120,23 +110,12 @@ class Mapper:
 
         The back end is as that step left it, the rows are those before it; those that stay are returned.
         """
-        if self._monocular is not None:
-            self._monocular = self._new_monocular()
         known = backend.estimate().ids
         kept = np.zeros(0, np.int64) if landmarks is None else landmarks.ids
         strangers = np.setdiff1d(known, kept)
         if len(strangers):
             backend.remove(strangers)
         return None if landmarks is None else landmarks.select(np.isin(kept, known))
-
-    def _new_monocular(self) -> MonocularDepth:
-        return MonocularDepth(self.rig, self._localizer.pixel_sigma, self.config.max_depth_error)
-
-    def _view(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapView:
-        """The map as the camera sees it."""
-        positions = backend.positions(landmarks.ids)
-        pose = step.estimate.T_world_left
-        return MapView.of(self.rig, pose, positions, step.features, self._localizer.pixel_sigma)
 
     def _count(self, landmarks: LandmarkTable, view: MapView, step: Step) -> LandmarkTable:
         """Count landmarks as seen or missed, unless the frame's pose was not measured."""
@@ -172,38 +151,7 @@ class Mapper:
         if len(added):
             backend.add(added.observations(features))
             landmarks = landmarks.with_new(step.index, added.ids, features, rows, step.estimate.T_world_left[:3, 3])
-        if self._monocular is not None and (self.config.monocular or not features.has_stereo.any()):
-            return self._add_monocular(self._monocular, backend, landmarks, step, added, free)
         return landmarks, added
-
-    def _add_monocular(
-        self,
-        monocular: MonocularDepth,
-        backend: Backend,
-        landmarks: LandmarkTable,
-        step: Step,
-        added: LandmarkMatches,
-        free: BoolArray,
-    ) -> tuple[LandmarkTable, LandmarkMatches]:
-        """Turn features without a stereo match into landmarks once two views give their depth (paper B, 2.2)."""
-        features, matches = step.features, step.matches
-        if len(matches) < MINIMAL_POINTS:
-            return landmarks, added
-        T = step.estimate.T_world_left
-        view = self._view(backend, landmarks, step)
-        rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
-        there = isin(matches.ids, landmarks.ids)
-        local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
-        P = frame_covariance(self.rig, local, stereo, self._localizer.pixel_sigma)
-        rows, local, covariances = monocular.step(features, rows, T, P, step.index)
-        wanted = max(self.config.target_in_view - len(matches) - len(added), 0)
-        best = np.sort(np.argsort(-features.response[rows], kind="stable")[:wanted])
-        if not len(best):
-            return landmarks, added
-        ids = self._new_ids(len(best))
-        backend.place(ids, local[best], covariances[best])  # type: ignore[attr-defined]
-        landmarks = landmarks.with_new(step.index, ids, features, rows[best], T[:3, 3])
-        return landmarks, added.joined(LandmarkMatches(ids, rows[best]))
 
     def _named(self, ids: IdArray) -> IdArray:
         """The ids (N,) with new ones in place of −1."""

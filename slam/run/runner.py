@@ -74,11 +74,6 @@ def run(
     require_outputs(options.outputs, overwrite=True)
     if options.prior_map is not None and options.record is not None:
         raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
-    if options.config.map.monocular and options.record is not None:
-        raise SlamError("a run with map.monocular cannot be recorded: a recording holds stereo observations alone")
-    if options.record is not None:
-        config = replace(options.config, map=replace(options.config.map, monocular=False))
-        options = replace(options, config=config)
     frames, live = sequence.frames(options.start, options.stop), None
     if options.live or is_live(sequence):
         live = LiveFrames(frames, not is_live(sequence), until)

@@ -109,7 +109,7 @@ def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monke
     ("setting", "meant"),
     [
         ("map.max_landmark=3", "'max_landmarks'"),
-        ("mpa.monocular=true", "'map.monocular'"),
+        ("mpa.max_landmarks=3", "'map.max_landmarks'"),
         ("mapp.gird=3", "'map'"),
         ("max_landmarks=3", "'map.max_landmarks'"),
         ("map.max_speed=3", "'objects.max_speed'"),  # not that of the models, which cannot be set

@@ -57,18 +57,18 @@ def _judged(
         return _left_out(atlas, chain, loop, rig, config, off > config.refused_beyond)
     before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
     if config.agreeing > 1 and not (before is not None and _agree(chain, before, loop, limit)):
-        return atlas.with_inactive_loop(loop, config.most_loops), False
+        return atlas.with_inactive_loop(loop), False
     atlas = replace(atlas, confirmed=True)
     if off > limit:
         atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
         chain = atlas.chain(rig, path())
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain.poses), loop.pair, common)
     elif atlas.loops and not is_informative(graph, loop):
-        return atlas.with_inactive_loop(loop, config.most_loops), False
+        return atlas.with_inactive_loop(loop), False
     graph = graph.with_loop(loop)
     if (graph.disagreement() > limit).any():
         return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
-    return atlas.with_loop(loop, config.most_loops).solved_by(graph, rig), True
+    return replace(atlas, loops=(*atlas.loops, loop)).solved_by(graph, rig), True
 
 
 def _left_out(
@@ -79,7 +79,7 @@ def _left_out(
     One that is not `refused` contradicts them by no more than may be: it does not count as another place.
     """
     limit, start = config.gate_sigmas**2, atlas.in_map(chain.poses)
-    atlas = atlas.with_inactive_loop(loop, config.most_loops)
+    atlas = atlas.with_inactive_loop(loop)
     if refused:
         atlas = replace(atlas, refused=(*atlas.refused, loop.pair))
     left = config.return_depths * np.array([k.depth for k in atlas.keyframes])
@@ -95,7 +95,7 @@ def _left_out(
         return atlas, False
     before = {x.pair for x in atlas.loops}
     held = {x.pair: x for x in (*places(rival), *(x for x in rival if x.pair in before), loop)}
-    atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival, config.most_loops)
+    atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival)
     return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig), True
 
 

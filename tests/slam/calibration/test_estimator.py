@@ -12,7 +12,6 @@ from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
-from slam.tracker import _moved_as
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
 from tests.slam.scene import RIG, Cloud
 
@@ -135,13 +134,6 @@ def test_what_rows_alone_say_is_not_applied():
     assert np.sqrt(np.mean(np.square(applied), axis=1)).max() < 0.1
 
 
-def test_outliers_do_not_lead_astray():
-    for seed in range(2):
-        calibration = drive(TURNED, seed, outliers=0.2)
-        assert np.abs(z_scores(calibration, TURNED)).max() < 3
-        assert disparity_error(calibration, TURNED) < 0.15
-
-
 def test_unrectified_rig():
     theta = parameters(right_cx=2e-3)
     calibration = drive(theta, rig=GENERAL_RIG, scale=GENERAL_RIG.baseline / CAR.baseline, noise=0.1, frames=20)
@@ -165,19 +157,6 @@ def test_nothing_seen_is_no_error():
     calibration.observe(replace(features, descriptors=np.zeros((len(features), 0), np.float32)), pose(1))
     assert calibration.apply() is None
     assert calibration.summary()["pairs"] == 0
-
-
-def test_features_that_move_are_corrected_as_they_were():
-    """The correction is nearly the same over some tenths of a pixel."""
-    calibration, before = SelfCalibration(RIG, SelfCalibrationConfig()), Cloud(60).features(np.eye(4), 0.0, 0.1)[0]
-    moved = replace(before, uv_left=before.uv_left.copy(), uv_right=before.uv_right.copy())
-    moved.uv_left[3] += 0.4
-    moved.uv_right[5:7] = np.nan
-    assert _moved_as(before, before, moved) is moved  # nothing is known yet
-    calibration.applied = RigCorrection(RigModel(RIG), parameters(right_cx=2e-3, yaw=1e-3))
-    again, whole = _moved_as(calibration.correct(before), before, moved), calibration.correct(moved)
-    np.testing.assert_allclose(again.uv_left, whole.uv_left, atol=1e-3)
-    np.testing.assert_allclose(again.uv_right, whole.uv_right, atol=1e-3)
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])

@@ -11,7 +11,7 @@ from slam.geometry.se3 import Array, exp, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.chain import Chain
-from slam.mapping.atlas.closing import agreeing, close, spaced
+from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, Loop
 from slam.mapping.atlas.pose_graph import PoseGraph, _Normal
@@ -42,24 +42,6 @@ CHAIN = Chain(ODOM, np.tile(np.diag(SIGMAS**2), (len(ODOM), 1, 1)))
 def loop(second: int, wrong: Array | None = None) -> Loop:
     T = inverse(TRUE[second - LAP]) @ TRUE[second]
     return Loop(second - LAP, second, T if wrong is None else T @ wrong, np.diag(SURE**2), 50)
-
-
-def test_the_largest_set_leaves_false_loops_out_whichever_came_first():
-    false, true = [loop(62, FALSE), loop(63, FALSE)], [loop(k) for k in range(66, 96, 5)]
-    found = agreeing(CHAIN, [*false, *true], true[-1], ODOM, LIMIT)
-    assert [x.pair for x in found] == [x.pair for x in true]
-    assert loop(62, FALSE).pair in [x.pair for x in agreeing(CHAIN, [*false, *true], false[0], ODOM, LIMIT)]
-
-
-def test_a_loop_that_contradicts_the_path_itself_agrees_with_nothing():
-    far = loop(70, exp(np.array([0.0, 0.0, 0.0, 40.0, 0.0, 0.0])))
-    assert agreeing(CHAIN, [loop(66)], far, ODOM, LIMIT) == []
-
-
-def test_keyframes_of_one_place_are_one_witness():
-    loops = [loop(k) for k in (62, 63, 66, 70, 80)]
-    chosen = spaced(loops, np.arange(len(TRUE), dtype=float), np.full(len(TRUE), 6.0))
-    assert [x.second for x in chosen] == [62, 70, 80]
 
 
 def atlas_of(count: int) -> Atlas:

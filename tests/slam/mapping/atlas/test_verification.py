@@ -135,15 +135,6 @@ def test_matches_in_one_spot_are_not_enough():
     assert verify(old, seen, RIG, LOCALIZER, AtlasConfig(spread=0.0), 0) is not None
 
 
-def test_landmarks_are_kept_first_and_nothing_that_moves():
-    features = view(np.eye(4), *world(0), 0)
-    landmark_of = np.full(len(features), -1)
-    landmark_of[-5:] = np.arange(5)
-    rows = kept_features(np.arange(len(features)), features.response, landmark_of, rows_of(), 5)
-    assert rows.tolist() == list(range(len(features) - 5, len(features)))
-    assert kept_features(np.arange(len(features)), features.response, landmark_of, np.arange(10), 400).min() == 10
-
-
 @pytest.mark.parametrize(("motion", "changed"), [
     (np.zeros(6), False),
     ([0, 0, 0, 0, 0, 5.0], True),
