@@ -212,7 +212,7 @@ class SavedMap:
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
             landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
             f"surf-stereo-slam {__version__}", seen_from=landmarks.seen_from,
-            keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map(), loops=atlas.loops,
+            keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map, loops=atlas.loops,
         )  # fmt: skip
 
     def require_fits(self, frontend: str, dimensions: int | None = None) -> None:

@@ -143,6 +143,7 @@ class Atlas:
         grown = (replace(k, step_covariance=factor * k.step_covariance) for k in self.keyframes[first + 1 : last + 1])
         return replace(self, keyframes=(*self.keyframes[: first + 1], *grown, *self.keyframes[last + 1 :]))
 
+    @cached_property
     def poses_in_map(self) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes."""
         return self.in_map(self.poses)
@@ -242,12 +243,6 @@ class Atlas:
     def in_map(self, poses: Array) -> Array:
         """Poses (K, 4, 4) of all keyframes in the map, given those in odom; the last loop has set those before it."""
         return np.concatenate([self.corrected, self.T_map_odom @ poses[len(self.corrected) :]])
-
-    def pose_in_map(self, number: int) -> Array:
-        """Pose T_map_left (4, 4) of a keyframe."""
-        if number < len(self.corrected):
-            return np.asarray(self.corrected[number])
-        return self.T_map_odom @ self.keyframes[number].T_odom_left
 
     def estimate(self, estimate: Estimate, common: CommonError, gaps: bool = True) -> Estimate:
         """An estimate in odom, transformed to the map; its covariance is propagated from the anchor, if there is one.

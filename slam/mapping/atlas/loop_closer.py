@@ -111,7 +111,7 @@ class LoopCloser:
         loop, seen = max(verified, key=lambda one: one[0].inliers)
         if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other, _ in verified):
             return None
-        T = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first)
+        T = inverse(atlas.T_map_odom) @ atlas.poses_in_map[loop.first]
         points = seen.keyframe.points.astype(float)
         P = self._rig.triangulation_covariance(points, self._sigma)
         landmarks = replace(keyframe_landmarks(seen.keyframe), seen_from=np.tile(T[:3, 3], (len(points), 1)))
@@ -171,7 +171,7 @@ class LoopCloser:
         Keyframes of a place that the camera has not left yet are excluded, those that it cannot have come to, given its
         uncertainty, and those whose landmarks the back end still measures: it knows their position by itself.
         """
-        c, poses, here = self._config, atlas.poses_in_map(), atlas.T_map_odom @ new.T_odom_left
+        c, poses, here = self._config, atlas.poses_in_map, atlas.T_map_odom @ new.T_odom_left
         sigma = np.sqrt(np.trace(atlas.estimate(step.estimate, step.common).covariance[3:, 3:]))
         length, far = new.travelled - atlas.travelled, np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
@@ -244,5 +244,5 @@ class LoopCloser:
 
     def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:
         """Whether two verified loops put the camera at positions closer together than the scene's depth."""
-        T, U = (atlas.pose_in_map(loop.first) @ loop.T_first_second for loop in (one, other))
+        T, U = (atlas.poses_in_map[loop.first] @ loop.T_first_second for loop in (one, other))
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)

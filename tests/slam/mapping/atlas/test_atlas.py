@@ -194,7 +194,7 @@ def test_a_run_in_a_saved_map_keeps_its_keyframes_and_loops(closed, sequence, tm
     assert results[-1].status.value == "tracked"
     before, after = first.atlas, second.snapshot()
     assert len(after.keyframes) > len(before)
-    np.testing.assert_allclose(after.keyframe_poses[: len(before)], before.poses_in_map(), atol=0.1)
+    np.testing.assert_allclose(after.keyframe_poses[: len(before)], before.poses_in_map, atol=0.1)
     pairs, kept = ([(loop.first, loop.second) for loop in loops] for loops in (before.loops, after.loops))
     assert kept[: len(pairs)] == pairs
     assert second.atlas.summary()["known"] == len(before)

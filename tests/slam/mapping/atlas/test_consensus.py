@@ -70,7 +70,7 @@ def closed(loops: list[Loop]) -> Atlas:
 
 
 def error(atlas: Atlas) -> float:
-    poses = atlas.poses_in_map()
+    poses = atlas.poses_in_map
     return float(np.linalg.norm(poses[-1, :3, 3] - TRUE[len(poses) - 1, :3, 3]))
 
 
