@@ -16,27 +16,39 @@ _ROUNDING = 1e-14  # numerics: share of a covariance's largest eigenvalue below 
 _SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from its transpose
 
 
-def require_known(backend: str, ids: IdArray, positions: Array, covariances: Array) -> None:
-    """Check landmarks (N) at positions (N, 3) [m] with covariances (N, 3, 3) [m²], as given to a back end of this name.
+def require_known(owner: str, ids: IdArray, positions: Array, covariances: Array, seen: bool = False) -> None:
+    """Check landmarks (N) at positions (N, 3) [m] with covariances (N, 3, 3) [m²]; `owner` is named in messages.
+
+    Where they are `seen`, their positions are in the camera's coordinates, in front of it.
 
     Raises:
-        MeasurementError: shapes differ, an id occurs twice, a position is not finite or absurdly far, or a covariance
-            is not symmetric and positive definite.
+        MeasurementError: shapes differ, an id occurs twice, a position is not finite, absurdly far or behind the
+            camera, or a covariance is not symmetric and positive definite.
     """
     n = len(ids)
     if positions.shape != (n, 3) or covariances.shape != (n, 3, 3):
         shapes = f"positions {positions.shape} and covariances {covariances.shape}"
-        raise MeasurementError(f"{backend}: {n} landmark ids, but {shapes}")
+        raise MeasurementError(f"{owner}: {n} landmark ids, but {shapes}")
     if len(np.unique(ids)) != n:
-        raise MeasurementError(f"{backend}: a landmark id stands twice")
-    far = f"landmark {{}} lies more than {FARTHEST_POSITION:g} m off"
+        raise MeasurementError(f"{owner}: a landmark id stands twice")
+    C = np.nan_to_num(covariances, nan=np.inf)
+    scale = np.abs(C).max(axis=(1, 2), initial=0)
+    C = np.where((scale < _LARGEST)[:, None, None], C, -np.eye(3))
+    good = np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2), initial=0) <= _SYMMETRIC * scale
     for bad, what in (
         (~np.isfinite(positions).all(axis=1), "the position of landmark {} is not finite"),
-        ((np.abs(positions) > FARTHEST_POSITION).any(axis=1), far),
-        (~_positive_definite(covariances), "the covariance of landmark {} is not symmetric and positive definite"),
+        (
+            (np.abs(positions) > FARTHEST_POSITION).any(axis=1),
+            f"landmark {{}} lies more than {FARTHEST_POSITION:g} m off",
+        ),
+        (
+            ~good | (np.linalg.eigvalsh(C)[:, 0] <= 0),
+            "the covariance of landmark {} is not symmetric and positive definite",
+        ),
+        (seen & ~in_front(positions), "landmark {} does not lie in front of the camera"),
     ):
         if bad.any():
-            raise MeasurementError(f"{backend}: {what.format(ids[bad][0])}")
+            raise MeasurementError(f"{owner}: {what.format(ids[bad][0])}")
 
 
 def definite(covariances: Array) -> Array:
@@ -55,14 +67,10 @@ def known_landmarks(
 ) -> tuple[IdArray, Array, Array]:
     """Copies of landmarks (N,) handed to `slam.interfaces.MapBackend`, checked; they may not be in the table yet.
 
-    Where they are seen, their positions (N, 3) are in the camera's coordinates, in front of it.
-
     Raises:
-        MeasurementError: as `require_known` and `require_in_front`; or one is in the table already.
+        MeasurementError: as `require_known`; or one is in the table already.
     """
-    require_known(backend, ids, positions, covariances)
-    if seen:
-        require_in_front(backend, ids, positions)
+    require_known(backend, ids, positions, covariances, seen)
     table.require_new(ids)
     return np.array(ids, np.int64), np.array(positions, float), np.array(covariances, float)
 
@@ -70,19 +78,3 @@ def known_landmarks(
 def in_front(local: Array) -> BoolArray:
     """Which points (N, 3) [m] in a camera's coordinates lie in front of it (N,)."""
     return np.asarray(local[:, 2] >= _NEAREST)
-
-
-def require_in_front(backend: str, ids: IdArray, local: Array) -> None:
-    """Raise MeasurementError where a landmark at `local` (N, 3) [m] in the camera's coordinates is not before it."""
-    bad = ~in_front(local)
-    if bad.any():
-        raise MeasurementError(f"{backend}: landmark {ids[bad][0]} does not lie in front of the camera")
-
-
-def _positive_definite(covariances: Array) -> BoolArray:
-    """Which matrices (N,) are finite, symmetric and positive definite."""
-    good = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
-    C = np.where(good[:, None, None], covariances, np.eye(3))
-    scale = np.abs(C).max(axis=(1, 2))
-    good &= (np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2)) <= _SYMMETRIC * scale) & (scale < _LARGEST)
-    return np.asarray(good & (np.linalg.eigvalsh(np.where(good[:, None, None], C, np.eye(3)))[:, 0] > 0))

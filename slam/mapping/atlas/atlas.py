@@ -44,16 +44,13 @@ class MapAnchor:
     rig: CommonError  # what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`
 
     def belief(self, rig: CommonError) -> tuple[Array, Array]:
-        """The common errors (n,) and their covariance (n, n); zero and unity if there are others by now."""
+        """The common errors (n,) in units of `rig`, as the rig's posterior has changed since, and their covariance.
+
+        They are zero, and the covariance (n, n) unity, if there are others by now.
+        """
         if rig.root.shape != self.rig.root.shape:
             return np.zeros(rig.root.shape[1]), np.eye(rig.root.shape[1])
-        return self.common_as(rig), self.covariance[6:, 6:]
-
-    def common_as(self, rig: CommonError) -> Array:
-        """The common errors (n,) in units of `rig`, as the rig's posterior has changed since; zero if others by now."""
-        if rig.root.shape != self.rig.root.shape:
-            return np.zeros(rig.root.shape[1])
-        return np.asarray(np.linalg.lstsq(rig.root, self.rig.root @ self.common, rcond=None)[0])
+        return np.linalg.lstsq(rig.root, self.rig.root @ self.common, rcond=None)[0], self.covariance[6:, 6:]
 
     def later(self, back: Array, shares: Array) -> Array:
         """Covariance (6, 6) of a later pose, without the noise since.

@@ -16,7 +16,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, Loop, kept_features, step_covariance, view_has_changed
+from slam.mapping.atlas.keyframes import Keyframe, Loop, step_covariance, view_has_changed
 from slam.mapping.atlas.verification import Verified, keyframe_landmarks, verify
 from slam.mapping.mapper import OldPlace
 from slam.mapping.selection import depth_is_known
@@ -141,11 +141,12 @@ class LoopCloser:
         return view_has_changed(last, inverse(last.T_odom_left) @ step.estimate.T_world_left, self._rig, self._config)
 
     def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray) -> Keyframe | None:
-        """The frame as a keyframe; None where too few features have a depth."""
+        """The frame as a keyframe, of features that do not move, landmarks first; None where too few have a depth."""
         features = step.features
-        stereo = np.flatnonzero(features.has_stereo)
-        known = stereo[depth_is_known(self._rig, features, stereo, self._sigma, self._max_depth_error)]
-        rows = kept_features(known, features.response, landmark_of, step.labels.moving, self._config.features)
+        rows = np.setdiff1d(np.flatnonzero(features.has_stereo), step.labels.moving)
+        rows = rows[depth_is_known(self._rig, features, rows, self._sigma, self._max_depth_error)]
+        order = np.lexsort((-features.response[rows], landmark_of[rows] < 0))
+        rows = np.sort(rows[order[: self._config.features]])
         if len(rows) < _MINIMAL:
             return None
         points = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])

@@ -14,7 +14,7 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, covariance_growth, kept_features, step_covariance, view_has_changed
+from slam.mapping.atlas.keyframes import Keyframe, covariance_growth, step_covariance, view_has_changed
 from slam.mapping.atlas.verification import refined_pose, verify
 from slam.mapping.selection import depth_is_known
 from slam.models import EstimatorModels
@@ -46,15 +46,10 @@ def view(T_world_left: Array, points: Array, descriptors: Array, seed: int) -> S
     return StereoFeatures(0.0, left, right, one, 0 * one, one, one.astype(np.int8), descriptors[seen])
 
 
-def rows_of(*rows: int) -> np.ndarray:
-    return np.array(rows, np.intp)
-
-
 def keyframe(features: StereoFeatures) -> Keyframe:
     """The frame as a keyframe."""
     nothing = np.full(len(features), -1)
-    known = np.flatnonzero(depth_is_known(RIG, features, np.arange(len(features)), SIGMA, 0.2))
-    rows = kept_features(known, features.response, nothing, rows_of(), 400)
+    rows = np.flatnonzero(depth_is_known(RIG, features, np.arange(len(features)), SIGMA, 0.2))
     points = RIG.triangulate(features.uv_left[rows], features.uv_right[rows])
     return Keyframe(
         0, 0.0, np.eye(4), np.eye(6), np.zeros((6, 6)), np.zeros((6, 0)), 0.0, float(np.median(points[:, 2])),
