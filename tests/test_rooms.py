@@ -18,7 +18,7 @@ MAY_IMPORT = {
     "data": {"geometry"},
     "window": {"data", "geometry", "kernels", "runtime"},
     "tracks": {"data", "geometry", "kernels", "runtime"},
-    "calibration": {"tracks", "data", "geometry"},
+    "calibration": {"data", "geometry", "kernels", "runtime"},
     "mapping": {"tracks", "window", "data", "geometry", "runtime"},
     "objects": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
     "worlds": {"data", "geometry"},

@@ -14,12 +14,11 @@ from slam.calibration.motion import Pair, noise_variances, pair_evidence, parall
 from slam.calibration.posterior import RigPosterior, Solution, residual_scale, solve
 from slam.calibration.prior import FOCALS, along, factory_prior, prior_information, resumed_prior, systematic_variance
 from slam.calibration.saved import SavedCalibration, rig_numbers
-from slam.calibration.views import View, match, pair_of
+from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.tracks.follow import Matches
 
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
@@ -167,13 +166,13 @@ class SelfCalibration:
         """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""
         c = self.config
         waiting = self._waiting
-        newest = match(waiting[-1], view) if waiting else None
+        newest = match(waiting[-1], view) if waiting else NO_MATCHES
         # 0.5: a new view is taken when the last one has lost this share of the features it may lose
-        apart = newest is None or len(newest) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
+        apart = not waiting or len(newest[0]) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
         ended = 0
         for first in waiting:
             matched = newest if first is waiting[-1] else match(first, view)
-            n = len(matched)
+            n = len(matched[0])
             if n > max(c.kept_share * len(first), c.minimum_common):
                 break
             ended += 1
@@ -218,7 +217,7 @@ class SelfCalibration:
         pixel, disparity = np.exp(self._variances)
         return np.diag([pixel, pixel, disparity])
 
-    def _evidence(self, first: View, second: View, matched: Matches) -> Evidence | None:
+    def _evidence(self, first: View, second: View, matched: Rows) -> Evidence | None:
         """The evidence of a pair of views with matched features; None without a solution."""
         mean = self._solution.mean
         pair = pair_of(self.model, first, second, mean, self._noise, self._seen, matched)

@@ -14,7 +14,7 @@ from slam.calibration.evidence import Evidence, student_weights
 from slam.calibration.model import RigModel
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
-from slam.geometry.se3 import Array, hat, so3_exp
+from slam.geometry.se3 import Array, so3_exp
 
 
 class Pair(NamedTuple):
@@ -133,7 +133,6 @@ def parallax(model: RigModel, pair: Pair) -> float:
     return float(np.median(np.linalg.norm((there - turned)[:, :2], axis=1)))
 
 
-@np.errstate(all="ignore")
 def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array, Array]:
     """Transform points ``(x, y, D)`` (N, 3) of one view to another by ``R, t`` [baselines].
 
@@ -143,28 +142,16 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     Returns:
         Moved points (N, 3), Jacobians by the points (N, 3, 3), and by ``[rotation (left), t]`` (N, 3, 6).
     """
-    D = points[:, 2:]
-    turned = points[:, :2] @ R[:, :2].T + focal * R[:, 2]
-    ahead = turned + D * t
-    depth = ahead[:, 2:]
-    moved = np.column_stack([ahead[:, :2], D]) * (focal / depth)
-    J = np.empty((len(points), 3, 9))  # of `ahead` by points, rotation and t
-    J[:, :, :3], J[:, :, 3:6] = np.column_stack([R[:, :2], t]), -hat(turned)
-    J[:, :, 6:] = D[:, :, None] * np.eye(3)
-    by_depth = J[:, 2:].copy()
-    J[:, 2] = np.eye(9)[2]  # D itself, in the place of the depth
-    J = (focal / depth)[:, :, None] * J - (moved / depth)[:, :, None] * by_depth
-    return moved, J[:, :, :3], J[:, :, 3:]
+    return linearised(points, points, points, R, t, focal, np.eye(3))[:3]
 
 
-@np.errstate(all="ignore")
 def linearised(first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
     """A motion linearised at estimates of the first view's points (N, 3); for the arguments see `fit_motion`.
 
     The residuals carry the points' own corrections to first order. The motion amplifies the disparity errors of near
     points, so that a limit in pixels would keep only points whose errors happen to be small.
     """
-    moved, J_point, J_motion = move(points, R, t, focal)
-    residual = second - moved - (J_point @ (first - points)[:, :, None])[:, :, 0]
-    covariance = noise + J_point @ noise @ np.swapaxes(J_point, 1, 2)
-    return Linear(moved, J_point, J_motion, residual, np.linalg.inv(covariance))
+    from slam.calibration.motion_kernels import linearise
+
+    arrays = (np.ascontiguousarray(a, float) for a in (first, second, points, R, t))
+    return Linear(*linearise(*arrays, focal, noise))
