@@ -87,7 +87,7 @@ class SelfCalibration:
     @property
     def posterior(self) -> RigPosterior:
         """The present posterior of the rig's error."""
-        return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), self.covariance)
+        return RigPosterior(self._solution.mean.copy(), self.covariance)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.

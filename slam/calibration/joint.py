@@ -47,7 +47,7 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
         residual = max(part.residual for part in evidence)
         solution = solve(prior, residual, sum(whole[1:], whole[0]), sum(known[1:], known[0]))
         covariance = solution.covariance
-    posterior = RigPosterior(model.names, model.units, solution.mean, 0.5 * (covariance + covariance.T))
+    posterior = RigPosterior(solution.mean, 0.5 * (covariance + covariance.T))
     return SavedCalibration(posterior, rig_numbers(model.rig), solution.residual)
 
 
@@ -55,7 +55,6 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
 class Agreement:
     """Differences between recordings, each by its own evidence."""
 
-    names: tuple[str, ...]  # of the parameters (n,)
     # the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN if fewer than two
     # determine it
     largest: Array
@@ -67,8 +66,8 @@ class Agreement:
         if not known.any():
             return "Nothing can be said of whether the recordings agree: no parameter is shown by two of them."
         worst = int(np.nanargmax(self.largest))
-        least = f"the largest difference is {self.largest[worst]:.1f} sigma, in {self.names[worst]}"
-        differing = ", ".join(name for name, z in zip(self.names, self.largest) if z > _AGREES)
+        least = f"the largest difference is {self.largest[worst]:.1f} sigma, in {RigModel.names[worst]}"
+        differing = ", ".join(name for name, z in zip(RigModel.names, self.largest) if z > _AGREES)
         if not differing:
             return (
                 f"The recordings agree in all {known.sum()} of {len(known)} parameters that two of them show: {least}."
@@ -101,4 +100,4 @@ def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic
     first, second = np.triu_indices(len(evidence), 1)
     mean, own = np.array(means), 1 / np.array(informations)
     z = np.abs(mean[first] - mean[second]) / np.sqrt(own[first] + own[second])
-    return Agreement(model.names, np.fmax.reduce(z, axis=0))
+    return Agreement(np.fmax.reduce(z, axis=0))
