@@ -84,7 +84,8 @@ class RigModel:
 
     def shift(self, points: Array, parameters: Array) -> Array:
         """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,): ``field(points) @ parameters``."""
-        return _field(points, self.focal) @ np.concatenate([parameters, self._gauge @ parameters])
+        both = np.concatenate([parameters, self._gauge @ parameters])
+        return np.asarray((_field(points, self.focal).reshape(-1, len(both)) @ both).reshape(-1, 3))
 
     @cached_property
     def _gauge(self) -> Array:

@@ -38,7 +38,8 @@ class Linear(NamedTuple):
     @property
     def squared(self) -> Array:
         """Squared Mahalanobis distances of the residuals (N,)."""
-        return np.asarray(np.einsum("ni,nij,nj->n", self.residual, self.information, self.residual))
+        weighted = self.information @ self.residual[:, :, None]
+        return np.asarray((self.residual * weighted[:, :, 0]).sum(axis=1))
 
 
 class Fit(NamedTuple):
@@ -71,7 +72,7 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
         H = weighted.reshape(-1, 6).T @ J
         step = np.linalg.solve(H + _ridge(H), weighted.reshape(-1, 6).T @ at.residual.ravel())
         R, t = so3_exp(step[:3]) @ R, t + step[3:]
-        change = at.J_motion @ step
+        change = (J @ step).reshape(-1, 3)
         rest = at.information @ (at.residual - change)[:, :, None]
         points = first + (np.swapaxes(at.J_point, 1, 2) @ rest)[:, :, 0] @ noise
         last = np.abs(change).max()
