@@ -10,8 +10,6 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-import slam
-from experiments.startup import STARTS, start_up, stored_map
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, SlamError
@@ -221,18 +219,3 @@ def test_there_is_no_map_before_the_first_frame_and_an_empty_one_is_refused():
         StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=empty)
     with pytest.raises(SlamError, match="no map yet"):
         StereoSlam(RIG, None, "ekf").snapshot()
-
-
-# --- start-up from pre-stored features (paper B, 4.2) ---
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_start_up_before_the_board(backend):
-    """From three wrong starts to within a centimetre; single frames fix the place to 8 mm (one sigma)."""
-    sequence = slam.open_sequence("synthetic:startup?frames=25")
-    known = stored_map(sequence)
-    for start in STARTS:
-        run = start_up(sequence, known, backend, start, 25, "stereo")
-        assert run.errors[0] < 0.03
-        assert run.errors[10:].max() < 0.01
-        assert (run.errors[10:] < 4 * run.sigma[10:]).all()

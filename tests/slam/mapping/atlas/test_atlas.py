@@ -146,15 +146,6 @@ def test_landmarks_are_as_sure_as_the_pose_that_a_loop_gives():
 
 
 @pytest.mark.slow
-def test_a_loop_that_contradicts_the_path_is_refused(sequence):
-    system, results = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.gate_sigmas=0.01")
-    assert all(r.loop is None for r in results)
-    told = [(r.index, r.refused_loop) for r in results if r.refused_loop is not None]
-    assert system.atlas.summary()["refused"] == len(told) > 0
-    assert all(abs(now - then - LAP) <= 8 for now, then in told)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_landmarks_of_an_old_place_are_measured_again(sequence, backend: str):
     _, results = drive(sequence, backend, "map.target_in_view=30")  # so that few of them are landmarks already
