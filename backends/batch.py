@@ -21,7 +21,7 @@ from backends.smoother.state import SmootherState
 from slam.bounds import from_options, require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
@@ -88,11 +88,6 @@ class BatchBackend:
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         self._smoother.insert(ids, positions, covariances)
-        self._solution = None
-
-    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
-        """See `slam.interfaces.MapBackend.place`."""
-        self._smoother.place(ids, local, covariances)
         self._solution = None
 
     @one_blas_thread
@@ -174,19 +169,12 @@ class _BatchSolution:
         for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), smoother.models):
             problem.factors.add(factor)
         places = _places(s, make.stereo, numbers)
-        known = {serial: one for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
-        self.landmarks = {*places, *known}
+        self.landmarks = {*places, *s.known}
         for serial in sorted(self.landmarks):
-            one = known.get(serial)
-            if one is None:
-                problem.values.insert(landmark_key(serial), places[serial])
-            elif one.pose < 0:
+            if serial in s.known:
                 tracks.add_known(problem, s, serial)
             else:
-                tied = [pose_key(one.pose), landmark_key(serial)]
-                noise = gtsam.noiseModel.Gaussian.Covariance(one.covariance)
-                problem.factors.add(gtsam.CustomFactor(noise, tied, _seen_at(tied, one.position)))
-                problem.values.insert(tied[1], transform(s.poses[s.of(one.pose)], one.position[None])[0])
+                problem.values.insert(landmark_key(serial), places[serial])
         for number in numbers:
             sight = s.sights[s.of(number)]
             for serial, z in zip(sight.serials.tolist(), sight.z.tolist()):
@@ -266,18 +254,5 @@ def _velocity_change(keys: list[int], d0: float, d1: float) -> Callable[[gtsam.C
             for i, by_pose in enumerate(J):
                 jacobians[i] = by_pose
         return r
-
-    return error
-
-
-def _seen_at(keys: list[int], local: Array) -> Callable[[gtsam.CustomFactor, gtsam.Values, Any], Any]:
-    """Residual (3,) of a point known to be at `local` (3,) in a camera's coordinates."""
-
-    def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
-        T = values.atPose3(keys[0]).matrix()
-        point = transform(inverse(T), values.atPoint3(keys[1])[None])
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = points_by_pose(point)[0], T[:3, :3].T.copy()
-        return point[0] - local
 
     return error

@@ -371,7 +371,6 @@ class FrameResult:
         loop, refused_loop: if the frame closed a loop, or one that contradicts the path, index of the earlier frame of
             the same place, or −1 if that is in the prior map; else None.
         keyframe: whether the frame has become a keyframe.
-        returned: ids of the revisited place's landmarks that have rejoined the map.
         common: the part of the pose's error that all frames share; empty after a loop, which mixes it with noise.
     """
 
@@ -397,7 +396,6 @@ class FrameResult:
     loop: int | None = None
     refused_loop: int | None = None
     keyframe: bool = False
-    returned: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
     common: CommonError = field(default_factory=CommonError)
 
     def __repr__(self) -> str:

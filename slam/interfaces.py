@@ -203,15 +203,3 @@ class MapBackend(Protocol):
             MeasurementError: an id is in the map already, or a covariance is not symmetric and positive definite.
         """
         ...
-
-    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
-        """Add landmarks at `local` (N, 3) [m] in the newest camera's coordinates, with covariances (N, 3, 3) [m²].
-
-        As `Backend.add`, but for landmarks whose position relative to the camera was not measured by a stereo pair;
-        `covariances` is the uncertainty of that position. They become correlated with the camera's present pose.
-
-        Raises:
-            MeasurementError: before the first `predict`; an id is in the map already, a landmark is not in front of
-                the camera, or a covariance is not symmetric and positive definite.
-        """
-        ...

@@ -176,19 +176,12 @@ class EkfBackend:
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         s = self.state
-        known = known_landmarks(self._form.name, s.landmarks, ids, positions, covariances, False)
+        known = known_landmarks(self._form.name, s.landmarks, ids, positions, covariances)
         ids, positions, covariances = known
         anchors = distant_anchors(positions, covariances)
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame)
         D = self._coordinates.inverse_jacobian(anchors, new.c)
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
-
-    @one_blas_thread
-    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
-        """See `slam.interfaces.MapBackend.place`."""
-        s = self._started("place")
-        known = known_landmarks(self._form.name, s.landmarks, ids, local, covariances, True)
-        self.state = s.placed(self._coordinates, *known)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 

@@ -151,17 +151,9 @@ class SmootherBackend:
     @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
-        arguments = known_landmarks("smoother", self.state.landmarks, ids, positions, covariances, False)
+        arguments = known_landmarks("smoother", self.state.landmarks, ids, positions, covariances)
         if len(ids):
             self.state = self._steps.inserted(self.state, *arguments)
-
-    @one_blas_thread
-    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
-        """See `slam.interfaces.MapBackend.place`."""
-        s = self._started("place")
-        arguments = known_landmarks("smoother", s.landmarks, ids, local, covariances, True)
-        if len(ids):
-            self.state = self._steps.placed(s, *arguments)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 

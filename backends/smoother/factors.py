@@ -140,14 +140,3 @@ class FactorMaker:
         """A landmark variable is at a position (3,) in the world, with a covariance (3, 3)."""
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         return gtsam.PriorFactorPoint3(landmark_key(landmark), position, noise)
-
-    def known_from(self, pose: int, landmark: int, local: Array, covariance: Array) -> gtsam.NonlinearFactor:
-        """A landmark variable is at `local` (3,) in the camera's coordinates, with a covariance (3, 3).
-
-        gtsam's factor takes it as a direction and a distance.
-        """
-        distance = float(np.linalg.norm(local))
-        direction = gtsam.Unit3(local / distance)
-        D = np.concatenate([direction.basis().T, direction.point3()[None] * distance]) / distance
-        noise = gtsam.noiseModel.Gaussian.Covariance(D @ covariance @ D.T)
-        return gtsam.BearingRangeFactor3D(pose_key(pose), landmark_key(landmark), direction, distance, noise)

@@ -12,7 +12,7 @@ import numpy as np
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
 from backends.smoother.state import SmootherState
 from slam.errors import SlamError
-from slam.geometry.se3 import Array, adjoint, inverse, transform
+from slam.geometry.se3 import Array, adjoint, inverse
 
 #: What gtsam throws when it cannot solve.
 FAILURES = (RuntimeError, ValueError, LookupError)
@@ -94,7 +94,7 @@ class Tracks:
         rows = (column[begin:].tolist() for column in (sight.serials, sight.begun, sight.z))
         for serial, begun, z in zip(*rows):
             point = make.point(z)
-            if known and self._is_variable(problem, s, serial, number, first):
+            if known and self._is_variable(problem, s, serial, number):
                 self._variables[serial] = number
                 problem.stamps[landmark_key(serial)] = float(number)
                 problem.factors.add(make.explicit(point, number, serial))
@@ -108,12 +108,11 @@ class Tracks:
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
             problem.grown[serial, begun] = track
 
-    def _is_variable(self, problem: GraphProblem, s: SmootherState, serial: int, number: int, first: int) -> bool:
+    def _is_variable(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> bool:
         """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
         if serial in self._variables:
             return self._lag is None or self._variables[serial] >= number - 1 - self._lag
-        known = s.known.get(serial)
-        if known is None or 0 <= known.pose < first:
+        if serial not in s.known:
             return False
         self.add_known(problem, s, serial)
         return True
@@ -121,13 +120,8 @@ class Tracks:
     def add_known(self, problem: GraphProblem, s: SmootherState, serial: int) -> None:
         """A landmark of which something is known, as a variable."""
         known = s.known[serial]
-        if known.pose < 0:
-            problem.factors.add(self._make.known(serial, known.position, known.covariance))
-            place = known.position
-        else:
-            problem.factors.add(self._make.known_from(known.pose, serial, known.position, known.covariance))
-            place = transform(s.poses[s.of(known.pose)], known.position[None])[0]
-        problem.values.insert(landmark_key(serial), place)
+        problem.factors.add(self._make.known(serial, known.position, known.covariance))
+        problem.values.insert(landmark_key(serial), known.position)
 
     def make_smart(self, problem: GraphProblem, careful: bool = True) -> list[tuple[Track, int]]:
         """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""

@@ -49,9 +49,8 @@ class Tie:
 class Known:
     """What is known of a landmark besides its measurements."""
 
-    position: Array  # in the world, or in the camera's coordinates (3,) [m]
+    position: Array  # in the world (3,) [m]
     covariance: Array  # of that (3, 3) [m²]
-    pose: int  # number of the pose that it is relative to; −1 for the world
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +103,7 @@ class SmootherState:
     @property
     def anchored(self) -> bool:
         """Whether landmarks are known in the world: then the path may not be moved in it."""
-        return any(known.pose < 0 for known in self.known.values())
+        return bool(self.known)
 
     @property
     def own(self) -> Array:
@@ -130,5 +129,4 @@ class SmootherState:
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], sights=self.sights[gone:], ties=self.ties[gone:],
             spread=self.spread[gone:],
-            known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip

@@ -123,8 +123,7 @@ class Steps(RectifiedMeasurement):
         if found.jump is not None:
             marks = marks.without_measurements().measured(seen, z[used], number, self.track)
             after = _begun(s, found.T, world_covariance(s.covariance), Sight.of(marks, seen, z[used]))
-            known = {serial: one for serial, one in s.known.items() if one.pose < 0}
-            after = replace(after, known=known, landmarks=marks)
+            after = replace(after, landmarks=marks)
             return self.settled(after, graph.rebuilt(after)), float("nan"), ""
         residuals, J = pose_only.residuals(one, found.T)
         information = _information(J[used], one.noise[used], z[used])
@@ -200,18 +199,8 @@ class Steps(RectifiedMeasurement):
     def inserted(self, s: SmootherState, ids: IdArray, positions: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
         marks = SmootherLandmarks.of(ids, s.serials, positions, covariances, inverses(covariances), True)
-        known = {serial: Known(x, P, -1) for serial, x, P in zip(marks.serial.tolist(), positions, covariances)}
+        known = {serial: Known(x, P) for serial, x, P in zip(marks.serial.tolist(), positions, covariances)}
         return replace(_with(s, marks), known={**s.known, **known}, measured=s.measured)
-
-    def placed(self, s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherState:
-        """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
-        marks = _seen_from_newest(s, ids, local, covariances)
-        T, by_pose = inverse(s.poses[-1]) @ s.last[1], points_by_pose(local)
-        there = T[:3, :3] @ (covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)) @ T[:3, :3].T
-        relative = zip(marks.serial.tolist(), transform(T, local), there)
-        return replace(
-            _with(s, marks), known={**s.known, **{serial: Known(x, P, s.number) for serial, x, P in relative}}
-        )
 
     def removed(self, s: SmootherState, ids: IdArray) -> SmootherState:
         """Without landmarks; what their measurements say of the poses stays.

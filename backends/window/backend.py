@@ -147,17 +147,9 @@ class WindowBackend:
     @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
-        arguments = known_landmarks("window", self._state.landmarks, ids, positions, covariances, False)
+        arguments = known_landmarks("window", self._state.landmarks, ids, positions, covariances)
         if len(ids):
             self._done(self._steps.inserted(self._state, *arguments), "inserted", *arguments)
-
-    @one_blas_thread
-    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
-        """See `slam.interfaces.MapBackend.place`."""
-        s = self._started("place")
-        arguments = known_landmarks("window", s.landmarks, ids, local, covariances, True)
-        if len(ids):
-            self._done(self._steps.placed(s, *arguments), "placed", *arguments)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 

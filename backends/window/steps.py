@@ -118,12 +118,6 @@ class Steps(RectifiedMeasurement):
         )  # fmt: skip
         return _with(s, new)
 
-    def placed(self, s: WindowState, ids: IdArray, local: Array, covariances: Array) -> WindowState:
-        """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
-        s = _with_new(s, ids, local, covariances)
-        points = np.arange(len(s.landmarks) - len(ids), len(s.landmarks))
-        return replace(s, places=s.places.joined(_places(s, points, local, covariances)))
-
     # --- parts of an update ---
 
     def _rows(self, s: WindowState, points: IndexArray, z: Array) -> Rows:

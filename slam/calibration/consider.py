@@ -151,12 +151,12 @@ class SchmidtFilter:
                 now = now.measured(now.landmarks.rows_of(ids[good]), local[good], *self._sight(local[good]))
         self._now, self._stamp = now, stamp  # one statement, so that an interrupt finds all of it done or nothing
 
-    def change(self, ids: IdArray, positions: Array, erased: IdArray, again: bool = False) -> None:
+    def change(self, ids: IdArray, positions: Array, erased: IdArray) -> None:
         """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones.
 
-        With `again`, those that are there already begin anew; else they stay as they are.
+        Those that are there already stay as they are.
         """
-        now = self._now.without(isin(self._now.landmarks.ids, ids if again else erased))
+        now = self._now.without(isin(self._now.landmarks.ids, erased))
         new = ~isin(ids, np.concatenate([now.landmarks.ids, erased]))
         if new.any():
             local = transform(inverse(now.T_world), positions[new])

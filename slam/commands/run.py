@@ -81,7 +81,7 @@ def prepare(
             backend=before.config.backend if backend == before.backend else chosen.backend,
         )
     require_settable(settings, chosen.to_json(), frontend)
-    chosen = chosen.with_settings(settings)
+    chosen = chosen.with_settings(list(settings))
     if frames is not None:
         start, stop = parse_frames(frames)
     options = RunOptions(

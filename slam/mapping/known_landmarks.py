@@ -5,25 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from slam.checks import FARTHEST_POSITION
-from slam.data import BoolArray, IdArray
+from slam.data import IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import LEAST_VARIANCE, Array
 from slam.table import LandmarkRows
 
-_NEAREST = 1e-3  # guard: least depth [m] of a landmark that a camera sees
 _LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having
 _ROUNDING = 1e-14  # numerics: share of a covariance's largest eigenvalue below which the smallest is rounding
 _SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from its transpose
 
 
-def require_known(owner: str, ids: IdArray, positions: Array, covariances: Array, seen: bool = False) -> None:
+def require_known(owner: str, ids: IdArray, positions: Array, covariances: Array) -> None:
     """Check landmarks (N) at positions (N, 3) [m] with covariances (N, 3, 3) [m²]; `owner` is named in messages.
 
-    Where they are `seen`, their positions are in the camera's coordinates, in front of it.
-
     Raises:
-        MeasurementError: shapes differ, an id occurs twice, a position is not finite, absurdly far or behind the
-            camera, or a covariance is not symmetric and positive definite.
+        MeasurementError: shapes differ, an id occurs twice, a position is not finite or absurdly far, or a covariance
+            is not symmetric and positive definite.
     """
     n = len(ids)
     if positions.shape != (n, 3) or covariances.shape != (n, 3, 3):
@@ -45,7 +42,6 @@ def require_known(owner: str, ids: IdArray, positions: Array, covariances: Array
             ~good | (np.linalg.eigvalsh(C)[:, 0] <= 0),
             "the covariance of landmark {} is not symmetric and positive definite",
         ),
-        (seen & ~in_front(positions), "landmark {} does not lie in front of the camera"),
     ):
         if bad.any():
             raise MeasurementError(f"{owner}: {what.format(ids[bad][0])}")
@@ -63,18 +59,13 @@ def definite(covariances: Array) -> Array:
 
 
 def known_landmarks(
-    backend: str, table: LandmarkRows, ids: IdArray, positions: Array, covariances: Array, seen: bool
+    backend: str, table: LandmarkRows, ids: IdArray, positions: Array, covariances: Array
 ) -> tuple[IdArray, Array, Array]:
     """Copies of landmarks (N,) handed to `slam.interfaces.MapBackend`, checked; they may not be in the table yet.
 
     Raises:
         MeasurementError: as `require_known`; or one is in the table already.
     """
-    require_known(backend, ids, positions, covariances, seen)
+    require_known(backend, ids, positions, covariances)
     table.require_new(ids)
     return np.array(ids, np.int64), np.array(positions, float), np.array(covariances, float)
-
-
-def in_front(local: Array) -> BoolArray:
-    """Which points (N, 3) [m] in a camera's coordinates lie in front of it (N,)."""
-    return np.asarray(local[:, 2] >= _NEAREST)

@@ -258,7 +258,8 @@ def encode(saved: SavedMap) -> bytes:
     """The bytes of a file; the same for the same map."""
     header = {name: getattr(saved, name) for name in (*_TEXTS, "holds")}
     archive = io.BytesIO()
-    np.savez(archive, **map_arrays(saved))
+    arrays: dict[str, Any] = dict(map_arrays(saved))
+    np.savez(archive, **arrays)
     with zipfile.ZipFile(archive, "a") as file:
         content = json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
         file.writestr(zipfile.ZipInfo("header.json", _DATE), content)
@@ -299,7 +300,7 @@ def map_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
     for name, kind in _ARRAYS.items():
         if kind.field:
-            values = [getattr(x, kind.field) for x in (loops if kind.shape[0] == "l" else k)]
+            values: Any = [getattr(x, kind.field) for x in (loops if kind.shape[0] == "l" else k)]
             values = np.concatenate(values) if kind.shape[0] == "f" and values else values
         else:
             values = whole[name] if name in whole else getattr(saved, name)
@@ -330,5 +331,5 @@ def map_of(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str], source: s
 
     keyframes = [Keyframe(-1, **fields_of(k=i, f=slice(*span))) for i, span in enumerate(pairwise(begin))]
     loops = [Loop(first, second, **fields_of(l=i)) for i, (first, second) in enumerate(pairs.tolist())]
-    whole = {name: arrays[name] for name in (*_LANDMARKS, "keyframe_poses")}
-    return SavedMap(**whole, **texts, source=source, keyframes=tuple(keyframes), loops=tuple(loops))
+    whole: dict[str, Any] = {name: arrays[name] for name in (*_LANDMARKS, "keyframe_poses")} | dict(texts)
+    return SavedMap(**whole, source=source, keyframes=tuple(keyframes), loops=tuple(loops))

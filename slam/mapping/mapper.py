@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
 from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import transform
 from slam.interfaces import Backend, MapBackend
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
-from slam.mapping.known_landmarks import in_front
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
 from slam.tracks.localizer import LandmarkMatches, Localizer
@@ -25,18 +22,11 @@ from slam.tracks.visibility import MapView, expected_landmarks
 
 @dataclass(frozen=True, eq=False)
 class OldPlace:
-    """Features of an old keyframe, as landmarks at positions that are known by now."""
+    """Features of an old keyframe, as landmarks at positions in the world that are known by now."""
 
     landmarks: LandmarkTable  # their bookkeeping (M); ids that they had, −1 for none
-    rows: NDArray[np.intp]  # of the present frame's features that show them, or of the keyframe's (M,)
     positions: Array  # (M, 3) [m]
     covariances: Array  # of the positions (M, 3, 3) [m²]
-
-    @classmethod
-    def at(cls, landmarks: LandmarkTable, rows: NDArray[np.intp], T: Array, points: Array, P: Array) -> OldPlace:
-        """From points (M, 3) [m] with covariances (M, 3, 3) in coordinates that `T` (4, 4) transforms."""
-        P = T[:3, :3] @ P @ T[:3, :3].T
-        return cls(landmarks, rows, transform(T, points), 0.5 * (P + np.swapaxes(P, 1, 2)))
 
 
 class Mapper:
@@ -72,29 +62,6 @@ class Mapper:
         if len(erased):  # once a frame: it costs a filter a copy of its covariance
             backend.remove(erased)
         return replace(step, landmarks=landmarks, added=added, erased=erased)
-
-    def restore(self, backend: Backend, step: Step, place: OldPlace) -> Step:
-        """Let landmarks of a revisited place rejoin the map, if the back end can place them.
-
-        They are in the present camera's coordinates, and keep the ids that they had. If the back end still holds such a
-        landmark, at its old, drifted position, that one is erased first. Features that are landmarks of the map
-        already, or that move, are left out.
-        """
-        if not isinstance(backend, MapBackend):
-            return step
-        taken = np.concatenate([step.matches.rows, step.added.rows, step.withheld.rows, step.labels.moving])
-        free = np.flatnonzero(~np.isin(place.rows, taken) & in_front(place.positions))
-        if not len(free):
-            return step
-        ids, rows = self._named(place.landmarks.ids[free]), place.rows[free]
-        stale = np.isin(step.landmarks.ids, ids)
-        if stale.any():
-            backend.remove(step.landmarks.ids[stale])
-        landmarks = step.landmarks.select(~stale)
-        backend.place(ids, place.positions[free], place.covariances[free])
-        landmarks = landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
-        erased = step.erased[~isin(step.erased, ids)]
-        return replace(step, landmarks=landmarks, erased=erased, returned=LandmarkMatches(ids, rows))
 
     def insert(self, backend: Backend, landmarks: LandmarkTable, place: OldPlace) -> LandmarkTable:
         """Add landmarks of a place in the world to the map, as from a saved map; those already in it are unchanged."""

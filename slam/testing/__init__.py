@@ -82,7 +82,6 @@ RIGHT: Sequence[Check] = (
     hostile.queries_are_pure,
     hostile.a_stamp_has_one_update,
     hostile.rows_that_no_point_explains_are_rejected,
-    hostile.landmarks_are_placed_in_front,
     hostile.hostile_calls_have_one_meaning,
 )
 

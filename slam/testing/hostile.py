@@ -104,19 +104,6 @@ def rows_that_no_point_explains_are_rejected(factory: Factory) -> None:
     assert_sound(run.backend.estimate(), "after an update with two wrong rows")
 
 
-def landmarks_are_placed_in_front(factory: Factory) -> None:
-    """`place` refuses landmarks behind the camera; a back end without it has nothing to refuse."""
-    backend: Any = factory(RIG, models=MODELS)
-    if not hasattr(backend, "place"):
-        return
-    raises(MeasurementError, backend.place, *_cloud([7], [[0.0, 0.0, 5.0]]), what="place before the first predict")
-    backend.predict(0.0)
-    for depth in (-5.0, 0.0, float("nan")):
-        raises(MeasurementError, backend.place, *_cloud([7], [[0.0, 0.0, depth]]), what=f"place at a depth of {depth}")
-    backend.place(*_cloud([7], [[0.0, 0.0, 5.0]]))
-    assert_sound(backend.estimate(), "after a landmark was placed")
-
-
 def hostile_calls_have_one_meaning(factory: Factory) -> None:
     """Generated sequences of hostile calls: each is taken or refused as the interface says, and all stays finite."""
     for seed in range(_SEQUENCES):
@@ -166,7 +153,7 @@ class _Life:
     def next(self) -> _Call:
         """A call."""
         kinds = [self._predict] * 3 + [self._update] * 4 + [self._add] * 3 + [self._remove]
-        kinds += [self._place, self._insert] if isinstance(self.backend, MapBackend) else []
+        kinds += [self._insert] if isinstance(self.backend, MapBackend) else []
         kinds += [self._revise] if hasattr(self.backend, "revise") else []
         return kinds[self.rng.integers(len(kinds))]()
 
@@ -233,17 +220,6 @@ class _Life:
         return _Call(
             f"remove of {len(ids)} landmarks", unknown, lambda: self.backend.remove(ids),
             lambda: self.ids.difference_update(ids),
-        )  # fmt: skip
-
-    def _place(self) -> _Call:
-        ids, local, covariances = _cloud(self._new_ids(), None, self.rng)
-        behind = self.rng.random() < 0.2 and len(ids) > 0
-        if behind:
-            local[0, 2] = self.rng.choice([-5.0, 0.0, float("nan")])
-        return _Call(
-            f"place of {len(ids)} landmarks", not self.stamps or behind,
-            lambda: self.backend.place(ids, local, covariances),
-            lambda: self._added(ids, self.measured or len(ids) > 0),
         )  # fmt: skip
 
     def _insert(self) -> _Call:

@@ -1,4 +1,4 @@
-"""Landmarks whose place is known beforehand, in the world or before the camera, in every back end."""
+"""Landmarks whose place is known beforehand, in every back end."""
 
 from __future__ import annotations
 
@@ -158,41 +158,6 @@ def test_the_smoother_with_a_lag_tracks_in_a_prior_map():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_landmarks_placed_before_the_camera_move_with_its_pose(name):
-    """With the camera's own place known to 5 cm, so is theirs; the next pose is known relative to them."""
-    scene = Scene(frames=8)
-    backend = backends.create(
-        name, RIG, models=models(initial_position_sigma=0.05, initial_rotation_sigma=1e-3, T_world_left=START.tolist())
-    )
-    backend.predict(0.0)
-    first = scene.seen[0]
-    local = RIG.triangulate(first.uv_left, first.uv_right)
-    backend.place(first.ids, local, RIG.triangulation_covariance(local, SIGMA))
-    spread = np.sqrt(backend.estimate().covariances[:, 0, 0])
-    assert (spread > 0.05).all()
-    for k, seen in enumerate(scene.seen[1:], start=1):
-        backend.predict(DT * k)
-        report = backend.update(seen.select(np.isin(seen.ids, first.ids)))
-        assert len(report.used) > 0.8 * len(seen)
-    last = backend.estimate().T_world_left
-    # the first pose is believed where it is: what was placed is seen from there
-    assert np.linalg.norm(last[:3, 3] - scene.poses[-1][:3, 3]) < 0.03
-
-
-def test_placing_what_stereo_says_is_adding():
-    """`place` with the stereo pair's own covariance gives the filter the very belief that `add` does."""
-    scene = Scene(frames=1)
-    seen = scene.seen[0]
-    local = RIG.triangulate(seen.uv_left, seen.uv_right)
-    one, other = (backends.create("ekf", RIG, models=models()) for _ in range(2))
-    one.predict(0.0), other.predict(0.0)
-    one.add(seen)
-    other.place(seen.ids, local, RIG.triangulation_covariance(local, SIGMA))
-    np.testing.assert_array_equal(one.estimate().covariances, other.estimate().covariances)
-    np.testing.assert_array_equal(one.estimate().positions, other.estimate().positions)
-
-
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -211,5 +176,3 @@ def test_bad_input_is_refused_with_one_line(name, change, words):
     backend.insert(scene.ids, scene.believed, scene.covariances)
     with pytest.raises(MeasurementError, match=r"landmark 7 .*already"):
         backend.insert(scene.ids, scene.believed, scene.covariances)
-    with pytest.raises(MeasurementError, match="before the first predict"):
-        backend.place(scene.ids + 1000, scene.believed, scene.covariances)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from backends.smoother import SmootherBackend
-from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
+from backends.smoother.factors import FactorMaker, pose_key, to_pose3
 from slam.data import Observations, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
@@ -310,24 +310,6 @@ def test_whether_the_whole_path_follows_is_told_with_the_present_frame():
 
 
 # --- parts ---
-
-
-def test_a_known_landmark_tells_what_is_known_of_it():
-    """The information of its factor on the landmark is the inverse of its covariance, wherever the camera is."""
-    rng = np.random.default_rng(0)
-    A, local = rng.normal(0, 0.1, (3, 3)), np.array([1.0, -0.5, 4.0])
-    P, T = A @ A.T, se3.exp(rng.normal(0, 0.5, 6))
-    factor = FactorMaker(RectifiedStereo.of(RIG), MODELS).known_from(3, 7, local, P)
-    values = gtsam.Values()
-    values.insert(pose_key(3), to_pose3(T))
-    values.insert(landmark_key(7), se3.transform(T, local[None])[0])
-    linear = factor.linearize(values)
-    by_landmark = (
-        linear.information()[-3:, -3:] if linear.keys()[-1] == landmark_key(7) else linear.information()[:3, :3]
-    )
-    R = T[:3, :3]
-    np.testing.assert_allclose(np.linalg.inv(by_landmark), R @ P @ R.T, rtol=1e-6, atol=1e-9)
-    assert np.abs(linear.jacobian()[1]).max() < 1e-6
 
 
 def test_a_track_that_cannot_be_triangulated_does_not_end_the_solver():

@@ -88,21 +88,16 @@ class Play:
         self.reference.add(seen, self.points[points[rows]])
         self.of.update(zip(seen.ids.tolist(), points[rows].tolist()))
 
-    def insert(self, local: bool = False) -> None:
-        """Landmarks whose place is known from elsewhere, in the world or before the camera."""
+    def insert(self) -> None:
+        """Landmarks whose place is known from elsewhere."""
         points = self._some(sorted(set(range(len(self.points))) - set(self.of.values())), 3)
         ids = self._new_ids(len(points))
         roots = 0.02 * self.rng.standard_normal((len(points), 3, 3)) + 0.03 * np.eye(3)
         covariances = roots @ roots.transpose(0, 2, 1) + 1e-4 * np.eye(3)
         noise = np.linalg.cholesky(covariances) @ self.rng.standard_normal((len(points), 3, 1))
-        if local:
-            h = (self.points[points] - self.T[:3, 3]) @ self.T[:3, :3] + noise[..., 0]
-            self.backend.place(ids, h, covariances)
-            self.reference.place(ids, h, covariances)
-        else:
-            positions = self.points[points] + noise[..., 0]
-            self.backend.insert(ids, positions, covariances)
-            self.reference.insert(ids, positions, covariances)
+        positions = self.points[points] + noise[..., 0]
+        self.backend.insert(ids, positions, covariances)
+        self.reference.insert(ids, positions, covariances)
         self.of.update(zip(ids.tolist(), points.tolist()))
 
     def remove(self) -> None:
@@ -197,7 +192,7 @@ def _play(rng: np.random.Generator, play: Play, tolerance: tuple[float, float]) 
         elif kind == 9:
             play.remove()
         else:
-            play.insert(local=kind == 10)
+            play.insert()
         play.count()
         if number == half:
             play.compare(*tolerance)

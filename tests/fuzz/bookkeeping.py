@@ -103,16 +103,15 @@ class Books:
         if result.index != len(self.stamps) or result.estimate.stamp != features.stamp:
             raise Broken(f"frame {len(self.stamps)} is called {result.index}, at {result.estimate.stamp}")
         self._check_status(result)
-        matched, used, rejected, added, erased, returned = (
+        matched, used, rejected, added, erased = (
             _set(ids)
-            for ids in (result.matched, result.report.used, result.report.rejected, result.added, result.erased,
-                        result.returned)
-        )  # fmt: skip
+            for ids in (result.matched, result.report.used, result.report.rejected, result.added, result.erased)
+        )
         if added & self.ever:
             raise Broken(f"ids of new landmarks were used before: {sorted(added & self.ever)[:5]}")
         self.ever |= added
         came_back = _set(() if self.system.landmarks is None else self.system.landmarks.ids) - self.map - added
-        if not returned | came_back <= self.ever or (came_back and not self.loops):
+        if not came_back <= self.ever or (came_back and not self.loops):
             raise Broken("a landmark came back that never was, or although no places are kept")
         if not matched <= self.map | came_back or not used | rejected <= matched or used & rejected:
             raise Broken("landmarks were matched, used or rejected that are not in the map, or both")

@@ -100,13 +100,6 @@ class Reference:
         for i, position, L in zip(ids.tolist(), positions, np.linalg.cholesky(covariances)):
             self._know(i, lambda T, X, at=position, L=L: np.linalg.solve(L, X[0] - at))
 
-    def place(self, ids: Array, local: Array, covariances: Array) -> None:
-        """New landmarks whose positions before the newest camera are known."""
-        T = self.poses[-1]
-        self._join(ids, local @ T[:3, :3].T + T[:3, 3])
-        for i, h, L in zip(ids.tolist(), local, np.linalg.cholesky(covariances)):
-            self._know(i, lambda T, X, h=h, L=L: np.linalg.solve(L, (X[0] - T[0, :3, 3]) @ T[0, :3, :3] - h))
-
     def remove(self, ids: Array) -> None:
         """Landmarks leave the map; what they told about the poses stays known."""
         for i in ids.tolist():

@@ -22,7 +22,7 @@ _DIMENSIONS = 6  # fixed: mean of χ² of a pose
 
 def close(
     atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool, config: AtlasConfig
-) -> tuple[Atlas, bool]:
+) -> Atlas:
     """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop; else refuse it.
 
     One that cannot be judged is refused.
@@ -35,9 +35,6 @@ def close(
         same_view: the camera sees the same from the same place, which is believed against the path: the covariance of
             the path between is then as much too small as the two disagree.
         config: settings.
-
-    Returns:
-        the atlas after it, and whether the pose graph was solved anew with the loop.
     """
     common = None if atlas.solved is None else atlas.solved.belief(rig)[0]
 
@@ -54,24 +51,22 @@ def close(
             return _left_out(atlas, chain, loop, rig, config, off > config.refused_beyond)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if config.agreeing > 1 and not (before is not None and _agree(chain, before, loop, limit)):
-            return atlas.with_inactive_loop(loop), False
+            return atlas.with_inactive_loop(loop)
         atlas = replace(atlas, confirmed=True)
         if off > limit:
             atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
             chain, graph, _ = without_it(atlas)
         elif atlas.loops and not is_informative(graph, loop):
-            return atlas.with_inactive_loop(loop), False
+            return atlas.with_inactive_loop(loop)
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
             return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
-        return replace(atlas, loops=(*atlas.loops, loop)).solved_by(graph, rig), True
+        return replace(atlas, loops=(*atlas.loops, loop)).solved_by(graph, rig)
     except np.linalg.LinAlgError:
-        return replace(atlas, refused=(*atlas.refused, loop.pair)), False
+        return replace(atlas, refused=(*atlas.refused, loop.pair))
 
 
-def _left_out(
-    atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, config: AtlasConfig, refused: bool
-) -> tuple[Atlas, bool]:
+def _left_out(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, config: AtlasConfig, refused: bool) -> Atlas:
     """Leave out a loop that contradicts the others, or the others if fewer places support them.
 
     One that is not `refused` contradicts them by no more than may be: it does not count as another place.
@@ -81,7 +76,7 @@ def _left_out(
     if refused:
         atlas = replace(atlas, refused=(*atlas.refused, loop.pair))
     if not atlas.loops or len(spaced(atlas, atlas.inactive_loops, config)) < 2:
-        return atlas, False
+        return atlas
     every = (*atlas.loops, *atlas.inactive_loops)
     rival, present = (
         agreeing(chain, every, loop, chain.poses, limit),
@@ -89,11 +84,11 @@ def _left_out(
     )
     places = spaced(atlas, rival, config)
     if len(places) <= len(spaced(atlas, present, config)):
-        return atlas, False
+        return atlas
     before = {x.pair for x in atlas.loops}
     held = {x.pair: x for x in (*places, *(x for x in rival if x.pair in before), loop)}
     atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival)
-    return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig), True
+    return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig)
 
 
 def _agree(chain: Chain, before: Loop, loop: Loop, limit: float) -> bool:

@@ -37,7 +37,6 @@ class AtlasConfig:
             keyframes after the first.
         gate_sigmas: a loop is closed if its distance from the path is at most this many standard deviations. Beyond
             what is as rare as a Gaussian number so far off, it is refused; between the two it is left out.
-        give_back: landmarks of a revisited place return to the back end, if it can place landmarks.
     """
 
     enabled: bool = True
@@ -52,7 +51,6 @@ class AtlasConfig:
     spread: float = 0.1
     agreeing: int = 2
     gate_sigmas: float = 5.0
-    give_back: bool = True
 
     __pydantic_config__ = FORBID_UNKNOWN
 

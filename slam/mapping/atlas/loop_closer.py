@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
@@ -67,20 +67,17 @@ class LoopCloser:
         self._localizer = Localizer(self._rig, association, models)
 
     @one_blas_thread
-    def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> tuple[Atlas, OldPlace | None]:
-        """The atlas after a frame, and the old features that the frame shows again if it closed a loop.
-
-        `path` returns the path in odom so far.
-        """
+    def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> Atlas:
+        """The atlas after a frame; `path` returns the path in odom so far."""
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
         wanted = begins or (not step.tracking.unmatched and self._is_keyframe(atlas, step))
         if not (self._config.enabled and wanted):
-            return atlas, None
+            return atlas
         landmark_of = step.matches.landmark_of(len(step.features))
         landmark_of[step.added.rows] = step.added.ids
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:
-            return atlas, None
+            return atlas
         known = landmark_of[landmark_of >= 0]
         candidates = self._candidates(atlas, new, step, known)
         atlas = replace(atlas.with_new(new), restarts=len(atlas.gaps))
@@ -90,11 +87,10 @@ class LoopCloser:
             found = self._verified(atlas, lookalike, step.features, step.correction, step.index)
             found = [one for one in found if self._is_same_view(one[1], step.features)]
         if not found:
-            return atlas, None
+            return atlas
         loop, seen = max(found, key=lambda one: one[0].inliers)
         same = self._is_same_view(seen, step.features)
-        atlas, closed = close(atlas, loop, step.common, path, same, self._config)
-        return atlas, self._seen_again(seen) if closed and self._config.give_back else None
+        return close(atlas, loop, step.common, path, same, self._config)
 
     @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
@@ -115,20 +111,10 @@ class LoopCloser:
         points = seen.keyframe.points.astype(float)
         P = self._rig.triangulation_covariance(points, self._sigma)
         landmarks = replace(keyframe_landmarks(seen.keyframe), seen_from=np.tile(T[:3, 3], (len(points), 1)))
-        place = OldPlace.at(landmarks, np.arange(len(points)), T, points, P)
+        P = T[:3, :3] @ P @ T[:3, :3].T
+        place = OldPlace(landmarks, transform(T, points), 0.5 * (P + np.swapaxes(P, 1, 2)))
         stamp = -np.inf if loop.first < atlas.prior_count else seen.keyframe.stamp
         return Found(T @ loop.T_first_second, place, stamp)
-
-    def _seen_again(self, seen: Verified) -> OldPlace:
-        """The old keyframe's inliers, in coordinates of the present left camera."""
-        m, back = seen.matches, inverse(seen.T_keyframe_left)
-        points, R = seen.keyframe.points[m.landmarks].astype(float), back[:3, :3]
-        near = transform(back, points)
-        J = points_by_pose(near)
-        P = R @ self._rig.triangulation_covariance(points, self._sigma) @ R.T
-        P = P + J @ seen.covariance @ np.swapaxes(J, 1, 2)
-        landmarks = keyframe_landmarks(seen.keyframe).select(m.landmarks)
-        return OldPlace.at(landmarks, m.features, np.eye(4), near, P)
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
         """Whether the view differs enough from the last keyframe's, or its loop waits to be confirmed by another."""

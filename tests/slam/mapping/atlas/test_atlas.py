@@ -145,17 +145,6 @@ def test_landmarks_are_as_sure_as_the_pose_that_a_loop_gives():
     np.testing.assert_array_equal(landmarks_by_pose(replace(estimate, covariances=1e-6 * P), corrected), 1e-6 * P)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
-def test_landmarks_of_an_old_place_are_measured_again(sequence, backend: str):
-    _, results = drive(sequence, backend, "map.target_in_view=30")  # so that few of them are landmarks already
-    first = first_loop(results)
-    long_ago = np.concatenate([r.matched for r in results[: LAP // 2]])
-    erased = np.concatenate([r.erased for r in results[:first]])
-    again = np.concatenate([r.matched for r in results[first + 1 :]])
-    assert np.isin(again, np.intersect1d(long_ago, erased)).any()
-
-
 def test_a_camera_carried_to_a_place_of_long_ago_is_found(sequence):
     system = system_for(sequence, "ekf", ("map.max_landmarks=60",))
     for k in range(60):
