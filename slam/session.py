@@ -186,7 +186,7 @@ class Session:
         _fill(new, known)
         self.mapper.next_id = known.next_id
         if found is not None:
-            landmarks = self.mapper.insert(new, known.rows, found.place)
+            landmarks = self.mapper.insert(new, known.rows, found)
         return replace(state, backend=new, landmarks=landmarks, prior_map=None)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
@@ -234,7 +234,7 @@ class Session:
             _give_landmarks(old, new)
             if elsewhere.found is not None:
                 assert landmarks is not None
-                landmarks, place = self.mapper.insert(new, landmarks, elsewhere.found.place), elsewhere.found.stamp
+                landmarks, place = self.mapper.insert(new, landmarks, elsewhere.found), elsewhere.found.stamp
             prediction = new.predict(stamp)
             standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
             atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), place)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from slam.data import BoolArray, IdArray
-from slam.geometry.arrays import Array, isin
+from slam.geometry.arrays import isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend, MapBackend
+from slam.mapping.atlas.loop_closer import Found
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.selection import new_landmarks
@@ -18,15 +19,6 @@ from slam.mapping.step import Step
 from slam.tracks.localizer import LandmarkMatches, Localizer
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView, expected_landmarks
-
-
-@dataclass(frozen=True, eq=False)
-class OldPlace:
-    """Features of an old keyframe, as landmarks at positions in the world that are known by now."""
-
-    landmarks: LandmarkTable  # their bookkeeping (M); ids that they had, −1 for none
-    positions: Array  # (M, 3) [m]
-    covariances: Array  # of the positions (M, 3, 3) [m²]
 
 
 class Mapper:
@@ -63,14 +55,15 @@ class Mapper:
             backend.remove(erased)
         return replace(step, landmarks=landmarks, added=added, erased=erased)
 
-    def insert(self, backend: Backend, landmarks: LandmarkTable, place: OldPlace) -> LandmarkTable:
-        """Add landmarks of a place in the world to the map, as from a saved map; those already in it are unchanged."""
+    def insert(self, backend: Backend, landmarks: LandmarkTable, found: Found) -> LandmarkTable:
+        """Add landmarks of an old place to the map, as from a saved map; those already in it are unchanged."""
         assert isinstance(backend, MapBackend)  # only such back ends start in a map
-        old = place.landmarks.ids
+        old = found.landmarks.ids
         new = np.flatnonzero(~np.isin(old, landmarks.ids) | (old < 0))
-        ids = self._named(old[new])
-        backend.insert(ids, place.positions[new], place.covariances[new])
-        return landmarks.joined(replace(place.landmarks.select(new), ids=ids))
+        ids, without = old[new], old[new] < 0
+        ids[without] = self._new_ids(int(without.sum()))
+        backend.insert(ids, found.positions[new], found.covariances[new])
+        return landmarks.joined(replace(found.landmarks.select(new), ids=ids))
 
     def reconcile(self, backend: Backend, landmarks: LandmarkTable | None) -> LandmarkTable | None:
         """Make rows and back end agree after an interrupted step: landmarks that only one of them has are erased.
@@ -119,12 +112,6 @@ class Mapper:
             backend.add(added.observations(features))
             landmarks = landmarks.with_new(step.index, added.ids, features, rows, step.estimate.T_world_left[:3, 3])
         return landmarks, added
-
-    def _named(self, ids: IdArray) -> IdArray:
-        """The ids (N,) with new ones in place of −1."""
-        ids = ids.copy()
-        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
-        return ids
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

@@ -17,8 +17,7 @@ from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, Loop, step_covariance, view_has_changed
-from slam.mapping.atlas.verification import Verified, keyframe_landmarks, verify
-from slam.mapping.mapper import OldPlace
+from slam.mapping.atlas.verification import keyframe_landmarks, verify
 from slam.mapping.selection import depth_is_known
 from slam.mapping.step import Step
 from slam.models import EstimatorModels
@@ -27,6 +26,7 @@ from slam.runtime.blas import one_blas_thread
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
 from slam.tracks.localizer import Localizer
+from slam.tracks.table import LandmarkTable
 
 _NEARBY = 4  # cost: keyframes compared because they are near the path, besides those that look alike
 _VERIFIED = 3  # cost: keyframes whose geometry is checked, of those that are compared in detail
@@ -37,10 +37,12 @@ _HYPOTHESES = 300  # cost: poses tried, so that with a quarter of the matches ri
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Pose and place of a camera found without a prior."""
+    """A camera found without a prior, by a keyframe."""
 
     T_odom_left: Array  # the camera's pose (4, 4) in the back end's frame
-    place: OldPlace  # what the place shows, in the back end's world
+    landmarks: LandmarkTable  # the keyframe's features (M); ids of the landmarks that they showed, −1 for none
+    positions: Array  # of these (M, 3) [m] in the back end's world
+    covariances: Array  # (M, 3, 3) [m²]
     stamp: float  # time of the keyframe that shows the place [s]; −inf for one of an earlier run
 
 
@@ -85,11 +87,11 @@ class LoopCloser:
         if not found:  # whatever the path says
             lookalike = self._anywhere(atlas, new, known, step.features)
             found = self._verified(atlas, lookalike, step.features, step.correction, step.index)
-            found = [one for one in found if self._is_same_view(one[1], step.features)]
+            found = [loop for loop in found if self._is_same_view(atlas, loop, step.features)]
         if not found:
             return atlas
-        loop, seen = max(found, key=lambda one: one[0].inliers)
-        same = self._is_same_view(seen, step.features)
+        loop = max(found, key=lambda loop: loop.inliers)
+        same = self._is_same_view(atlas, loop, step.features)
         return close(atlas, loop, step.common, path, same, self._config)
 
     @one_blas_thread
@@ -104,17 +106,16 @@ class LoopCloser:
         verified = self._verified(atlas, self._ranked(atlas, likely, features), features, correction, seed)
         if not verified:
             return None
-        loop, seen = max(verified, key=lambda one: one[0].inliers)
-        if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other, _ in verified):
+        loop = max(verified, key=lambda loop: loop.inliers)
+        if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other in verified):
             return None
-        T = inverse(atlas.T_map_odom) @ atlas.poses_in_map[loop.first]
-        points = seen.keyframe.points.astype(float)
-        P = self._rig.triangulation_covariance(points, self._sigma)
-        landmarks = replace(keyframe_landmarks(seen.keyframe), seen_from=np.tile(T[:3, 3], (len(points), 1)))
-        P = T[:3, :3] @ P @ T[:3, :3].T
-        place = OldPlace(landmarks, transform(T, points), 0.5 * (P + np.swapaxes(P, 1, 2)))
-        stamp = -np.inf if loop.first < atlas.prior_count else seen.keyframe.stamp
-        return Found(T @ loop.T_first_second, place, stamp)
+        keyframe = atlas.keyframes[loop.first].corrected(correction, self._rig)
+        T, points = inverse(atlas.T_map_odom) @ atlas.poses_in_map[loop.first], keyframe.points.astype(float)
+        P = T[:3, :3] @ self._rig.triangulation_covariance(points, self._sigma) @ T[:3, :3].T
+        landmarks = replace(keyframe_landmarks(keyframe), seen_from=np.tile(T[:3, 3], (len(points), 1)))
+        stamp = -np.inf if loop.first < atlas.prior_count else keyframe.stamp
+        P = 0.5 * (P + np.swapaxes(P, 1, 2))
+        return Found(T @ loop.T_first_second, landmarks, transform(T, points), P, stamp)
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
         """Whether the view differs enough from the last keyframe's, or its loop waits to be confirmed by another."""
@@ -188,11 +189,11 @@ class LoopCloser:
         few = [np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL for k in rows.tolist()]
         return rows[np.array(few, bool)]
 
-    def _is_same_view(self, seen: Verified, features: StereoFeatures) -> bool:
-        """Whether a frame shows what a keyframe did: most features, from the same place."""
-        most = min(len(seen.keyframe), int(features.has_stereo.sum()))
-        moved = view_has_changed(seen.keyframe, seen.T_keyframe_left, self._rig, self._config)
-        return 2 * len(seen.matches) >= most and not moved
+    def _is_same_view(self, atlas: Atlas, loop: Loop, features: StereoFeatures) -> bool:
+        """Whether a frame shows what a loop's first keyframe did: most features, from the same place."""
+        keyframe = atlas.keyframes[loop.first]
+        most = min(len(keyframe), int(features.has_stereo.sum()))
+        return 2 * loop.inliers >= most and not view_has_changed(keyframe, loop.T_first_second, self._rig, self._config)
 
     def _most_alike(self, atlas: Atlas, descriptors: NDArray[np.float32], possible: BoolArray) -> NDArray[np.intp]:
         """Numbers of those `possible` keyframes (K,) whose descriptors as a whole are most similar, best first."""
@@ -214,20 +215,16 @@ class LoopCloser:
     def _verified(
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, correction: Correction | None,
         seed: int,
-    ) -> list[tuple[Loop, Verified]]:  # fmt: skip
+    ) -> list[Loop]:  # fmt: skip
         """The candidates that geometry confirms, as loops that end at the present camera.
 
         Their second number is that of the newest keyframe, which is the present camera's unless it is lost.
         """
         found = []
         for k in candidates.tolist():
-            keyframe = atlas.keyframes[k].corrected(correction, self._rig)
-            seen = verify(keyframe, features, self._rig, self._localizer, self._config, seed)
-            if seen is not None:
-                # Each of both poses has an error of its own frame too, at most as large as such a measurement's noise.
-                P = seen.covariance + seen.noise
-                found.append((Loop(k, len(atlas) - 1, seen.T_keyframe_left, P, len(seen.matches)), seen))
-        return found
+            keyframe, pair = atlas.keyframes[k].corrected(correction, self._rig), (k, len(atlas) - 1)
+            found.append(verify(keyframe, features, pair, self._rig, self._localizer, self._config, seed))
+        return [loop for loop in found if loop is not None]
 
     def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:
         """Whether two verified loops put the camera at positions closer together than the scene's depth."""
