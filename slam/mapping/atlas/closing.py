@@ -36,7 +36,7 @@ def close(
             the path between is then as much too small as the two disagree.
         config: settings.
     """
-    common = None if atlas.solved is None else atlas.solved.belief(rig)[0]
+    given, common = atlas, None if atlas.solved is None else atlas.solved.belief(rig)[0]
 
     def without_it(atlas: Atlas) -> tuple[Chain, PoseGraph, float]:
         """The path, the pose graph without the loop, and the loop's distance from it."""
@@ -63,7 +63,7 @@ def close(
             return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
         return replace(atlas, loops=(*atlas.loops, loop)).solved_by(graph, rig)
     except np.linalg.LinAlgError:
-        return replace(atlas, refused=(*atlas.refused, loop.pair))
+        return replace(given, refused=(*given.refused, loop.pair))
 
 
 def _left_out(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, config: AtlasConfig, refused: bool) -> Atlas:
