@@ -328,8 +328,7 @@ class FrameResult:
         loop, refused_loop: if the frame closed a loop, or one that contradicts the path, index of the earlier frame of
             the same place, or −1 if that is in the prior map; else None.
         keyframe: whether the frame has become a keyframe.
-        returned: ids of a revisited place's landmarks that have joined the map: those that they had before, new ones
-            where the place was kept before a feature of it became a landmark.
+        returned: ids of landmarks of an old place that joined the map as another back end took over there.
         common: the part of the pose's error that all frames share; empty after a loop, which mixes it with noise.
     """
 

@@ -177,7 +177,7 @@ class Session:
         _fill(new, saved)
         self.mapper.next_id = saved.next_id
         if place is not None:
-            landmarks = self.mapper.insert(new, saved.rows, place.place)
+            landmarks = self.mapper.insert(new, saved.rows, place)
         return replace(state, backend=new, landmarks=landmarks, prior_map=None)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
@@ -226,7 +226,7 @@ class Session:
             new.insert(whole.ids, whole.positions, definite(whole.covariances))  # type: ignore[attr-defined]
             if elsewhere.place is not None:
                 assert landmarks is not None
-                landmarks = self.mapper.insert(new, landmarks, elsewhere.place.place)
+                landmarks = self.mapper.insert(new, landmarks, elsewhere.place)
                 seen_at = elsewhere.place.stamp
             prediction = new.predict(stamp)
             standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()

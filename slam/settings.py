@@ -18,7 +18,7 @@ SETTABLE: dict[str, tuple[str, ...]] = {
     "models": ("motion.acceleration", "motion.angular_acceleration", "pixel_sigma"),
     "association": ("align",),
     "map": ("target_in_view", "max_landmarks", "max_depth_error", "monocular", "restart_after"),
-    "atlas": ("enabled", "give_back"),
+    "atlas": ("enabled",),
     "self_calibration": ("enabled", "systematic"),
     "objects": ("mode", "max_speed", "min_speed", "database"),
     "surf": ("features", "descriptor", "upright", "min_depth", "max_depth", "threads"),

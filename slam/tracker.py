@@ -158,19 +158,14 @@ class Tracker:
         return replace(step, landmarks=landmarks)
 
     def close_loops(self, state: State, step: Step) -> Step:
-        """Make the frame a keyframe where it differs; a loop corrects the path, and returns old landmarks to the map.
+        """Make the frame a keyframe where it differs; a loop corrects the path.
 
         The rig's uncertainty is added to the pose.
         """
         session, rig_error = self._session, self._session.rig_error
         estimate, common = rig_error.added_to(step.estimate), rig_error.common(as_reported=False)
         step = replace(step, estimate=estimate, common=common, correction=session.calibration.applied)
-        atlas, seen_again = session.loop_closer.update(state.atlas, step, state.path)
-        if seen_again is not None:
-            step = session.mapper.restore(state.backend, step, seen_again)
-            back = np.sort(step.returned.ids)
-            rig_error.uncertainty.change(back, _positions(state, back), back[:0], again=True)
-        return replace(step, atlas=atlas)
+        return replace(step, atlas=session.loop_closer.update(state.atlas, step, state.path))
 
     def roll_back(self, state: State) -> State:
         """The state after an interrupted step: what that did to the back end's map is undone, bodies are forgotten."""
@@ -218,7 +213,7 @@ def frame_result(
         len(step.landmarks), dict(milliseconds), step.labels.moving, objects, revision=revision,
         T_map_odom=atlas.T_map_odom, loop=atlas.closed_in(step.index), refused_loop=atlas.refused_in(step.index),
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
-        returned=np.union1d(step.returned.ids, step.joined),
+        returned=step.joined,
         common=common if atlas.anchor is None else CommonError(),
     )  # fmt: skip
 

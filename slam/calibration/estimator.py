@@ -12,7 +12,7 @@ from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence, 
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
 from slam.calibration.posterior import RigPosterior, Solution, residual_scale, solve
-from slam.calibration.prior import factory_prior, focal_sigma, prior_information, resumed_prior, systematic_variance
+from slam.calibration.prior import FOCALS, along, factory_prior, prior_information, resumed_prior, systematic_variance
 from slam.calibration.saved import SavedCalibration, rig_numbers
 from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
 from slam.data import StereoFeatures
@@ -47,22 +47,22 @@ class SelfCalibration:
         self.model = RigModel(rig)
         self._kept = kept is not None
         if kept is None:
-            self._prior = factory_prior(self.model)
+            self._prior, residual = factory_prior(self.model), 1.0
+            start = self._prior.covariances[-1]
         else:
             kept.require_fits(rig)
             if not config.enabled:
                 raise ConfigurationError("a kept calibration needs self_calibration.enabled=true")
             self._prior = resumed_prior(self.model, kept.posterior.mean, kept.posterior.covariance)
+            start, residual = self._prior.covariances.mean(axis=0), kept.residual
+        self._solution = Solution(self._prior.mean, start, start, residual)
         self._systematic = systematic_variance(self.model, config.systematic)
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
-        start = self._prior.covariances[-1] if kept is None else self._prior.covariances.mean(axis=0)
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
-        zoom = focal_sigma(self.model) > 0
-        self._focal = zoom / zoom.sum()  # the focal lengths' common error by the parameters
+        self._focal = along(self.model, *FOCALS) / 2  # the focal lengths' common error by the parameters
         self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
-        self._solution = Solution(self._prior.mean, start, start, 1.0 if kept is None else kept.residual)
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
         self._scattered = 4  # 4: number of pairs that the configured noise counts for
         self._waiting: list[View] = []
@@ -87,7 +87,7 @@ class SelfCalibration:
     @property
     def posterior(self) -> RigPosterior:
         """The present posterior of the rig's error."""
-        return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), self.covariance)
+        return RigPosterior(self._solution.mean.copy(), self.covariance)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
@@ -167,9 +167,8 @@ class SelfCalibration:
         c = self.config
         waiting = self._waiting
         newest = match(waiting[-1], view) if waiting else NO_MATCHES
-        common = len(newest[0])
         # 0.5: a new view is taken when the last one has lost this share of the features it may lose
-        apart = not waiting or common < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
+        apart = not waiting or len(newest[0]) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
         ended = 0
         for first in waiting:
             matched = newest if first is waiting[-1] else match(first, view)

@@ -45,11 +45,7 @@ class RecordingEvidence(NamedTuple):
     whole: Evidence  # of its rows and its motion
     # of its motion alone, from which the scale of the calibration's errors follows: rows have errors of their own
     motion: Evidence
-    residual: float = 1.0  # scale of the residual fields by its rows, from 0 to 1
-
-    def scaled(self, factor: float) -> RecordingEvidence:
-        """The same with `factor` times the information."""
-        return RecordingEvidence(self.whole.scaled(factor), self.motion.scaled(factor), self.residual)
+    residual: float  # scale of the residual fields by its rows, from 0 to 1
 
 
 class Accumulator:
@@ -68,7 +64,6 @@ class Accumulator:
     def __init__(self, inflation: float, length: int) -> None:
         self._prior = inflation
         self._blocks: list[Evidence] = []
-        self._before: Evidence | None = None  # cost: the sum of all blocks but the last, None where it is out of date
         self._length = length
         self._in_last = 0
         self.count = 0
@@ -78,7 +73,7 @@ class Accumulator:
         """Take in a likelihood."""
         if not self._blocks or self._in_last == self._length:
             self._blocks.append(evidence)
-            self._in_last, self._before = 0, None
+            self._in_last = 0
         else:
             self._blocks[-1] += evidence
         self._in_last += 1
@@ -88,17 +83,13 @@ class Accumulator:
             if len(even) == len(odd):
                 self._in_last += self._length
             self._blocks = [a + b for a, b in zip(even, odd)] + even[len(odd) :]
-            self._length, self._before = 2 * self._length, None
+            self._length *= 2
 
     def total(self) -> Evidence | None:
         """The sum, with its information divided by the inflation; None if there is no likelihood."""
         if not self._blocks:
             return None
-        *earlier, last = self._blocks
-        if earlier and self._before is None:
-            self._before = sum(earlier[1:], earlier[0])
-        whole = last if self._before is None else self._before + last
-        return whole.scaled(1 / self.inflation)
+        return sum(self._blocks[1:], self._blocks[0]).scaled(1 / self.inflation)
 
     def update_inflation(self, mean: Array, covariance: Array) -> None:
         """Estimate the inflation from the scatter of the blocks' gradients about the solution of the blocks alone.

@@ -47,7 +47,7 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
         residual = max(part.residual for part in evidence)
         solution = solve(prior, residual, sum(whole[1:], whole[0]), sum(known[1:], known[0]))
         covariance = solution.covariance
-    posterior = RigPosterior(model.names, model.units, solution.mean, 0.5 * (covariance + covariance.T))
+    posterior = RigPosterior(solution.mean, 0.5 * (covariance + covariance.T))
     return SavedCalibration(posterior, rig_numbers(model.rig), solution.residual)
 
 
@@ -55,7 +55,6 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
 class Agreement:
     """Differences between recordings, each by its own evidence."""
 
-    names: tuple[str, ...]  # of the parameters (n,)
     # the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN if fewer than two
     # determine it
     largest: Array
@@ -66,12 +65,13 @@ class Agreement:
         known = np.isfinite(self.largest)
         if not known.any():
             return "Nothing can be said of whether the recordings agree: no parameter is shown by two of them."
-        worst, total = int(np.nanargmax(self.largest)), len(known)
-        every = "every parameter" if known.all() else f"all {known.sum()} of {total} parameters that two of them show"
-        least = f"the largest difference is {self.largest[worst]:.1f} sigma, in {self.names[worst]}"
-        if self.largest[worst] <= _AGREES:
-            return f"The recordings agree in {every}: {least}."
-        differing = ", ".join(name for name, z in zip(self.names, self.largest) if z > _AGREES)
+        worst = int(np.nanargmax(self.largest))
+        least = f"the largest difference is {self.largest[worst]:.1f} sigma, in {RigModel.names[worst]}"
+        differing = ", ".join(name for name, z in zip(RigModel.names, self.largest) if z > _AGREES)
+        if not differing:
+            return (
+                f"The recordings agree in all {known.sum()} of {len(known)} parameters that two of them show: {least}."
+            )
         if self.largest[worst] <= _DIFFERS:
             return f"The recordings agree, but for {differing}, where chance may do it: {least}."
         return f"The recordings do not agree in {differing}: {least}. Is it one rig, and has it not changed?"
@@ -94,11 +94,10 @@ def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic
         covariance = np.linalg.inv(np.linalg.inv(prior) + part.S)
         moved = recording.residual * covariance @ part.cross
         after = 1 / (np.diag(covariance) + residual_variance() * np.square(moved).sum(axis=1))
-        # 1.0: least information of a recording on a parameter, in units of the prior's, for it to be compared
-        said = np.where(after - before > 1.0 * before, after - before, np.nan)
+        said = np.where(after > 2 * before, after - before, np.nan)  # more than the prior does
         means.append(after * (covariance @ part.e) / said)
         informations.append(said)
-    mean, own = np.array(means), 1 / np.array(informations)
     first, second = np.triu_indices(len(evidence), 1)
+    mean, own = np.array(means), 1 / np.array(informations)
     z = np.abs(mean[first] - mean[second]) / np.sqrt(own[first] + own[second])
-    return Agreement(model.names, np.fmax.reduce(z, axis=0))
+    return Agreement(np.fmax.reduce(z, axis=0))

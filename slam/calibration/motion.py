@@ -6,20 +6,18 @@ way of its own, whatever the motion was.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from slam.calibration.evidence import Evidence
+from slam.calibration.evidence import Evidence, student_weights
 from slam.calibration.model import RigModel
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, so3_exp
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
+class Pair(NamedTuple):
     """The same still points in two views."""
 
     first: Array  # ``(x, y, d)`` (N, 3) [px], d the disparity, as measured
@@ -29,23 +27,22 @@ class Pair:
 
 
 class Linear(NamedTuple):
-    """A motion at some points, linearised."""
+    """A motion linearised at estimates of the first view's points."""
 
     moved: Array  # where the motion takes the points (N, 3) [px]
     J_point: Array  # derivatives of `moved` by the points (N, 3, 3)
     J_motion: Array  # and by ``[rotation (left), t]`` (N, 3, 6)
-    motion: Array  # `J_motion`, whitened
-    white: Array  # lower triangular whitening matrices (N, 3, 3) of the residuals; NaN where there is none
-    residual: Array  # second view less its prediction from the first (N, 3), whitened
+    residual: Array  # second view less its prediction from the first (N, 3) [px]
+    information: Array  # of the residuals (N, 3, 3), up to a common factor
 
-    @classmethod
-    def empty(cls, n: int) -> Linear:
-        """Of n points, to be filled in."""
-        return cls(*(np.empty((n, *shape)) for shape in ((3,), (3, 3), (3, 6), (3, 6), (3, 3), (3,))))
+    @property
+    def squared(self) -> Array:
+        """Squared Mahalanobis distances of the residuals (N,)."""
+        weighted = self.information @ self.residual[:, :, None]
+        return np.asarray((self.residual * weighted[:, :, 0]).sum(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(NamedTuple):
     """The motion that takes one view's points to the other's, and the linear problem about it."""
 
     R: Array  # the motion
@@ -64,13 +61,23 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
     `R` (3, 3) and `t` (3,) [baselines] a first guess. Of the `noise`, a point's covariance (3, 3) [px²], only the form
     matters.
     """
-    from slam.calibration.motion_kernels import fit
-
-    first, second = (np.ascontiguousarray(a, float) for a in (first, second))
-    points, at, weights = first.copy(), Linear.empty(len(first)), np.empty(len(first))
-    R, t = np.array(R, float), np.array(t, float)
-    median_of_chi_square = chi_square_limit(3, 0.5)
-    last = fit(first, second, points, R, t, focal, noise, median_of_chi_square, weights, *at)
+    points, last = first, np.inf
+    for _ in range(20):  # 20: iterations at most
+        at = linearised(first, second, points, R, t, focal, noise)
+        squared = at.squared
+        if not np.isfinite(squared).all():
+            return None
+        weights = student_weights(squared, 3, 0.2)  # 0.2: no less than a fifth of the configured noise
+        J, weighted = at.J_motion.reshape(-1, 6), weights[:, None, None] * at.information @ at.J_motion
+        H = weighted.reshape(-1, 6).T @ J
+        step = np.linalg.solve(H + _ridge(H), weighted.reshape(-1, 6).T @ at.residual.ravel())
+        R, t = so3_exp(step[:3]) @ R, t + step[3:]
+        change = (J @ step).reshape(-1, 3)
+        rest = at.information @ (at.residual - change)[:, :, None]
+        points = first + (np.swapaxes(at.J_point, 1, 2) @ rest)[:, :, 0] @ noise
+        last = np.abs(change).max()
+        if not last >= 1e-3:  # 1e-3: [px]; at 0.02 focal lengths were wrong by percents
+            break
     # 3e-3: change of a predicted point [px] in the last iteration: in some pairs single points oscillate
     return Fit(R, t, points, at, weights) if last < 3e-3 else None
 
@@ -86,17 +93,24 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
     """
     first, second = (points + model.shift(points, parameters) for points in (pair.first, pair.second))
     fit = fit_motion(first, second, pair.R, pair.t, model.focal, noise)
-    return None if fit is None else _eliminated(model, fit, parameters)
+    if fit is None:
+        return None
+    at = fit.linear
+    by_rig = at.J_point @ model.field(fit.points) - model.field(at.moved)
+    J = np.concatenate([at.J_motion, by_rig], axis=2)
+    by_moved = fit.weights[:, None, None] * at.information @ J
+    rows = by_moved.reshape(-1, J.shape[2])
+    normal, gradient = rows.T @ J.reshape(rows.shape), rows.T @ at.residual.ravel()
+    by_point = np.swapaxes(at.J_point, 1, 2) @ by_moved
+    cross = model.residual_products(by_point, fit.points) - model.residual_products(by_moved, at.moved)
+    motion = np.linalg.solve(normal[:6, :6] + _ridge(normal[:6, :6]), normal[:6, 6:])  # Schur complement
+    S = normal[6:, 6:] - motion.T @ normal[:6, 6:]
+    return Evidence(S, S @ parameters + gradient[6:] - motion.T @ gradient[:6], cross[6:] - motion.T @ cross[:6])
 
 
-def squared_distance(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Array:
-    """Squared Mahalanobis distances (N,) of points (N, 3) in two views from a motion; NaN if they cannot be tested.
-
-    The motion amplifies the disparity errors of near points. A limit in pixels would keep only points whose errors
-    happen to be small, and bias the motion towards its prior guess.
-    """
-    residual = linearised(first, second, first, R, t, focal, noise).residual
-    return np.asarray(np.einsum("ni,ni->n", residual, residual))
+def _ridge(H: Array) -> Array:
+    """What makes normal equations (6, 6) of a motion invertible."""
+    return 1e-12 * np.trace(H) * np.eye(6)
 
 
 def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
@@ -116,27 +130,8 @@ def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
 
 def parallax(model: RigModel, pair: Pair) -> float:
     """Median displacement of the points in the image by translation [px]."""
-    there = move(pair.first, pair.R, pair.t, model.focal)[0]
-    turned = move(pair.first, pair.R, 0 * pair.t, model.focal)[0]
+    there, turned = (move(pair.first, pair.R, t, model.focal)[0] for t in (pair.t, 0 * pair.t))
     return float(np.median(np.linalg.norm((there - turned)[:, :2], axis=1)))
-
-
-def _eliminated(model: RigModel, fit: Fit, parameters: Array) -> Evidence:
-    """The likelihood of the parameters (n,) with the motion marginalised out (Schur complement)."""
-    at, n = fit.linear, 6 + len(parameters)
-    root = np.sqrt(fit.weights)[:, None]
-    white = root[..., None] * at.white
-    by_rig = at.J_point @ model.field(fit.points) - model.field(at.moved)
-    J = np.concatenate([root[..., None] * at.motion, white @ by_rig], axis=2)
-    rows = J.reshape(-1, n)
-    normal = rows.T @ rows
-    gradient = rows.T @ (root * at.residual).ravel()
-    by_moved = np.swapaxes(white, 1, 2) @ J
-    by_point = np.swapaxes(at.J_point, 1, 2) @ by_moved
-    cross = model.residual_products(by_point, fit.points) - model.residual_products(by_moved, at.moved)
-    motion = np.linalg.solve(normal[:6, :6] + 1e-12 * np.trace(normal[:6, :6]) * np.eye(6), normal[:6, 6:])
-    S = normal[6:, 6:] - motion.T @ normal[:6, 6:]
-    return Evidence(S, S @ parameters + gradient[6:] - motion.T @ gradient[:6], cross[6:] - motion.T @ cross[:6])
 
 
 def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array, Array]:
@@ -148,18 +143,16 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     Returns:
         Moved points (N, 3), Jacobians by the points (N, 3, 3), and by ``[rotation (left), t]`` (N, 3, 6).
     """
-    at = linearised(points, points, points, R, t, focal, np.eye(3))
-    return at.moved, at.J_point, at.J_motion
+    return linearised(points, points, points, R, t, focal, np.eye(3))[:3]
 
 
 def linearised(first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
-    """A motion linearised at estimates of the first view's points, as `fit_motion` needs it.
+    """A motion linearised at estimates of the first view's points (N, 3); for the arguments see `fit_motion`.
 
-    The residuals carry the points' own corrections to first order.
+    The residuals carry the points' own corrections to first order. The motion amplifies the disparity errors of near
+    points, so that a limit in pixels would keep only points whose errors happen to be small.
     """
-    first, second, points = (np.ascontiguousarray(a, float) for a in (first, second, points))
     from slam.calibration.motion_kernels import linearise
 
-    out = Linear.empty(len(points))
-    linearise(first, second, points, np.ascontiguousarray(R), np.ascontiguousarray(t), focal, noise, *out)
-    return out
+    arrays = (np.ascontiguousarray(a, float) for a in (first, second, points, R, t))
+    return Linear(*linearise(*arrays, focal, noise))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from slam.calibration.evidence import Evidence
+from slam.calibration.model import RigModel
 from slam.calibration.prior import RESIDUAL_SCALES, Prior, residual_variance
 from slam.geometry.se3 import Array
 
@@ -16,10 +17,11 @@ from slam.geometry.se3 import Array
 class RigPosterior:
     """Gaussian belief about the parameters of `slam.calibration.model`."""
 
-    names: tuple[str, ...]  # of the parameters (n,)
-    units: tuple[str, ...]  # of the parameters (n,)
     mean: Array  # (n,)
     covariance: Array  # (n, n)
+
+    names: ClassVar = RigModel.names  # of the parameters (n,)
+    units: ClassVar = RigModel.units
 
     def __repr__(self) -> str:
         most = int(np.argmax(np.abs(self.mean) / self.sigma))

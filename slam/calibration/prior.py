@@ -43,7 +43,10 @@ FIELD = 1.4e-3
 #: Error of the focal length common to both cameras, as the board's distance or curvature may compensate it [share].
 FOCAL = 0.005
 
-_OFFSETS = (0.03, 0.3, 1.0)  # the same of an offset of the disparity alone
+#: The parameters that such an error changes.
+FOCALS = "left_f", "right_f"
+
+_OFFSETS = (0.03, 0.3, 1.0)  # scales of an offset of the disparity alone, equally probable a priori
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +70,14 @@ class Prior:
 def factory_prior(model: RigModel) -> Prior:
     """Prior of a calibration as delivered, by how calibrations are usually made."""
     spread = np.linalg.inv(prior_information(model))
-    drift, zoom = (np.outer(sigma, sigma) for sigma in (offset_sigma(model), focal_sigma(model)))
+    drift, zoom = (
+        np.outer(sigma, sigma) for sigma in (OFFSET * along(model, "right_cx"), FOCAL * along(model, *FOCALS))
+    )
     # (0.02, 0.1, 0.3, 1.0): Scales of the prior, equally probable a priori: of all errors of a calibration, from none
     # to as large as allowed.
     # (0.1, 1.0): the same of a common error of the focal lengths
-    scales, turned, zoomed = np.array(list(product((0.02, 0.1, 0.3, 1.0), _OFFSETS, (0.1, 1.0)))).T
-    wide = [s[:, None, None] ** 2 * covariance for s, covariance in ((scales, spread), (turned, drift), (zoomed, zoom))]
-    return Prior(np.zeros(len(model.names)), sum(wide))
+    scales = np.array(list(product((0.02, 0.1, 0.3, 1.0), _OFFSETS, (0.1, 1.0))))
+    return Prior(np.zeros(len(model.names)), np.tensordot(scales**2, np.stack([spread, drift, zoom]), axes=1))
 
 
 def resumed_prior(model: RigModel, mean: Array, covariance: Array) -> Prior:
@@ -81,10 +85,8 @@ def resumed_prior(model: RigModel, mean: Array, covariance: Array) -> Prior:
 
     `mean` (n,) of the parameters and its `covariance` (n, n) are by those recordings.
     """
-    sigma = offset_sigma(model)
-    turned = np.array(_OFFSETS)
-    covariances = covariance + turned[:, None, None] ** 2 * np.outer(sigma, sigma)
-    return Prior(mean, covariances)
+    sigma, turned = OFFSET * along(model, "right_cx"), np.array(_OFFSETS)
+    return Prior(mean, covariance + turned[:, None, None] ** 2 * np.outer(sigma, sigma))
 
 
 def prior_information(model: RigModel) -> Array:
@@ -100,14 +102,9 @@ def prior_information(model: RigModel) -> Array:
     return np.asarray(information)
 
 
-def offset_sigma(model: RigModel) -> Array:
-    """Standard deviation of the parameters (n,) due to an offset of all disparities."""
-    return np.array([OFFSET if name == "right_cx" else 0.0 for name in model.names])
-
-
-def focal_sigma(model: RigModel) -> Array:
-    """Standard deviation of the parameters (n,) due to an error of the focal length common to both cameras."""
-    return np.array([FOCAL if name in ("left_f", "right_f") else 0.0 for name in model.names])
+def along(model: RigModel, *names: str) -> Array:
+    """A change of some parameters alone, by one each (n,)."""
+    return np.array([float(name in names) for name in model.names])
 
 
 def residual_variance() -> float:

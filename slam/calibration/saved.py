@@ -86,7 +86,7 @@ class SavedCalibration:
         """
         try:
             rows, residual = tree["parameters"], tree.get("residual_scale")
-            names, units = (tuple(str(row[key]) for row in rows) for key in ("name", "unit"))
+            names = tuple(str(row["name"]) for row in rows)
             mean = np.array([row["mean"] for row in rows], float)
             covariance = np.array(tree["covariance"], float).reshape(len(rows), len(rows))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -107,7 +107,7 @@ class SavedCalibration:
             raise CalibrationError("calibration: its covariance is none")
         if not isinstance(residual, (int, float)) or not 0 <= residual <= 1:
             raise CalibrationError("calibration: residual_scale must lie in 0..1")
-        return cls(RigPosterior(names, units, mean, covariance), rig, float(residual))
+        return cls(RigPosterior(mean, covariance), rig, float(residual))
 
 
 def load_calibration(path: str | Path) -> SavedCalibration:

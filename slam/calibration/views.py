@@ -1,4 +1,4 @@
-"""Views of the scene for self-calibration, and matches between them."""
+"""Views of the scene for self-calibration, and what two of them have in common."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.calibration.model import RigModel
-from slam.calibration.motion import Pair, fit_motion, move, squared_distance
+from slam.calibration.motion import Pair, fit_motion, linearised, move
 from slam.chi_square import chi_square_limit
 from slam.data import StereoFeatures
 from slam.geometry.arrays import median
@@ -86,18 +86,16 @@ def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[N
 
 
 def pair_of(
-    model: RigModel, first: View, second: View, parameters: Array, noise: Array, seed: int, matched: Rows | None = None
+    model: RigModel, first: View, second: View, parameters: Array, noise: Array, seed: int, matched: Rows
 ) -> Pair:
     """Matches of two views that agree on one motion, and that motion.
 
     The motion of the system's poses is tried first; others are tried only if most matches disagree with it.
 
     The rig is corrected by `parameters` (n,). Of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
-    `seed` is of the random choice in the geometric check; `matched` are features that look alike, where that is known
-    already.
+    `seed` is of the random choice in the geometric check; `matched` are features that look alike.
     """
-    a, b = match(first, second) if matched is None else matched
-    one, two = first.points[a], second.points[b]
+    one, two = first.points[matched[0]], second.points[matched[1]]
     ideal = [p + model.shift(p, parameters) for p in (one, two)]
     T: Array = inverse(second.T_world_left) @ first.T_world_left
     # 1.0: least disparity of a point that helps to find the motion [px]
@@ -110,15 +108,15 @@ def pair_of(
         found = find_consensus(rig, local, after, inverse(T), _AGREES, 100, seed)
         T = np.asarray(inverse(found.T_world_left))
     R, t = T[:3, :3], T[:3, 3] / rig.baseline
-    with np.errstate(all="ignore"):
-        moved, J, _ = move(ideal[0], R, t, model.focal)
+    moved, J, _ = move(ideal[0], R, t, model.focal)
+    with np.errstate(invalid="ignore"):
         agree = (np.abs(moved - ideal[1]) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
     for _ in range(2):  # 2: times that motion and inliers are recomputed
         fitted = fit_motion(ideal[0][agree], ideal[1][agree], R, t, model.focal, noise) if agree.sum() >= 3 else None
         if fitted is None:
             break
         R, t = fitted.R, fitted.t
-        distance = squared_distance(ideal[0], ideal[1], R, t, model.focal, noise)
+        distance = linearised(ideal[0], ideal[1], ideal[0], R, t, model.focal, noise).squared
         # 16.3: χ²(3) at 99.9 %, largest squared distance of a match that agrees
         agree = distance <= 16.3 * median(distance[agree]) / chi_square_limit(3, 0.5)
     return Pair(one[agree], two[agree], R, t)

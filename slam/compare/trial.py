@@ -47,9 +47,6 @@ SERIES_COLUMNS = ("stamp", "nees")
 #: Settings under which a front end has one thread; what it finds does not depend on it.
 _ONE_THREAD = {"surf": ["frontend.threads=1"]}
 
-#: Settings without which a run could not be recorded: landmarks that return are no observations.
-_RECORDED = ["atlas.give_back=false"]
-
 _RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associated [px]
 _SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
 
@@ -88,7 +85,7 @@ def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
     first = _ONE_THREAD.get(name, [])
     if name == SIMULATED and isinstance(sequence, WorldSequence):  # the noise of these features is known
         first = [f"models.pixel_sigma={sequence.values['sigma']}"] if sequence.values["sigma"] else []
-    settings = [*_RECORDED, *first, *trial.variant.settings]
+    settings = [*first, *trial.variant.settings]
     return SystemConfig.for_kind(sequence.kind, name, trial.backend).with_settings(settings)
 
 
@@ -247,7 +244,7 @@ class Lifetimes:
     def add(self, result: FrameResult) -> None:
         """One more frame."""
         self._last = result.index
-        for i in (*result.added.tolist(), *result.returned.tolist()):
+        for i in result.added.tolist():
             self._first.setdefault(i, result.index)
         for i in result.erased.tolist():
             if i in self._first:  # else one of an old place, by which a kidnapped camera was found

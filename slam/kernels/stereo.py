@@ -2,7 +2,7 @@
 
 ``uL = u0 + fu x/z, vL = v0 + fv y/z, uR = u0' + f' (x + b)/z`` of a point (x, y, z) in rectified axes. The camera
 (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`: fu, fv, u0, v0, f', u0', b; b is minus the baseline [m].
-Derivatives by the rig's own parameters are `slam.calibration.model_kernels.field`.
+Derivatives by the rig's own parameters are `slam.calibration.model.RigModel.field`.
 """
 
 from __future__ import annotations

@@ -34,9 +34,8 @@ from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
 _VERSION = 5  # fixed: of the file format
-_WITHOUT_PLACES = "2"  # also read; versions 3 and 4 had keyframes with other poses, and are not
 _TEXTS = ("frontend", "world_frame", "written_by")  # of the header
-_DATE = (1980, 1, 1, 0, 0, 0)  # fixed: of all members, so that the same map gives the same bytes
+_DATE = (1980, 1, 1, 0, 0, 0)  # fixed: NumPy's for all members, so that the same map gives the same bytes
 
 #: World frame of a map that was built from scratch.
 FIRST_FRAME = "left camera at the first frame"
@@ -68,8 +67,8 @@ _LANDMARKS = {
     "seen_from": _Kind(np.float64, "n3", -_FAR, _FAR, "unknown"),
 }  # fmt: skip
 
-#: Keyframes by their attributes, the features of all of them in succession, and loops.
-_PLACES = {
+#: Those, keyframes by their attributes, the features of all of them in succession, and loops.
+_ARRAYS = _LANDMARKS | {
     "keyframe_stamps": _Kind(np.float64, "k", -_GREATEST, _GREATEST, field="stamp"),
     "keyframe_poses": _Kind(np.float64, "k44", -_FAR, _FAR, "pose"),
     "keyframe_odometry": _Kind(np.float64, "k44", -_FAR, _FAR, "pose", "T_odom_left"),
@@ -83,7 +82,7 @@ _PLACES = {
     "place_descriptors": _Kind(np.float16, "fd", -_HALF, _HALF, field="descriptors"),
     "place_laplacian": _Kind(np.int8, "f", -128, 127, field="laplacian"),
     "place_landmarks": _Kind(np.int64, "f", -1, MOST_ID, field="landmarks"),
-    "loop_pairs": _Kind(np.int64, "l2", 0, MOST_ID, field="pair"),
+    "loop_pairs": _Kind(np.int64, "l2", 0, MOST_ID),
     "loop_motions": _Kind(np.float64, "l44", -_FAR, _FAR, "pose", "T_first_second"),
     "loop_covariances": _Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance", "covariance"),
     "loop_inliers": _Kind(np.int64, "l", 0, MOST_ID, field="inliers"),
@@ -213,7 +212,7 @@ class SavedMap:
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
             landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
             f"surf-stereo-slam {__version__}", seen_from=landmarks.seen_from,
-            keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map(), loops=atlas.loops,
+            keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map, loops=atlas.loops,
         )  # fmt: skip
 
     def require_fits(self, frontend: str, dimensions: int | None = None) -> None:
@@ -258,16 +257,12 @@ def load_map(path: str | Path) -> SavedMap:
 def encode(saved: SavedMap) -> bytes:
     """The bytes of a file; the same for the same map."""
     header = {name: getattr(saved, name) for name in (*_TEXTS, "holds")}
-    members = {"header.json": json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False).encode() + b"\n"}
-    arrays = {name: getattr(saved, name) for name in _LANDMARKS} | places_to_arrays(saved)
-    for name, values in arrays.items():
-        buffer = io.BytesIO()
-        np.lib.format.write_array(buffer, np.ascontiguousarray(values), (1, 0), allow_pickle=False)
-        members[f"{name}.npy"] = buffer.getvalue()
     archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as file:
-        for name, content in members.items():
-            file.writestr(zipfile.ZipInfo(name, _DATE), content)
+    arrays: dict[str, Any] = dict(map_arrays(saved))
+    np.savez(archive, **arrays)
+    with zipfile.ZipFile(archive, "a") as file:
+        content = json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
+        file.writestr(zipfile.ZipInfo("header.json", _DATE), content)
     body = archive.getvalue()
     return f"{_MAGIC}{_VERSION}\n{hashlib.sha256(body).hexdigest()}\n".encode() + body
 
@@ -279,50 +274,48 @@ def decode(data: bytes, source: str) -> SavedMap:
     if not first.startswith(_MAGIC.encode()):
         raise SlamError(f"{source}: not a saved map")
     version = first[len(_MAGIC) :].decode("ascii", "replace")
-    if version not in (_WITHOUT_PLACES, str(_VERSION)):
-        known = f"this program reads versions {_WITHOUT_PLACES} and {_VERSION}: make the map again with --save-map"
+    if version != str(_VERSION):
+        known = f"this program reads version {_VERSION}: make the map again with --save-map"
         raise SlamError(f"{source}: a map of version {version!r}; {known}")
     if hashlib.sha256(body).hexdigest().encode() != digest:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
     members = unpack(body, source)
-    names = [*_LANDMARKS, *(_PLACES if version != _WITHOUT_PLACES else ())]
-    missing = {"header.json", *(f"{name}.npy" for name in names)} - set(members)
+    missing = {"header.json", *(f"{name}.npy" for name in _ARRAYS)} - set(members)
     if missing:
         raise SlamError(f"{source}: the map lacks {min(missing)}")
     header = json_text(members["header.json"], f"{source}: header.json")
     if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in _TEXTS):
         raise SlamError(f"{source}: header.json must give {', '.join(_TEXTS)}")
-    arrays = {name: array(members[f"{name}.npy"], name, source) for name in names}
-    places: dict[str, Any] = places_from_arrays(arrays, source) if version != _WITHOUT_PLACES else {}
-    landmarks: dict[str, Any] = {name: arrays[name] for name in _LANDMARKS}
-    return SavedMap(**landmarks, **{name: header[name] for name in _TEXTS}, **places, source=source)
+    arrays = {name: array(members[f"{name}.npy"], name, source) for name in _ARRAYS}
+    return map_of(arrays, {name: header[name] for name in _TEXTS}, source)
 
 
-def places_to_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
-    """Keyframes, their poses in the map, and loops of a map as arrays by the names of `_PLACES`."""
+def map_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
+    """A map as arrays by the names of `_ARRAYS`."""
     k, loops = saved.keyframes, saved.loops
     m = max((f.jacobian.shape[1] for f in k), default=0)
     k = tuple(f if f.jacobian.shape[1] == m else replace(f, jacobian=np.zeros((6, m))) for f in k)
-    sizes = {"k": len(k), "m": m, "l": len(loops), "d": saved.dimensions, "f": sum(map(len, k))}
-    whole = {"keyframe_poses": saved.keyframe_poses, "keyframe_features": [len(f) for f in k]}
+    sizes = {"k": len(k), "m": m, "l": len(loops), "n": len(saved), "d": saved.dimensions, "f": sum(map(len, k))}
+    whole: dict[str, Any] = {"keyframe_features": [len(f) for f in k], "loop_pairs": [x.pair for x in loops]}
     arrays: dict[str, np.ndarray] = {}
-    for name, kind in _PLACES.items():
-        values: Any = whole.get(name)
-        if values is None:
-            values = [getattr(x, kind.field) for x in (loops if kind.shape[0] == "l" else k)]
+    for name, kind in _ARRAYS.items():
+        if kind.field:
+            values: Any = [getattr(x, kind.field) for x in (loops if kind.shape[0] == "l" else k)]
             values = np.concatenate(values) if kind.shape[0] == "f" and values else values
+        else:
+            values = whole[name] if name in whole else getattr(saved, name)
         shape = [sizes[c] if c.isalpha() else int(c) for c in kind.shape]
-        arrays[name] = np.array(values, kind.dtype).reshape(shape)
+        arrays[name] = np.ascontiguousarray(np.array(values, kind.dtype).reshape(shape))
     return arrays
 
 
-def places_from_arrays(arrays: Mapping[str, np.ndarray], source: str) -> dict[str, Any]:
-    """The attributes of `SavedMap` for keyframes and loops, from arrays by the names of `_PLACES`, and descriptors.
+def map_of(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str], source: str) -> SavedMap:
+    """The map of arrays by the names of `_ARRAYS`, and of the header's texts.
 
     Raises:
         SlamError: the arrays do not fit together, or a value is impossible; `source` names them in the message.
     """
-    _require(arrays, {"descriptors": _LANDMARKS["descriptors"]} | _PLACES, source)
+    _require(arrays, _ARRAYS, source)
     begin = np.concatenate([[0], np.cumsum(arrays["keyframe_features"])]).astype(int).tolist()
     pairs = arrays["loop_pairs"]
     if begin[-1] != len(arrays["place_points"]):
@@ -330,16 +323,13 @@ def places_from_arrays(arrays: Mapping[str, np.ndarray], source: str) -> dict[st
     if (pairs >= len(begin) - 1).any() or (pairs[:, :1] >= pairs[:, 1:]).any():
         raise SlamError(f"{source}: a loop is between keyframes that there are not")
 
-    def fields_of(sizes: dict[str, Any]) -> dict[str, Any]:
+    def fields_of(**rows: Any) -> dict[str, Any]:
         """Fields of a keyframe or loop, given its row, or the slice of its rows, in arrays of each size."""
-        found = {k.field: arrays[name][sizes[k.shape[0]]] for name, k in _PLACES.items() if k.shape[0] in sizes}
-        return {name: x.item() if x.ndim == 0 else x for name, x in found.items() if name}
+        kinds = ((name, kind) for name, kind in _ARRAYS.items() if kind.field and kind.shape[0] in rows)
+        found = {kind.field: arrays[name][rows[kind.shape[0]]] for name, kind in kinds}
+        return {name: x.item() if x.ndim == 0 else x for name, x in found.items()}
 
-    spans = [slice(*span) for span in pairwise(begin)]
-    keyframes = tuple(Keyframe(-1, **fields_of({"k": i, "f": span})) for i, span in enumerate(spans))
-    loops = []
-    for i, (first, second) in enumerate(pairs.tolist()):
-        fields = fields_of({"l": i})
-        del fields["pair"]
-        loops.append(Loop(first, second, **fields))
-    return {"keyframes": keyframes, "keyframe_poses": arrays["keyframe_poses"], "loops": tuple(loops)}
+    keyframes = [Keyframe(-1, **fields_of(k=i, f=slice(*span))) for i, span in enumerate(pairwise(begin))]
+    loops = [Loop(first, second, **fields_of(l=i)) for i, (first, second) in enumerate(pairs.tolist())]
+    whole: dict[str, Any] = {name: arrays[name] for name in (*_LANDMARKS, "keyframe_poses")} | dict(texts)
+    return SavedMap(**whole, source=source, keyframes=tuple(keyframes), loops=tuple(loops))

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
 from slam.errors import ConfigurationError
-from slam.geometry.arrays import Array, isin
+from slam.geometry.arrays import isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import transform
 from slam.interfaces import Backend, MapBackend
+from slam.mapping.atlas.loop_closer import Found
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.known_landmarks import in_front
@@ -23,22 +22,6 @@ from slam.mapping.step import Step
 from slam.tracks.localizer import LandmarkMatches, Localizer
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView, expected_landmarks
-
-
-@dataclass(frozen=True, eq=False)
-class OldPlace:
-    """Features of an old keyframe, as landmarks at positions that are known by now."""
-
-    landmarks: LandmarkTable  # their bookkeeping (M); ids that they had, −1 for none
-    rows: NDArray[np.intp]  # of the present frame's features that show them, or of the keyframe's (M,)
-    positions: Array  # (M, 3) [m]
-    covariances: Array  # of the positions (M, 3, 3) [m²]
-
-    @classmethod
-    def at(cls, landmarks: LandmarkTable, rows: NDArray[np.intp], T: Array, points: Array, P: Array) -> OldPlace:
-        """From points (M, 3) [m] with covariances (M, 3, 3) in coordinates that `T` (4, 4) transforms."""
-        P = T[:3, :3] @ P @ T[:3, :3].T
-        return cls(landmarks, rows, transform(T, points), 0.5 * (P + np.swapaxes(P, 1, 2)))
 
 
 class Mapper:
@@ -70,7 +53,7 @@ class Mapper:
         view = self._view(backend, step.landmarks, step)
         landmarks = self._count(step.landmarks, view, step)
         bad = isin(landmarks.ids, step.labels.landmarks)
-        if step.features.has_stereo.any() or not len(step.features):  # else little can take their place
+        if step.features.has_stereo.any() or not len(step.features):  # else nothing can take their place
             bad |= bad_landmarks(landmarks, self.config)
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
@@ -83,39 +66,13 @@ class Mapper:
             backend.remove(erased)
         return replace(step, landmarks=landmarks, added=added, erased=erased)
 
-    def restore(self, backend: Backend, step: Step, place: OldPlace) -> Step:
-        """Let landmarks of a revisited place rejoin the map, if the back end can place them.
-
-        They are in the present camera's coordinates, and keep the ids that they had. If the back end still holds such a
-        landmark, at its old, drifted position, that one is erased first. Features that are landmarks of the map
-        already, or that move, are left out; so are, where the map has no room for all, those least certain.
-        """
-        if not isinstance(backend, MapBackend):
-            return step
-        taken = np.concatenate([step.matches.rows, step.added.rows, step.withheld.rows, step.labels.moving])
-        free = np.flatnonzero(~np.isin(place.rows, taken) & in_front(place.positions))
-        there = isin(place.landmarks.ids[free], step.landmarks.ids)
-        room = int(there.sum()) + max(self.config.max_landmarks - len(step.landmarks), 0)
-        variance = np.where(there, -1.0, np.trace(place.covariances[free], axis1=1, axis2=2))
-        free = np.sort(free[np.argsort(variance, kind="stable")[:room]])
-        if not len(free):
-            return step
-        ids, rows = self._named(place.landmarks.ids[free]), place.rows[free]
-        stale = np.isin(step.landmarks.ids, ids)
-        if stale.any():
-            backend.remove(step.landmarks.ids[stale])
-        landmarks = step.landmarks.select(~stale)
-        backend.place(ids, place.positions[free], place.covariances[free])
-        landmarks = landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
-        erased = step.erased[~isin(step.erased, ids)]
-        return replace(step, landmarks=landmarks, erased=erased, returned=LandmarkMatches(ids, rows))
-
-    def insert(self, backend: Backend, landmarks: LandmarkTable, place: OldPlace) -> LandmarkTable:
-        """Add landmarks of a place in the world to the map, as from a saved map; those already in it are unchanged."""
+    def insert(self, backend: Backend, landmarks: LandmarkTable, place: Found) -> LandmarkTable:
+        """Add landmarks of an old place to the map, as from a saved map; those already in it are unchanged."""
         assert isinstance(backend, MapBackend)  # only such back ends start in a map
         old = place.landmarks.ids
         new = np.flatnonzero(~np.isin(old, landmarks.ids) | (old < 0))
-        ids = self._named(old[new])
+        ids, without = old[new], old[new] < 0
+        ids[without] = self._new_ids(int(without.sum()))
         backend.insert(ids, place.positions[new], place.covariances[new])
         return landmarks.joined(replace(place.landmarks.select(new), ids=ids))
 
@@ -138,8 +95,7 @@ class Mapper:
 
     def _view(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapView:
         """The map as the camera sees it."""
-        positions = backend.positions(landmarks.ids)
-        pose = step.estimate.T_world_left
+        positions, pose = backend.positions(landmarks.ids), step.estimate.T_world_left
         return MapView.of(self.rig, pose, positions, step.features, self._localizer.pixel_sigma)
 
     def _count(self, landmarks: LandmarkTable, view: MapView, step: Step) -> LandmarkTable:
@@ -210,12 +166,6 @@ class Mapper:
         backend.place(ids, local[best], covariances[best])  # type: ignore[attr-defined]
         landmarks = landmarks.with_new(step.index, ids, features, rows[best], T[:3, 3])
         return landmarks, added.joined(LandmarkMatches(ids, rows[best]))
-
-    def _named(self, ids: IdArray) -> IdArray:
-        """The ids (N,) with new ones in place of −1."""
-        ids = ids.copy()
-        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
-        return ids
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

@@ -41,8 +41,6 @@ class Step:
     labels: MotionLabels = field(default_factory=lambda: MotionLabels(_NONE, _NONE, _NONE))  # which features move
     objects: tuple[MovingObject, ...] = ()  # the moving bodies
     added: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)  # landmarks that joined the map
-    # landmarks of a revisited place that rejoined the map, and the features that show them now
-    returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
     joined: IdArray = field(default_factory=_NONE.copy)  # ids of those of a place at which another back end took over
     erased: IdArray = field(default_factory=_NONE.copy)  # ids of the landmarks that left the map
     # the part of the pose's error that other frames share; included in the covariance of `estimate`

@@ -112,7 +112,7 @@ class RunFiles(ExitStack):
     def write_old_landmarks(self, atlas: Atlas, present: IdArray) -> None:
         """Write landmarks_old.csv: of this run's keyframes, without those `present`."""
         found: dict[int, Array] = {}
-        for keyframe, T in zip(atlas.keyframes[atlas.prior_count :], atlas.poses_in_map()[atlas.prior_count :]):
+        for keyframe, T in zip(atlas.keyframes[atlas.prior_count :], atlas.poses_in_map[atlas.prior_count :]):
             rows = np.flatnonzero(~np.isin(keyframe.landmarks, [-1, *present]))
             at = transform(T, np.asarray(keyframe.points, float)[rows])
             found.update(zip(np.asarray(keyframe.landmarks)[rows].tolist(), at))

@@ -287,14 +287,9 @@ class _Run:
         """What was given to the back end of a run.
 
         Raises:
-            SlamError: it was given to more than one, or it was given landmarks back, which are no observations.
+            SlamError: it was given to more than one.
         """
         options, sequence = self.options, self.sequence
-        if self.record.returned is not None:
-            raise SlamError(
-                f"{options.record}: not written: landmarks came back into the map in frame {self.record.returned}, and "
-                "a recording holds observations alone: use atlas.give_back=false"
-            )
         if isinstance(self.system, StereoSlam) and self.system.restarted:
             raise SlamError(
                 f"{options.record}: not written: the camera was lost, and a new back end took over in frame "

@@ -52,15 +52,12 @@ class RunRecord:
     hidden: int = 0  # frames in which something moved past a standing vehicle
     rejected: int = 0
     used: int = 0
-    returned: int | None = None  # the first frame in which landmarks of an old place came back
     nis: float = 0.0
     nis_dof: int = 0
 
     def add(self, number: int, result: FrameResult) -> None:
         """Take in one frame, `number` in its sequence."""
         self.numbers.append(number)
-        if len(result.returned) and self.returned is None:
-            self.returned = number
         self.statuses.append(result.status.value)
         self.milliseconds.append(dict(result.milliseconds))
         self.times.append(working_time())

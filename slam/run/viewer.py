@@ -126,7 +126,7 @@ class Viewer:
     def _show_places(self, system: StereoSlam) -> None:
         """Keyframes, the path through them as loops have corrected it, and loops, closed and refused."""
         rr, atlas = self.rr, system.atlas
-        at = atlas.poses_in_map()[:, :3, 3]
+        at = atlas.poses_in_map[:, :3, 3]
         self.log("/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
         self.log("/places/path", rr.LineStrips3D([at[atlas.prior_count :]], colors=_PLACE))
         closed = [(loop.first, loop.second) for loop in atlas.loops]

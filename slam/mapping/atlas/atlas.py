@@ -25,6 +25,7 @@ from slam.mapping.atlas.pose_graph import PoseGraph
 from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
 
+_INACTIVE = 200  # cost: loops outside the pose graph that are kept
 _UNKNOWN_DIRECTION = np.pi / np.sqrt(3)  # derived: standard deviation of an unknown angle [rad]
 
 
@@ -43,16 +44,13 @@ class MapAnchor:
     rig: CommonError  # what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`
 
     def belief(self, rig: CommonError) -> tuple[Array, Array]:
-        """The common errors (n,) and their covariance (n, n); zero and unity if there are others by now."""
+        """The common errors (n,) in units of `rig`, as the rig's posterior has changed since, and their covariance.
+
+        They are zero, and the covariance (n, n) unity, if there are others by now.
+        """
         if rig.root.shape != self.rig.root.shape:
             return np.zeros(rig.root.shape[1]), np.eye(rig.root.shape[1])
-        return self.common_as(rig), self.covariance[6:, 6:]
-
-    def common_as(self, rig: CommonError) -> Array:
-        """The common errors (n,) in units of `rig`, as the rig's posterior has changed since; zero if others by now."""
-        if rig.root.shape != self.rig.root.shape:
-            return np.zeros(rig.root.shape[1])
-        return np.asarray(np.linalg.lstsq(rig.root, self.rig.root @ self.common, rcond=None)[0])
+        return np.linalg.lstsq(rig.root, self.rig.root @ self.common, rcond=None)[0], self.covariance[6:, 6:]
 
     def later(self, back: Array, shares: Array) -> Array:
         """Covariance (6, 6) of a later pose, without the noise since.
@@ -89,7 +87,6 @@ class Atlas:
     loops: tuple[Loop, ...] = ()  # those in the pose graph
     # the latest verified loops outside the pose graph: refused, unconfirmed, or not informative
     inactive_loops: tuple[Loop, ...] = ()
-    dropped: int = 0  # number of this run's loops taken out of the pose graph to save time
     refused: tuple[tuple[int, int], ...] = ()  # loops that contradict the path, as pairs of keyframe numbers
     # poses T_map_left (C, 4, 4) of the first C keyframes, as of the last loop closure
     corrected: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -143,6 +140,7 @@ class Atlas:
         grown = (replace(k, step_covariance=factor * k.step_covariance) for k in self.keyframes[first + 1 : last + 1])
         return replace(self, keyframes=(*self.keyframes[: first + 1], *grown, *self.keyframes[last + 1 :]))
 
+    @cached_property
     def poses_in_map(self) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes."""
         return self.in_map(self.poses)
@@ -154,36 +152,26 @@ class Atlas:
         """
         closed = sum(loop.second >= self.prior_count for loop in self.loops)
         known = {"known": self.prior_count} if self.prior_count else {}
-        return {"keyframes": len(self), **known, "closed": closed + self.dropped, "refused": len(self.refused)}
+        return {"keyframes": len(self), **known, "closed": closed, "refused": len(self.refused)}
 
-    def with_loop(self, loop: Loop, most: int) -> Atlas:
-        """A copy with one more loop; beyond `most`, the loop whose neighbours on the path are closest is dropped."""
-        loops, dropped = (*self.loops, loop), self.dropped
-        while len(loops) > most:
-            at = np.array([self.keyframes[k.second].travelled for k in loops])
-            least = 1 + int(np.argmin(at[2:] - at[:-2]))
-            dropped += loops[least].second >= self.prior_count
-            loops = loops[:least] + loops[least + 1 :]
-        return replace(self, loops=loops, dropped=dropped)
+    def with_inactive_loop(self, loop: Loop) -> Atlas:
+        """A copy with one more loop outside the pose graph."""
+        return replace(self, inactive_loops=(*self.inactive_loops, loop)[-_INACTIVE:])
 
-    def with_inactive_loop(self, loop: Loop, most: int) -> Atlas:
-        """A copy with one more loop outside the pose graph; the last `most` are kept."""
-        return replace(self, inactive_loops=(*self.inactive_loops, loop)[-most:])
-
-    def with_loops(self, held: Sequence[Loop], believed: Sequence[Loop], most: int) -> Atlas:
+    def with_loops(self, held: Sequence[Loop], believed: Sequence[Loop]) -> Atlas:
         """A copy with other loops in the pose graph; previous ones that are not `believed` any more become refused.
 
-        `dropped` keeps counting. `held` and `believed` are in order of their second keyframes.
+        `held` and `believed` are in order of their second keyframes.
         """
         good, kept = {x.pair for x in believed}, {x.pair for x in held}
         out = [x for x in self.loops if x.pair not in kept]
         refused = [pair for pair in self.refused if pair not in good]
         refused += [x.pair for x in out if x.pair not in good]
-        spare = [x for x in (*self.inactive_loops, *out) if x.pair not in kept]
-        atlas = replace(self, loops=(), inactive_loops=tuple(spare[-most:]), refused=tuple(refused))
-        for loop in held:
-            atlas = atlas.with_loop(loop, most)
-        return replace(atlas, pending=held[-1], confirmed=True)
+        spare = [x for x in (*self.inactive_loops, *out) if x.pair not in kept][-_INACTIVE:]
+        return replace(
+            self, loops=tuple(held), inactive_loops=tuple(spare), refused=tuple(refused), pending=held[-1],
+            confirmed=True,
+        )  # fmt: skip
 
     def solved_by(self, graph: PoseGraph, rig: CommonError) -> Atlas:
         """A copy with the keyframes' poses by the pose graph; `rig` says what its common errors stand for."""
@@ -222,15 +210,16 @@ class Atlas:
 
     def closed_in(self, frame: int) -> int | None:
         """Index of the earlier frame with which `frame` closed a loop; None if it closed none."""
-        if not self.loops or self.keyframes[self.loops[-1].second].frame != frame:
-            return None
-        return self.keyframes[self.loops[-1].first].frame
+        return self._partner([x.pair for x in self.loops[-1:]], frame)
 
     def refused_in(self, frame: int) -> int | None:
         """Index of the earlier frame with which `frame` formed a loop that was refused; None if there was none."""
-        if not self.refused or self.keyframes[self.refused[-1][1]].frame != frame:
-            return None
-        return self.keyframes[self.refused[-1][0]].frame
+        return self._partner(self.refused[-1:], frame)
+
+    def _partner(self, pairs: Sequence[tuple[int, int]], frame: int) -> int | None:
+        """Index of the earlier frame of a pair of keyframes whose second one is `frame`; None if there is none."""
+        found = (self.keyframes[first].frame for first, second in pairs if self.keyframes[second].frame == frame)
+        return next(found, None)
 
     def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as estimated at the time, or as revised in `path`.
@@ -251,12 +240,6 @@ class Atlas:
     def in_map(self, poses: Array) -> Array:
         """Poses (K, 4, 4) of all keyframes in the map, given those in odom; the last loop has set those before it."""
         return np.concatenate([self.corrected, self.T_map_odom @ poses[len(self.corrected) :]])
-
-    def pose_in_map(self, number: int) -> Array:
-        """Pose T_map_left (4, 4) of a keyframe."""
-        if number < len(self.corrected):
-            return np.asarray(self.corrected[number])
-        return self.T_map_odom @ self.keyframes[number].T_odom_left
 
     def estimate(self, estimate: Estimate, common: CommonError, gaps: bool = True) -> Estimate:
         """An estimate in odom, transformed to the map; its covariance is propagated from the anchor, if there is one.

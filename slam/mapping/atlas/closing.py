@@ -22,7 +22,7 @@ _DIMENSIONS = 6  # fixed: mean of χ² of a pose
 
 def close(
     atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool, config: AtlasConfig
-) -> tuple[Atlas, bool]:
+) -> Atlas:
     """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop; else refuse it.
 
     One that cannot be judged is refused.
@@ -35,68 +35,60 @@ def close(
         same_view: the camera sees the same from the same place, which is believed against the path: the covariance of
             the path between is then as much too small as the two disagree.
         config: settings.
-
-    Returns:
-        the atlas after it, and whether the pose graph was solved anew with the loop.
     """
-    try:
-        return _judged(atlas, loop, rig, path, same_view, config)
-    except np.linalg.LinAlgError:
-        return replace(atlas, refused=(*atlas.refused, loop.pair)), False
+    given, common = atlas, None if atlas.solved is None else atlas.solved.belief(rig)[0]
 
-
-def _judged(
-    atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool, config: AtlasConfig
-) -> tuple[Atlas, bool]:
-    """`close`, where all numbers can be computed with."""
-    chain = atlas.chain(rig, path())
-    common = None if atlas.solved is None else atlas.solved.common_as(rig)
-    graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain.poses), loop.pair, common)
-    limit, off = config.gate_sigmas**2, disagreement(graph, loop)
-    if off > limit and not (same_view and np.isfinite(off)):
-        return _left_out(atlas, chain, loop, rig, config, off > config.refused_beyond)
-    before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
-    if config.agreeing > 1 and not (before is not None and _agree(chain, before, loop, limit)):
-        return atlas.with_inactive_loop(loop, config.most_loops), False
-    atlas = replace(atlas, confirmed=True)
-    if off > limit:
-        atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
+    def without_it(atlas: Atlas) -> tuple[Chain, PoseGraph, float]:
+        """The path, the pose graph without the loop, and the loop's distance from it."""
         chain = atlas.chain(rig, path())
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain.poses), loop.pair, common)
-    elif atlas.loops and not is_informative(graph, loop):
-        return atlas.with_inactive_loop(loop, config.most_loops), False
-    graph = graph.with_loop(loop)
-    if (graph.disagreement() > limit).any():
-        return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
-    return atlas.with_loop(loop, config.most_loops).solved_by(graph, rig), True
+        return chain, graph, disagreement(graph, loop)
+
+    try:
+        chain, graph, off = without_it(atlas)
+        limit = config.gate_sigmas**2
+        if off > limit and not (same_view and np.isfinite(off)):
+            return _left_out(atlas, chain, loop, rig, config, off > config.refused_beyond)
+        before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
+        if config.agreeing > 1 and not (before is not None and _agree(chain, before, loop, limit)):
+            return atlas.with_inactive_loop(loop)
+        atlas = replace(atlas, confirmed=True)
+        if off > limit:
+            atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
+            chain, graph, _ = without_it(atlas)
+        elif atlas.loops and not is_informative(graph, loop):
+            return atlas.with_inactive_loop(loop)
+        graph = graph.with_loop(loop)
+        if (graph.disagreement() > limit).any():
+            return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
+        return replace(atlas, loops=(*atlas.loops, loop)).solved_by(graph, rig)
+    except np.linalg.LinAlgError:
+        return replace(given, refused=(*given.refused, loop.pair))
 
 
-def _left_out(
-    atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, config: AtlasConfig, refused: bool
-) -> tuple[Atlas, bool]:
+def _left_out(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, config: AtlasConfig, refused: bool) -> Atlas:
     """Leave out a loop that contradicts the others, or the others if fewer places support them.
 
     One that is not `refused` contradicts them by no more than may be: it does not count as another place.
     """
     limit, start = config.gate_sigmas**2, atlas.in_map(chain.poses)
-    atlas = atlas.with_inactive_loop(loop, config.most_loops)
+    atlas = atlas.with_inactive_loop(loop)
     if refused:
         atlas = replace(atlas, refused=(*atlas.refused, loop.pair))
-    left = config.return_depths * np.array([k.depth for k in atlas.keyframes])
-
-    def places(loops: Sequence[Loop]) -> list[Loop]:
-        return spaced(loops, atlas.travelled, left)
-
-    if not atlas.loops or len(places(atlas.inactive_loops)) < 2:
-        return atlas, False
+    if not atlas.loops or len(spaced(atlas, atlas.inactive_loops, config)) < 2:
+        return atlas
     every = (*atlas.loops, *atlas.inactive_loops)
-    rival = agreeing(chain, every, loop, chain.poses, limit)
-    if len(places(rival)) <= len(places(agreeing(chain, every, atlas.loops[-1], start, limit))):
-        return atlas, False
+    rival, present = (
+        agreeing(chain, every, loop, chain.poses, limit),
+        agreeing(chain, every, atlas.loops[-1], start, limit),
+    )
+    places = spaced(atlas, rival, config)
+    if len(places) <= len(spaced(atlas, present, config)):
+        return atlas
     before = {x.pair for x in atlas.loops}
-    held = {x.pair: x for x in (*places(rival), *(x for x in rival if x.pair in before), loop)}
-    atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival, config.most_loops)
-    return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig), True
+    held = {x.pair: x for x in (*places, *(x for x in rival if x.pair in before), loop)}
+    atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival)
+    return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig)
 
 
 def _agree(chain: Chain, before: Loop, loop: Loop, limit: float) -> bool:
@@ -155,16 +147,16 @@ def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array, limi
     return sorted(members, key=lambda x: x.second)
 
 
-def spaced(loops: Sequence[Loop], travelled: Array, apart: Array) -> list[Loop]:
+def spaced(atlas: Atlas, loops: Sequence[Loop], config: AtlasConfig) -> list[Loop]:
     """One loop of each place, in order of the second keyframes.
 
     Loops at one place are not independent evidence: they see the same things, or the same lookalikes.
-
-    `travelled` (K,) [m] is the length of the path up to each keyframe, `apart` (K,) [m] the distance along it beyond
-    which the keyframe's place is left.
     """
     chosen: list[Loop] = []
+    left = -np.inf  # length of the path at which the last one's place is left [m]
     for loop in sorted(loops, key=lambda x: x.second):
-        if not chosen or travelled[loop.second] - travelled[chosen[-1].second] > apart[chosen[-1].second]:
+        keyframe = atlas.keyframes[loop.second]
+        if keyframe.travelled > left:
             chosen.append(loop)
+            left = keyframe.travelled + config.return_depths * keyframe.depth
     return chosen

@@ -13,7 +13,6 @@ _RANGES = {
     "candidates": (0, 10_000),
     "inliers": (3, 100_000),
     "agreeing": (1, 2),
-    "most_loops": (2, 100_000),
 }
 
 
@@ -38,9 +37,6 @@ class AtlasConfig:
             keyframes after the first.
         gate_sigmas: a loop is closed if its distance from the path is at most this many standard deviations. Beyond
             what is as rare as a Gaussian number so far off, it is refused; between the two it is left out.
-        most_loops: largest number of loops in the pose graph, as each makes the next one slower; beyond it, those
-            spread most evenly along the path are kept.
-        give_back: landmarks of a revisited place return to the back end, if it can place landmarks.
     """
 
     enabled: bool = True
@@ -55,8 +51,6 @@ class AtlasConfig:
     spread: float = 0.1
     agreeing: int = 2
     gate_sigmas: float = 5.0
-    most_loops: int = 200
-    give_back: bool = True
 
     __pydantic_config__ = FORBID_UNKNOWN
 

@@ -84,19 +84,6 @@ def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: 
     return bool(rig.left.in_image(uv).mean() < config.keyframe_share)
 
 
-def kept_features(
-    rows: NDArray[np.intp], response: Array, landmark_of: IdArray, moving: NDArray[np.intp], most: int
-) -> NDArray[np.intp]:
-    """Rows of the features that a keyframe keeps: landmarks first, then the strongest; none that move.
-
-    They are at most `most` of `rows`, which have a depth. `landmark_of` (N,) is the id of the landmark that each
-    feature shows, −1 for none.
-    """
-    rows = rows[~np.isin(rows, moving)]
-    order = np.lexsort((-response[rows], landmark_of[rows] < 0))[:most]
-    return np.sort(rows[order])
-
-
 def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> Array:
     """Covariance (6, 6) by noise of the motion since a keyframe, from the covariances of both poses.
 

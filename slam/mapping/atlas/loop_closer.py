@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, Loop, kept_features, step_covariance, view_has_changed
-from slam.mapping.atlas.verification import Verified, keyframe_landmarks, verify
-from slam.mapping.mapper import OldPlace
+from slam.mapping.atlas.keyframes import Keyframe, Loop, step_covariance, view_has_changed
+from slam.mapping.atlas.verification import keyframe_landmarks, verify
 from slam.mapping.selection import depth_is_known
 from slam.mapping.step import Step
 from slam.models import EstimatorModels
@@ -27,6 +26,7 @@ from slam.runtime.blas import one_blas_thread
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
 from slam.tracks.localizer import Localizer
+from slam.tracks.table import LandmarkTable
 
 _NEARBY = 4  # cost: keyframes compared because they are near the path, besides those that look alike
 _VERIFIED = 3  # cost: keyframes whose geometry is checked, of those that are compared in detail
@@ -37,10 +37,12 @@ _HYPOTHESES = 300  # cost: poses tried, so that with a quarter of the matches ri
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Pose and place of a camera found without a prior."""
+    """A camera found without a prior, by a keyframe."""
 
     T_odom_left: Array  # the camera's pose (4, 4) in the back end's frame
-    place: OldPlace  # what the place shows, in the back end's world
+    landmarks: LandmarkTable  # the keyframe's features (M); ids of the landmarks that they showed, −1 for none
+    positions: Array  # of these (M, 3) [m] in the back end's world
+    covariances: Array  # (M, 3, 3) [m²]
     stamp: float  # time of the keyframe that shows the place [s]; −inf for one of an earlier run
 
 
@@ -67,20 +69,17 @@ class LoopCloser:
         self._localizer = Localizer(self._rig, association, models)
 
     @one_blas_thread
-    def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> tuple[Atlas, OldPlace | None]:
-        """The atlas after a frame, and the old features that the frame shows again if it closed a loop.
-
-        `path` returns the path in odom so far.
-        """
+    def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> Atlas:
+        """The atlas after a frame; `path` returns the path in odom so far."""
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
         wanted = begins or (not step.tracking.unmatched and self._is_keyframe(atlas, step))
         if not (self._config.enabled and wanted):
-            return atlas, None
+            return atlas
         landmark_of = step.matches.landmark_of(len(step.features))
         landmark_of[step.added.rows] = step.added.ids
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:
-            return atlas, None
+            return atlas
         known = landmark_of[landmark_of >= 0]
         candidates = self._candidates(atlas, new, step, known)
         atlas = replace(atlas.with_new(new), restarts=len(atlas.gaps))
@@ -88,13 +87,12 @@ class LoopCloser:
         if not found:  # whatever the path says
             lookalike = self._anywhere(atlas, new, known, step.features)
             found = self._verified(atlas, lookalike, step.features, step.correction, step.index)
-            found = [one for one in found if self._is_same_view(one[1], step.features)]
+            found = [loop for loop in found if self._is_same_view(atlas, loop, step.features)]
         if not found:
-            return atlas, None
-        loop, seen = max(found, key=lambda one: one[0].inliers)
-        same = self._is_same_view(seen, step.features)
-        atlas, closed = close(atlas, loop, step.common, path, same, self._config)
-        return atlas, self._seen_again(seen) if closed and self._config.give_back else None
+            return atlas
+        loop = max(found, key=lambda loop: loop.inliers)
+        same = self._is_same_view(atlas, loop, step.features)
+        return close(atlas, loop, step.common, path, same, self._config)
 
     @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
@@ -108,27 +106,16 @@ class LoopCloser:
         verified = self._verified(atlas, self._ranked(atlas, likely, features), features, correction, seed)
         if not verified:
             return None
-        loop, seen = max(verified, key=lambda one: one[0].inliers)
-        if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other, _ in verified):
+        loop = max(verified, key=lambda loop: loop.inliers)
+        if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other in verified):
             return None
-        T = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first)
-        points = seen.keyframe.points.astype(float)
-        P = self._rig.triangulation_covariance(points, self._sigma)
-        landmarks = replace(keyframe_landmarks(seen.keyframe), seen_from=np.tile(T[:3, 3], (len(points), 1)))
-        place = OldPlace.at(landmarks, np.arange(len(points)), T, points, P)
-        stamp = -np.inf if loop.first < atlas.prior_count else seen.keyframe.stamp
-        return Found(T @ loop.T_first_second, place, stamp)
-
-    def _seen_again(self, seen: Verified) -> OldPlace:
-        """The old keyframe's inliers, in coordinates of the present left camera."""
-        m, back = seen.matches, inverse(seen.T_keyframe_left)
-        points, R = seen.keyframe.points[m.landmarks].astype(float), back[:3, :3]
-        near = transform(back, points)
-        J = points_by_pose(near)
-        P = R @ self._rig.triangulation_covariance(points, self._sigma) @ R.T
-        P = P + J @ seen.covariance @ np.swapaxes(J, 1, 2)
-        landmarks = keyframe_landmarks(seen.keyframe).select(m.landmarks)
-        return OldPlace.at(landmarks, m.features, np.eye(4), near, P)
+        keyframe = atlas.keyframes[loop.first].corrected(correction, self._rig)
+        T, points = inverse(atlas.T_map_odom) @ atlas.poses_in_map[loop.first], keyframe.points.astype(float)
+        P = T[:3, :3] @ self._rig.triangulation_covariance(points, self._sigma) @ T[:3, :3].T
+        landmarks = replace(keyframe_landmarks(keyframe), seen_from=np.tile(T[:3, 3], (len(points), 1)))
+        stamp = -np.inf if loop.first < atlas.prior_count else keyframe.stamp
+        P = 0.5 * (P + np.swapaxes(P, 1, 2))
+        return Found(T @ loop.T_first_second, landmarks, transform(T, points), P, stamp)
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
         """Whether the view differs enough from the last keyframe's, or its loop waits to be confirmed by another."""
@@ -141,11 +128,12 @@ class LoopCloser:
         return view_has_changed(last, inverse(last.T_odom_left) @ step.estimate.T_world_left, self._rig, self._config)
 
     def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray) -> Keyframe | None:
-        """The frame as a keyframe; None where too few features have a depth."""
+        """The frame as a keyframe, of features that do not move, landmarks first; None where too few have a depth."""
         features = step.features
-        stereo = np.flatnonzero(features.has_stereo)
-        known = stereo[depth_is_known(self._rig, features, stereo, self._sigma, self._max_depth_error)]
-        rows = kept_features(known, features.response, landmark_of, step.labels.moving, self._config.features)
+        rows = np.setdiff1d(np.flatnonzero(features.has_stereo), step.labels.moving)
+        rows = rows[depth_is_known(self._rig, features, rows, self._sigma, self._max_depth_error)]
+        order = np.lexsort((-features.response[rows], landmark_of[rows] < 0))
+        rows = np.sort(rows[order[: self._config.features]])
         if len(rows) < _MINIMAL:
             return None
         points = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
@@ -171,7 +159,7 @@ class LoopCloser:
         Keyframes of a place that the camera has not left yet are excluded, those that it cannot have come to, given its
         uncertainty, and those whose landmarks the back end still measures: it knows their position by itself.
         """
-        c, poses, here = self._config, atlas.poses_in_map(), atlas.T_map_odom @ new.T_odom_left
+        c, poses, here = self._config, atlas.poses_in_map, atlas.T_map_odom @ new.T_odom_left
         sigma = np.sqrt(np.trace(atlas.estimate(step.estimate, step.common).covariance[3:, 3:]))
         length, far = new.travelled - atlas.travelled, np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
@@ -201,11 +189,11 @@ class LoopCloser:
         few = [np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL for k in rows.tolist()]
         return rows[np.array(few, bool)]
 
-    def _is_same_view(self, seen: Verified, features: StereoFeatures) -> bool:
-        """Whether a frame shows what a keyframe did: most features, from the same place."""
-        most = min(len(seen.keyframe), int(features.has_stereo.sum()))
-        moved = view_has_changed(seen.keyframe, seen.T_keyframe_left, self._rig, self._config)
-        return 2 * len(seen.matches) >= most and not moved
+    def _is_same_view(self, atlas: Atlas, loop: Loop, features: StereoFeatures) -> bool:
+        """Whether a frame shows what a loop's first keyframe did: most features, from the same place."""
+        keyframe = atlas.keyframes[loop.first]
+        most = min(len(keyframe), int(features.has_stereo.sum()))
+        return 2 * loop.inliers >= most and not view_has_changed(keyframe, loop.T_first_second, self._rig, self._config)
 
     def _most_alike(self, atlas: Atlas, descriptors: NDArray[np.float32], possible: BoolArray) -> NDArray[np.intp]:
         """Numbers of those `possible` keyframes (K,) whose descriptors as a whole are most similar, best first."""
@@ -227,22 +215,18 @@ class LoopCloser:
     def _verified(
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, correction: Correction | None,
         seed: int,
-    ) -> list[tuple[Loop, Verified]]:  # fmt: skip
+    ) -> list[Loop]:  # fmt: skip
         """The candidates that geometry confirms, as loops that end at the present camera.
 
         Their second number is that of the newest keyframe, which is the present camera's unless it is lost.
         """
         found = []
         for k in candidates.tolist():
-            keyframe = atlas.keyframes[k].corrected(correction, self._rig)
-            seen = verify(keyframe, features, self._rig, self._localizer, self._config, seed)
-            if seen is not None:
-                # Each of both poses has an error of its own frame too, at most as large as such a measurement's noise.
-                P = seen.covariance + seen.noise
-                found.append((Loop(k, len(atlas) - 1, seen.T_keyframe_left, P, len(seen.matches)), seen))
-        return found
+            keyframe, pair = atlas.keyframes[k].corrected(correction, self._rig), (k, len(atlas) - 1)
+            found.append(verify(keyframe, features, pair, self._rig, self._localizer, self._config, seed))
+        return [loop for loop in found if loop is not None]
 
     def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:
         """Whether two verified loops put the camera at positions closer together than the scene's depth."""
-        T, U = (atlas.pose_in_map(loop.first) @ loop.T_first_second for loop in (one, other))
+        T, U = (atlas.poses_in_map[loop.first] @ loop.T_first_second for loop in (one, other))
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)

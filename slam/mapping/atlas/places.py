@@ -8,10 +8,12 @@ not be recognised. For the same reason the vectors' mean is subtracted before th
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
 
 from slam.geometry.arrays import narrowed
 
@@ -77,26 +79,16 @@ def learn_words(descriptors: Vectors, number: int) -> Vectors:
     """Centres (number, D) of descriptors (F, D), by k-means on an evenly spaced subset."""
     some = min(number * _TRAINING, len(descriptors))
     descriptors = descriptors[np.linspace(0, len(descriptors) - 1, some).astype(int)]
-    words = descriptors[np.linspace(0, some - 1, number).astype(int)].copy()
-    for _ in range(_ROUNDS):
-        members = _members(descriptors, words)
-        count = members.sum(axis=1)
-        used = count > 0
-        words[used] = (members @ descriptors)[used] / count[used, None]
-    return words
+    first = descriptors[np.linspace(0, some - 1, number).astype(int)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a word without descriptors stays where it is
+        return np.asarray(kmeans2(descriptors, first, iter=_ROUNDS, minit="matrix")[0], np.float32)
 
 
 def aggregate(descriptors: Vectors, words: Vectors) -> NDArray[np.float32]:
     """VLAD vector (W · D,) of descriptors (F, D): each word's part is normalised, then the whole, to unit length."""
-    members = _members(descriptors, words)
+    members = (vq(descriptors, words)[0] == np.arange(len(words))[:, None]).astype(np.float32)
     parts = members @ descriptors - members.sum(axis=1)[:, None] * words
     parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), _NONE)
     vector = parts.ravel()
     return np.asarray(vector / max(float(np.linalg.norm(vector)), _NONE), np.float32)
-
-
-def _members(descriptors: Vectors, words: Vectors) -> Vectors:
-    """Which descriptors (F, D) are nearest to each word, as ones and zeros (W, F)."""
-    squares = np.einsum("wd,wd->w", words, words)
-    nearest = np.argmin(squares[None, :] - 2 * descriptors @ words.T, axis=1)
-    return (nearest == np.arange(len(words))[:, None]).astype(np.float32)

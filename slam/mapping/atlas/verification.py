@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, covariance_growth
-from slam.tracks.follow import Matches
+from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
 from slam.window.pose_only import PoseProblem, least_squares, whitened_residuals
@@ -21,23 +20,13 @@ from slam.window.stereo import RectifiedStereo
 _ROUNDS = 2  # numerics: of least squares, with the points' noise in the pixels as seen from the last pose
 
 
-@dataclass(frozen=True, eq=False)
-class Verified:
-    """A keyframe's place, seen again."""
-
-    keyframe: Keyframe  # that shows it
-    T_keyframe_left: Array  # pose (4, 4) of the present camera in the keyframe's coordinates
-    covariance: Array  # of that pose (6, 6), perturbing on the right
-    noise: Array  # the part of the covariance (6, 6) due to the features' own errors in both frames
-    matches: Matches  # inliers, as rows of the keyframe's features and of the present frame's
-
-
 def verify(
-    keyframe: Keyframe, features: StereoFeatures, rig: StereoRig, localizer: Localizer, config: AtlasConfig, seed: int
-) -> Verified | None:
-    """The present camera's pose relative to a keyframe; None if too few features agree, or all are in one spot.
+    keyframe: Keyframe, features: StereoFeatures, pair: tuple[int, int], rig: StereoRig, localizer: Localizer,
+    config: AtlasConfig, seed: int,
+) -> Loop | None:  # fmt: skip
+    """The loop from a keyframe to the present camera; None if too few features agree, or all are in one spot.
 
-    `seed` is of the random choice in the geometric check.
+    `pair` are the numbers of both keyframes; `seed` is of the random choice in the geometric check.
     """
     points = keyframe.points.astype(float)
     landmarks = replace(keyframe_landmarks(keyframe), ids=np.arange(len(points)))
@@ -55,7 +44,8 @@ def verify(
         return None
     slide = 1 / rig.left.fu  # seen from another viewpoint, all features of a place shift by a pixel on the surface
     covariance = noise + np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
-    return Verified(keyframe, T, covariance, noise, Matches(ids.astype(np.intp), seen))
+    # Each of both poses has an error of its own frame too, at most as large as such a measurement's noise.
+    return Loop(*pair, T, covariance + noise, len(found))
 
 
 def refined_pose(

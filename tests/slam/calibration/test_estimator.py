@@ -134,13 +134,6 @@ def test_what_rows_alone_say_is_not_applied():
     assert np.sqrt(np.mean(np.square(applied), axis=1)).max() < 0.1
 
 
-def test_outliers_do_not_lead_astray():
-    for seed in range(2):
-        calibration = drive(TURNED, seed, outliers=0.2)
-        assert np.abs(z_scores(calibration, TURNED)).max() < 3
-        assert disparity_error(calibration, TURNED) < 0.15
-
-
 def test_unrectified_rig():
     theta = parameters(right_cx=2e-3)
     calibration = drive(theta, rig=GENERAL_RIG, scale=GENERAL_RIG.baseline / CAR.baseline, noise=0.1, frames=20)
@@ -181,11 +174,22 @@ def test_features_that_move_are_corrected_as_they_were():
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_a_revision_does_not_move_the_camera(backend):
-    """Landmarks follow the new correction: else a sudden change of all pixels looks like motion."""
+    """Landmarks follow the new correction: else a sudden change of all pixels looks like motion.
+
+    A revision moves the past: the newest pose is to the last digit where it was, also for whoever reads poses live.
+    """
     correction = RigCorrection(RigModel(RIG), parameters(left_k1=-0.05, right_k1=-0.05, right_cx=1e-3))
     cloud, truth = Cloud(150, seed=2), [se3.exp(np.array([0, 0, 0, 0, 0, 0.01 * k])) for k in range(12)]
     system = StereoSlam(RIG, None, backend, config=SystemConfig().with_settings(["map.max_depth_error=0.3"]))
     system.calibration.observe = lambda *_: None
+    revise, moved = system.backend.revise, []
+
+    def watched(correct):
+        pose = system.backend.estimate(landmarks=False).T_world_left
+        revise(correct)
+        moved.append(np.abs(system.backend.estimate(landmarks=False).T_world_left - pose).max())
+
+    system.backend.revise = watched
     for k, T in enumerate(truth):
         f = cloud.features(T, k / 30, 0.05)[0]
         z = correction.undone(np.column_stack([f.uv_left, f.uv_right[:, 0]]))
@@ -200,3 +204,4 @@ def test_a_revision_does_not_move_the_camera(backend):
         if k == 8:
             step = np.linalg.norm((np.linalg.inv(before) @ result.estimate.T_world_left)[:3, 3])
             assert abs(step - 0.01) < 0.01
+    assert moved == [0.0]

@@ -5,7 +5,7 @@ import numpy as np
 from slam.calibration import RigModel
 from slam.calibration.motion import Pair, fit_motion, move, noise_variances, pair_evidence
 from slam.calibration.prior import prior_information
-from slam.calibration.views import View, pair_of
+from slam.calibration.views import View, match, pair_of
 from slam.geometry import se3
 from tests.slam.calibration.drives import CAR, Street, parameters
 from tests.slam.numeric import jacobian
@@ -58,7 +58,8 @@ def test_views_forty_metres_apart_are_solved_from_the_poses_of_the_system():
     poses, every = distant_views()
     off = se3.exp(np.array([0.01, 0.01, 0.0, 0.5, 0.0, 1.0]))  # as poses of a run that has drifted
     first = View.of(MODEL, every[0], poses[0], 10**6)
-    pair = pair_of(MODEL, first, View.of(MODEL, every[1], poses[1] @ off, 10**6), NONE, NOISE, seed=0)
+    second = View.of(MODEL, every[1], poses[1] @ off, 10**6)
+    pair = pair_of(MODEL, first, second, NONE, NOISE, 0, match(first, second))
     assert len(pair.first) >= 30
     evidence = pair_evidence(MODEL, pair, NONE, NOISE)
     assert evidence is not None and evidence.S[MODEL.names.index("yaw")].any()

@@ -8,13 +8,17 @@ import pytest
 import slam
 from slam.calibration import SelfCalibration, SelfCalibrationConfig
 from slam.calibration.joint import agreement, joint_calibration
-from slam.calibration.prior import factory_prior
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose
 
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
+
+
+def scaled(evidence, factor):
+    """The evidence of a recording with `factor` times the information."""
+    return evidence._replace(whole=evidence.whole.scaled(factor), motion=evidence.motion.scaled(factor))
 
 
 @pytest.fixture(scope="module")
@@ -117,19 +121,6 @@ def test_recordings_together_are_surer_and_agree(first):
     assert agreement(first.model, [first.evidence()], first.config.systematic) is None
 
 
-@pytest.mark.parametrize("share", [1.0, 0.1, 0.001])
-def test_recordings_that_say_more_and_less_are_never_worse_than_the_one_alone(first, share):
-    """Sums of evidence whose systematic errors are ignored are far surer in some directions than they may be."""
-    other = drive(TURNED, seed=2, frames=6).evidence().scaled(share)
-    alone, both = (
-        joint_calibration(first.model, parts, first.config.systematic).posterior
-        for parts in ([first.evidence()], [first.evidence(), other])
-    )
-    delivered = np.sqrt(np.diag(factory_prior(first.model).covariances[-1]))
-    assert (both.sigma < 1.05 * np.maximum(alone.sigma, delivered)).all()
-    assert np.abs((both.mean - TURNED) / both.sigma).max() < 3
-
-
 def test_recordings_of_another_rig_do_not_agree(first):
     other = drive(TURNED + parameters(roll=3e-3), seed=2, frames=20)
     found = agreement(first.model, [first.evidence(), other.evidence()], first.config.systematic)
@@ -139,7 +130,7 @@ def test_recordings_of_another_rig_do_not_agree(first):
 
 def test_the_prior_that_recordings_share_is_no_agreement(first):
     """Two that say next to nothing are both near the calibration as delivered."""
-    silent = [d.evidence().scaled(1e-9) for d in (first, drive(TURNED + parameters(roll=3e-3), seed=2, frames=20))]
+    silent = [scaled(d.evidence(), 1e-9) for d in (first, drive(TURNED + parameters(roll=3e-3), seed=2, frames=20))]
     found = agreement(first.model, silent, first.config.systematic)
     assert np.isnan(found.largest).all() and found.words.startswith("Nothing can be said")
     half = agreement(first.model, [first.evidence(), silent[1]], first.config.systematic)

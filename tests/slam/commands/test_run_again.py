@@ -90,7 +90,6 @@ def test_a_prior_map_is_found_again(here):
     before = load(here / "second")
     assert before.origin.mono
     assert before.origin.prior_map == here / "desk.map"
-    assert before.config.map.monocular
     run("--config", "second", "--out", "third")
     assert (here / "second/trajectory.txt").read_bytes() == (here / "third/trajectory.txt").read_bytes()
 

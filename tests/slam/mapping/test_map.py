@@ -8,7 +8,7 @@ from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.selection import new_landmarks
 from slam.tracks.table import LandmarkTable
-from slam.tracks.visibility import MapView, expected_landmarks, similar_view
+from slam.tracks.visibility import MapView, expected_landmarks
 from tests.slam.scene import RIG
 
 CONFIG = MapConfig(target_in_view=20, separation=5.0)
@@ -101,23 +101,6 @@ def test_what_is_held_back_is_neither_missed_nor_seen():
     assert bad_landmarks(after, MapConfig(confirmed=0)).tolist() == [False, True, False]
 
 
-def test_what_is_not_seen_is_forgotten_only_where_wanted():
-    rows = rows_with(seen=[9, 9, 9], in_view=[9, 9, 9], missed=[0, 0, 0], last_seen=[7, 90, 100])
-    assert not bad_landmarks(rows, MapConfig()).any()
-    assert bad_landmarks(rows, MapConfig(forget_after=20)).tolist() == [True, False, False]
-
-
-def test_counting_a_frame():
-    rows = rows_with(seen=[1, 1, 1], in_view=[1, 1, 1], missed=[0, 2, 0])
-    features = features_at([(1, 1), (2, 2)])
-    rows = rows.after_frame(8, np.array([0, 1]), np.array([1, 2]), features, np.array([1, 0]))
-    assert rows.in_view.tolist() == [2, 2, 2]
-    assert rows.missed.tolist() == [1, 0, 0]
-    assert rows.seen.tolist() == [1, 2, 2]
-    assert rows.last_seen.tolist() == [0, 8, 8]
-    np.testing.assert_array_equal(rows.descriptors[1], features.descriptors[1])
-
-
 @pytest.mark.parametrize(
     ("last_seen", "seen", "gone"),
     [([5, 1, 9, 3, 7], [2, 2, 2, 2, 2], [1, 3]), ([5, 1, 9, 3, 9], [1, 4, 1, 4, 2], [0, 1])],
@@ -138,19 +121,6 @@ def test_out_of_view_the_map_is_thinned_to_the_best_seen():
     assert not crowded_landmarks(rows, apart, config).any()
     unknown = rows_with(seen=rows.seen, unseen=rows.unseen)
     assert not crowded_landmarks(unknown, positions, config).any()
-
-
-def test_what_looks_as_it_did():
-    """One landmark 2 m ahead of where it was first seen from."""
-    from_here = lambda *camera: bool(  # noqa: E731
-        similar_view(np.array([[0, 0, 2.0]]), np.zeros((1, 3)), np.array(camera), 20.0, 1.4)[0]
-    )
-    assert from_here(0, 0, 0) and from_here(0, 0, 0.5) and from_here(0, 0, -0.7) and from_here(0.7, 0, 0)
-    assert not from_here(0, 0, 0.6)  # 1.4 m
-    assert not from_here(0, 0, -0.9)  # 2.9 m
-    assert not from_here(0.75, 0, 0)  # 20.6 degrees
-    unknown = similar_view(np.array([[0, 0, 2.0]]), np.full((1, 3), np.nan), np.array([5.0, 0, 0]), 20.0, 1.4)
-    assert unknown.tolist() == [True]
 
 
 def seen_from_the_origin(positions, features):
@@ -195,12 +165,3 @@ def test_hidden_landmarks_are_not_expected():
     size = (RIG.width, RIG.height)
     assert expected_landmarks(view, both, size, 16.0, 12.0).tolist() == [False, True, False]
     assert expected_landmarks(view, both, size, 0.0, 0.0).tolist() == [True, True, True]
-
-
-def test_looks_are_renewed_as_far_as_wanted():
-    rows = rows_with(seen=[1], in_view=[1], missed=[0])
-    rows = LandmarkTable(**{**vars(rows), "descriptors": np.eye(16, dtype=np.float32)[:1]})
-    features = features_at([(1, 1), (2, 2)])
-    for descriptor_update, expected in ((0.0, (1, 0)), (1.0, (0, 1)), (0.5, (0.5**0.5, 0.5**0.5))):
-        after = rows.after_frame(1, rows.ids, rows.ids, features, np.array([1]), descriptor_update)
-        np.testing.assert_allclose(after.descriptors[0, :2], expected, atol=1e-6)

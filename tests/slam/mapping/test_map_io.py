@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import zipfile
 from dataclasses import replace
 from io import BytesIO
@@ -11,8 +10,6 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-import slam
-from experiments.startup import STARTS, start_up, stored_map
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, SlamError
@@ -148,9 +145,9 @@ def test_other_files_and_versions_are_refused(tmp_path):
     (tmp_path / "text").write_text("hello")
     with pytest.raises(SlamError, match="not a saved map"):
         load_map(tmp_path / "text")
-    for version in (b"1", b"3", b"4", b"6"):
+    for version in (b"2", b"6"):
         data = encode(some_map()).replace(b"map 5\n", b"map " + version + b"\n", 1)
-        with pytest.raises(SlamError, match=f"version '{version.decode()}'.*versions 2 and 5"):
+        with pytest.raises(SlamError, match=f"version '{version.decode()}'.*version 5"):
             decode(data, "a.map")
     with pytest.raises(SlamError, match="cannot be written"):
         save_map(tmp_path / "no" / "folder.map", some_map())
@@ -222,37 +219,3 @@ def test_there_is_no_map_before_the_first_frame_and_an_empty_one_is_refused():
         StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=empty)
     with pytest.raises(SlamError, match="no map yet"):
         StereoSlam(RIG, None, "ekf").snapshot()
-
-
-@pytest.mark.slow
-def test_the_command_saves_and_starts_and_refuses(slam_command, tmp_path):
-    kept = str(tmp_path / "desk.map")
-    run = ("run", "synthetic:desk?seed=1", "--quiet", "--out")
-    done = slam_command(*run, str(tmp_path / "one"), "--frames", "0:5", "--save-map", kept)
-    assert done.returncode == 0, done.stderr
-    done = slam_command(*run, str(tmp_path / "two"), "--frames", "3:7", "--map", kept)
-    assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "two" / "summary.json").read_text())["status"] == {"tracked": 4}
-    data = bytearray((tmp_path / "desk.map").read_bytes())
-    data[-40] ^= 1
-    (tmp_path / "desk.map").write_bytes(data)
-    done = slam_command(*run, str(tmp_path / "three"), "--map", kept)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1 and "altered" in done.stderr
-    done = slam_command(*run, str(tmp_path / "three"), "--mono")
-    assert done.returncode == 2 and "--mono needs --map" in done.stderr
-
-
-# --- start-up from pre-stored features (paper B, 4.2) ---
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_start_up_before_the_board(backend):
-    """From three wrong starts to within a centimetre; single frames fix the place to 8 mm (one sigma)."""
-    sequence = slam.open_sequence("synthetic:startup?frames=25")
-    known = stored_map(sequence)
-    for start in STARTS:
-        run = start_up(sequence, known, backend, start, 25, "stereo")
-        assert run.errors[0] < 0.03
-        assert run.errors[10:].max() < 0.01
-        assert (run.errors[10:] < 4 * run.sigma[10:]).all()

@@ -81,26 +81,6 @@ def test_it_says_how_little_is_known_of_where_that_map_is(run):
     assert (after > before).all()  # no information comes from nowhere
 
 
-def test_landmarks_are_as_uncertain_as_the_place_where_the_map_begins(sequence):  # noqa: F811
-    run = Run(sequence, "ekf", "atlas.inliers=1000")  # no loop
-    e = run.system.estimate()
-    assert len(e.ids)
-    deviations = np.sqrt(np.trace(e.covariances, axis1=1, axis2=2))
-    assert (deviations > 0.5 * np.sqrt(np.trace(e.covariance[3:, 3:]))).all()
-
-
-def test_a_run_in_such_a_map_is_in_its_coordinates(sequence, tmp_path):  # noqa: F811
-    """Where the whole map is uncertain, its landmarks still hold together."""
-    first = Run(sequence, "ekf", "atlas.inliers=1000")
-    slam.save_map(tmp_path / "first.map", first.system)
-    known = slam.load_map(tmp_path / "first.map")
-    second = slam.StereoSlam(sequence.rig, None, "ekf", config=first.system.config, prior_map=known)
-    last = [second.process_features(first.results[k].features) for k in range(-12, 0)][-1]
-    assert last.status.value == "tracked"
-    apart = inverse(first.results[-1].estimate.T_world_left) @ last.estimate.T_world_left
-    assert np.linalg.norm(apart[:3, 3]) < 0.5
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_camera_that_sees_another_place_in_each_frame_goes_on(backend):
     """Pictures of a slide show: nothing is ever measured, and no number overflows."""

@@ -10,7 +10,7 @@ import pytest
 from slam.errors import SlamError
 from slam.geometry.se3 import exp
 from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.map_io import SavedMap, decode, encode, places_from_arrays, places_to_arrays
+from slam.mapping.map_io import SavedMap, decode, encode, map_arrays, map_of
 
 
 def keyframe(seed: int) -> Keyframe:
@@ -82,20 +82,17 @@ def test_new_landmarks_get_ids_that_no_keyframe_has():
     ("loop_motions", np.zeros((2, 4, 4))),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(name: str, value: np.ndarray):
-    known = saved(KEYFRAMES)
-    arrays = places_to_arrays(known) | {"descriptors": known.descriptors}
-    assert len(places_from_arrays(arrays, "a.map")["keyframes"]) == 4
+    arrays = map_arrays(saved(KEYFRAMES))
+    assert len(map_of(arrays, {}, "a.map").keyframes) == 4
     with pytest.raises(SlamError, match=r"^a\.map: ") as error:
-        places_from_arrays(arrays | {name: value.astype(arrays[name].dtype)}, "a.map")
+        map_of(arrays | {name: value.astype(arrays[name].dtype)}, {}, "a.map")
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("name", ["keyframe_covariances", "keyframe_poses", "loop_motions"])
 def test_an_empty_atlas_has_nothing_but_empty_arrays(name: str):
-    known = saved(())
-    arrays = places_to_arrays(known) | {"descriptors": known.descriptors}
-    arrays["place_descriptors"] = np.zeros((0, 0), np.float16)  # as older files have them
-    assert places_from_arrays(arrays, "a.map")["keyframes"] == ()
+    arrays = map_arrays(saved(()))
+    assert map_of(arrays, {}, "a.map").keyframes == ()
     for value in (np.array(1.0), np.zeros((3, 0))):
         with pytest.raises(SlamError, match=f"a.map: {name}"):
-            places_from_arrays(arrays | {name: value}, "a.map")
+            map_of(arrays | {name: value}, {}, "a.map")
