@@ -348,14 +348,14 @@ class RectifiedRig:
 
     @cached_property
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Tables for ``cv2.remap``, left and right."""
+        """Tables (2, H, W) for ``cv2.remap``, left and right: columns and rows in the original image."""
         v, u = np.mgrid[: self.rig.height, : self.rig.width]
         grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
-        tables = []
-        for uv in (self.unrectify_left(grid), self.unrectify_right(grid)):
-            table = np.nan_to_num(uv, nan=-1.0).astype(np.float32).reshape(*u.shape, 2)
-            tables.append(np.ascontiguousarray(table))
-        return tables[0], tables[1]
+        left, right = (
+            np.nan_to_num(uv.T, nan=-1.0).astype(np.float32, order="C").reshape(2, *u.shape)
+            for uv in (self.unrectify_left(grid), self.unrectify_right(grid))
+        )
+        return left, right
 
 
 def rectify(rig: StereoRig) -> RectifiedRig:

@@ -49,14 +49,15 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
     return replace(features, stamp=stamp, threshold=threshold, **columns)
 
 
-def outside_masks(features: StereoFeatures, frame: StereoFrame) -> StereoFeatures:
+def outside_masks(features: StereoFeatures, frame: StereoFrame, rig: StereoRig) -> StereoFeatures:
     """The features where the masks of their frame are True; under the right camera's only the right pixel goes."""
     if frame.left_mask is not None:
-        features = features.select(_at(frame.left_mask, features.uv_left))
+        uv = rig.rectified.unrectify_left(features.uv_left) if features.rectified else features.uv_left
+        features = features.select(_at(frame.left_mask, uv))
     if frame.right_mask is None:
         return features
-    there = _at(frame.right_mask, features.uv_right)[:, None]
-    return replace(features, uv_right=np.where(there, features.uv_right, np.nan))
+    uv = rig.rectified.unrectify_right(features.uv_right) if features.rectified else features.uv_right
+    return replace(features, uv_right=np.where(_at(frame.right_mask, uv)[:, None], features.uv_right, np.nan))
 
 
 def _at(mask: BoolArray, uv: Array) -> BoolArray:

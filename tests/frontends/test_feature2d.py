@@ -14,16 +14,6 @@ from slam.errors import ConfigurationError, SequenceError
 from tests.frontends.test_surf import IMAGE
 
 
-def test_what_feature2d_has_surf_has():
-    sift = cv2.SIFT_create()
-    for surf in (Surf(100), Surf(100, descriptor=16)):
-        assert surf.descriptorType() == sift.descriptorType()
-        assert surf.defaultNorm() == sift.defaultNorm()
-        assert surf.empty() == sift.empty()
-        assert surf.getDefaultName() == sift.getDefaultName().replace("SIFT", "SURF")
-        assert surf.detectAndCompute(IMAGE, None)[1].shape[1] == surf.descriptorSize()
-
-
 def test_detect_gives_what_opencv_takes_as_key_points():
     found = Surf(100).detect(IMAGE)
     first = found[0]
@@ -70,40 +60,10 @@ def test_the_arguments_and_defaults_are_opencv_s():
     parameters = inspect.signature(frontends.surf.create).parameters
     expected = {"hessianThreshold": 100.0, "nOctaves": 4, "nOctaveLayers": 3, "extended": False, "upright": False}
     assert {name: p.default for name, p in parameters.items()} == expected
-    surf = frontends.surf.create(400, 3, 2, False, True)
-    got = surf.getHessianThreshold(), surf.getNOctaves(), surf.getNOctaveLayers(), surf.getExtended(), surf.getUpright()
-    assert got == (400.0, 3, 2, False, True)
-    assert isinstance(surf, Surf) and surf.descriptorSize() == 64
-
-
-def test_setters_change_what_is_found():
-    surf = frontends.surf.create()
-    many = len(surf.detect(IMAGE))
-    surf.setHessianThreshold(5000)
-    surf.setNOctaves(2)
-    surf.setNOctaveLayers(2)
-    surf.setUpright(True)
-    keypoints, descriptors = surf.detectAndCompute(IMAGE)
-    other, same = Surf(5000, 2, 2).detectAndCompute(IMAGE)
-    assert 0 < len(keypoints) < many
-    assert len(other) == len(keypoints) and np.array_equal(descriptors, same)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [
-        ("HessianThreshold", -1, "threshold: must be"),
-        ("HessianThreshold", "a", "threshold: must be"),
-        ("NOctaves", 5, "octaves: must be 1 to 4"),
-        ("NOctaveLayers", 4, "layers: must be 2 or 3"),
-        ("Extended", True, "no descriptors of 128 numbers"),
-    ],
-)
-def test_what_this_surf_does_not_have_is_refused(name, value, words):
-    surf = frontends.surf.create()
-    with pytest.raises(ConfigurationError, match=words):
-        getattr(surf, f"set{name}")(value)
-    assert getattr(surf, f"get{name}")() == getattr(frontends.surf.create(), f"get{name}")()
+    c = frontends.surf.create(400, 3, 2, False, True).config
+    assert (c.threshold, c.octaves, c.layers, c.descriptor, c.upright) == (400.0, 3, 2, 64, True)
+    with pytest.raises(ConfigurationError, match="no descriptors of 128 numbers"):
+        frontends.surf.create(extended=True)
 
 
 def test_detect_and_compute_takes_opencv_s_arguments():

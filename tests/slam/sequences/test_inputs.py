@@ -235,12 +235,12 @@ def test_features_under_a_mask_are_not_used(tmp_path: Path) -> None:
         assert frame.left_mask is not None and frame.right_mask.all()
         features = system.frontend.extract(frame)
         assert len(features) > 50 and features.uv_left[:, 0].min() >= 150
-        strict = outside_masks(features, frame)
+        strict = outside_masks(features, frame, sequence.rig)
         assert strict.uv_left[:, 0].min() >= 159.5
         system.process(frame)
     right = open_sequence(with_mask(text, f",{tmp_path / 'left half.png'}"))
     frame = next(iter(right))
-    features = outside_masks(slam.StereoSlam(right.rig).frontend.extract(frame), frame)
+    features = outside_masks(slam.StereoSlam(right.rig).frontend.extract(frame), frame, right.rig)
     assert features.uv_left[:, 0].min() < 100
     assert np.nanmin(features.uv_right[:, 0]) >= 159.5
 
