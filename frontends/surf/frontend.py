@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
-from frontends.surf.correlation import align_patches, cut_patches, patch_windows, refine
+from frontends.surf.correlation import align, cut_patches, patch_windows
 from frontends.surf.epipolar import HalfImage, half_image, search_rows
 from frontends.surf.images import Picture, following_white, grey
 from frontends.surf.keypoints import Keypoints
@@ -100,9 +100,10 @@ class SurfFrontend:
     ) -> tuple[NDArray, NDArray]:
         """Where patches are in a later pair of images, see `slam.interfaces.AligningFrontend`."""
         size = patches.size
-        left = align_patches(
-            images.left, patches.images, patches.centres, warps, size, uv_left, _CORRELATION, _REACH, self._windows[0]
-        )
+        left = align(
+            patches.images, patches.centres, warps, images.left, size, uv_left, _CORRELATION,
+            np.full((1, 2), _REACH), self._windows[:1],
+        )  # fmt: skip
         if images.right is None:
             return left, np.full_like(left, np.nan)
         start = np.column_stack([uv_right[:, 0] + left[:, 0] - uv_left[:, 0], left[:, 1]])
@@ -188,7 +189,7 @@ class SurfFrontend:
         """Right pixels (N, 2) of left ones by correlation, NaN where they do not correlate."""
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
         reaches = np.array([(_REACH, self.config.epipolar), (_FINE_REACH, _FINE_REACH)])
-        return refine(left, right, uv, size, start, _CORRELATION, reaches, self._windows)
+        return align(left[None], uv, np.zeros((0, 2, 2)), right, size, start, _CORRELATION, reaches, self._windows)
 
     def _disparities(self) -> tuple[float, float]:
         """Range of disparities [px] of the rectified pair for the range of depths."""
