@@ -148,13 +148,11 @@ class SurfFrontend:
         It was adapted after the last image. Should it still find less than half of what is wanted, as in the first
         image or after the light went out, it is lowered at once.
         """
-        c = self.config
-        target = int((_CHOICE if c.localise else 1.0) * _SURPLUS * c.features)
+        target = int(_CHOICE * _SURPLUS * self.config.features)
         for _ in range(_TRIES):
             threshold = self._threshold
             keypoints = self._surf.detect(picture, self._masks[1], threshold)
-            if c.adaptive:
-                self._threshold = adapted_threshold(threshold, len(keypoints), target, *_THRESHOLDS)
+            self._threshold = adapted_threshold(threshold, len(keypoints), target, *_THRESHOLDS)
             if 2 * len(keypoints) >= target or self._threshold >= threshold:
                 break
         return keypoints, threshold
@@ -162,9 +160,8 @@ class SurfFrontend:
     def _keypoints(self, picture: Picture) -> tuple[Keypoints, float]:
         """Features of the left image, spread over it, and the D_threshold that found them."""
         keypoints, threshold = self._detect(picture)
-        if self.config.localise:
-            keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
-            keypoints = self._surf.localise(picture, keypoints)
+        keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
+        keypoints = self._surf.localise(picture, keypoints)
         return self._spread(keypoints, self.config.features), threshold
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:
