@@ -29,15 +29,6 @@ def bytes_of(features):
     return b"".join(a.tobytes() for a in arrays) + np.float64(features.threshold).tobytes()
 
 
-def test_by_name():
-    assert "surf" in frontends.names()
-    frontend = frontends.create("surf", RIG, features=123)
-    assert isinstance(frontend, Frontend)
-    assert frontend.config.features == 123
-    with pytest.raises(UnknownNameError, match="surf"):
-        frontends.create("sift", RIG)
-
-
 def test_fields():
     features = SurfFrontend(RIG, features=150).extract(StereoFrame(3, 1.5, LEFT, RIGHT))
     assert features.stamp == 1.5
