@@ -45,7 +45,7 @@ class SurfFrontend:
     """Detects SURF features in the left image, matches them along epipolar lines, and refines the right pixels.
 
     Args:
-        rig: the stereo rig; images that are not rectified are rectified, and results are in the rectified pair's pixels.
+        rig: the stereo rig; images that are not rectified are rectified. Results are in the rectified pair's pixels.
         **options: see `SurfConfig`.
 
     Raises:
@@ -180,9 +180,7 @@ class SurfFrontend:
         found[~((disparity >= low) & (disparity <= high)) | off_line] = np.nan
         return found
 
-    def _refine(
-        self, left: NDArray, right: NDArray, uv: NDArray, size: NDArray, start: NDArray
-    ) -> NDArray[np.float64]:
+    def _refine(self, left: NDArray, right: NDArray, uv: NDArray, size: NDArray, start: NDArray) -> NDArray[np.float64]:
         """Right pixels (N, 2) of left ones by correlation, NaN where they do not correlate."""
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
         reaches = np.array([(_REACH, self.config.epipolar), (_FINE_REACH, _FINE_REACH)])

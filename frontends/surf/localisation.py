@@ -101,7 +101,7 @@ def _sample(pixels, stride, x, y, size, bend, space, cube):
 
 @helper
 def _bends_down(c, curvature):
-    """Minus the Hessian (3, 3) of the responses, in units of the finite differences, factorised; False if no maximum."""
+    """Minus the Hessian (3, 3) of the responses, in units of the differences, factorised; False if no maximum."""
     v = 2.0 * c[1, 1, 1]
     curvature[0, 0] = v - c[1, 1, 0] - c[1, 1, 2]
     curvature[1, 1] = v - c[1, 0, 1] - c[1, 2, 1]

@@ -8,12 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-import frontends
 from frontends.surf import SurfFrontend
 from slam.data import StereoFrame
-from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam.errors import ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
-from slam.interfaces import Frontend
 from tests.frontends.scenes import stereo_pair
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
