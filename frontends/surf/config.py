@@ -24,8 +24,8 @@ class SurfConfig:
 
     Attributes:
         features: number of features aimed at in the left image.
-        threshold: D_threshold (paper A, III.A) on OpenCV's scale for 8-bit images; a front end begins with it, and adapts
-            it from frame to frame to keep the number of features.
+        threshold: D_threshold (paper A, III.A) on OpenCV's scale for 8-bit images; a front end begins with it, and
+            adapts it from frame to frame to keep the number of features.
         octaves: number of octaves, 1 to 4 (paper A: 2).
         layers: number of layers searched in each octave, 2 or 3.
         descriptor: dimensions of the descriptors, 16 (paper A, III.B) or 64.

@@ -131,7 +131,8 @@ class SurfFrontend:
             return image
         import cv2
 
-        return cv2.remap(image, *self.rig.rectified.maps[side], cv2.INTER_LINEAR)
+        columns, rows = self.rig.rectified.maps[side]
+        return cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
 
     def _rectified_mask(self, mask: NDArray | None) -> NDArray | None:
         """The mask of a frame in the rectified left image."""
