@@ -38,10 +38,9 @@ OBJECTS = {
 }
 
 #: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does; nothing comes
-#: within a metre of the cameras of a car. Hand-held, errors with 400 features are those with 800, for two thirds of the
-#: time; a recorded drive is a third farther off.
+#: within a metre of the cameras of a car.
 FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
-    ("handheld", "surf"): {"upright": False, "features": 400},
+    ("handheld", "surf"): {"upright": False},
     ("driving", "surf"): {"upright": True, "min_depth": 1.0},
 }
 
