@@ -155,9 +155,12 @@ def _correlate(image, stride, y, first, count, own, space):
 @vector_helper
 def _largest(scores, count):
     """Largest of the first scores, and the first column that has it."""
-    largest, column = scores[0], 0
-    for j in range(1, count):
-        largest = scores[j] if scores[j] > largest else largest
+    a = b = c = d = scores[0]
+    for j in range(0, count - 3, 4):  # four chains: each step of one waits for the step before
+        a, b, c, d = max(a, scores[j]), max(b, scores[j + 1]), max(c, scores[j + 2]), max(d, scores[j + 3])
+    for j in range(count - count % 4, count):
+        a = max(a, scores[j])
+    largest, column = max(max(a, b), max(c, d)), 0
     while scores[column] != largest:
         column += 1
     return largest, column
@@ -239,12 +242,13 @@ def _search(image, shape, band, y, first, last, own, limits, space):
         if score < min_correlation:
             continue
         harmless = one - unresolved - (one - score) / uniqueness  # a rival up to this height is none
+        least, own_place = np.float32(_CONTENDER) * harmless, best if better else -1
         for j in range(count):
-            s, itself = scores[j], better and j == best
-            if not itself and (s < _CONTENDER * harmless or abs(first + j - found) <= _NEIGHBOURS):
+            s, itself = scores[j], j == own_place
+            if s < least and not itself:
                 continue
             before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
-            if not itself and (s < before or s < after):
+            if not itself and (s < before or s < after or abs(first + j - found) <= _NEIGHBOURS):
                 continue
             side = 1 if after >= before or first + j == _HALF else -1
             top = _height(image, stride, v, first + j, own, s, side, space)
