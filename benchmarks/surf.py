@@ -1,7 +1,7 @@
-"""The SURF front end against OpenCV's SIFT and ORB: speed, quality, stereo.
+"""The SURF front end against OpenCV's SIFT and ORB: speed and quality.
 
-``python benchmarks/surf.py``               all of it, as ratios of medians of CPU time in one run
-``python benchmarks/surf.py speed stereo``  some of: speed quality stereo
+``python benchmarks/surf.py``        all of it, as ratios of medians of CPU time in one run
+``python benchmarks/surf.py speed``  one of: speed quality
 
 Uses the images under the environment variable SLAM_DATA where it is set, else rendered ones.
 """
@@ -21,9 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
-from benchmarks.plain_surf import plain_descriptors
-from frontends.surf import Surf, SurfFrontend
-from slam.geometry.rig import StereoRig
+from frontends.surf import Surf
 
 SIZES = ((320, 240), (752, 480), (1241, 376))
 DATA = Path(os.environ["SLAM_DATA"]) if os.environ.get("SLAM_DATA") else None
@@ -115,10 +113,8 @@ def changes(size: tuple[int, int]) -> dict[str, tuple[np.ndarray, Callable[[np.n
 Found = tuple[np.ndarray, np.ndarray, np.ndarray]  # pixels (N, 2), sizes (N,), descriptors (N, D)
 
 
-def surf_method(
-    threshold: float, count: int, plain: bool = False, localise: bool = False, **options: object
-) -> Callable:
-    """Our features; with the reference's descriptors where `plain`."""
+def surf_method(threshold: float, count: int, localise: bool = False, **options: object) -> Callable:
+    """Our features."""
     surf = Surf(threshold, **options)  # type: ignore[arg-type]
 
     def run(image: np.ndarray) -> Found:
@@ -126,8 +122,6 @@ def surf_method(
         if localise:
             keypoints = surf.localise(image, keypoints)
         keypoints, descriptors = surf.describe(image, keypoints.select(np.arange(min(count, len(keypoints)))))
-        if plain:
-            descriptors = plain_descriptors(image, keypoints.uv, keypoints.size, keypoints.angle)
         return keypoints.uv, keypoints.size, descriptors
 
     return run
@@ -173,7 +167,6 @@ def quality() -> None:
     threshold = 100.0
     methods = {
         "64-D oriented": surf_method(threshold, 500, upright=False),
-        "reference": surf_method(threshold, 500, plain=True, upright=False),
         "16-D oriented": surf_method(threshold, 500, upright=False, descriptor=16),
         "64-D upright": surf_method(threshold, 500),
         "16-D upright": surf_method(threshold, 500, descriptor=16),
@@ -193,91 +186,7 @@ def quality() -> None:
     print("| mean | " + " | ".join(f"{r:.3f} / {m:.3f} / {e:.2f}" for r, m, e in np.mean(rows, axis=0)) + " |")
 
 
-def edges(values: np.ndarray, reach: int = 6) -> np.ndarray:
-    """Pixels (H, W) with a step of depth, or disparity, by more than 3 % from pixel to pixel within `reach`."""
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    step = cv2.morphologyEx(values.astype(np.float32), cv2.MORPH_GRADIENT, cross) > 0.03 * np.maximum(values, 1e-6)
-    return cv2.dilate(step.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
-
-
-def disparity_errors(features: slam.StereoFeatures, truth: np.ndarray) -> np.ndarray:
-    """Errors [px] of the matched disparities (3, N), by a table (H, W) of true ones with NaN where unknown.
-
-    At the feature's own pixel; against whichever surface within 5 px is nearest, since what shows at the pixel of a
-    feature on a depth edge need not be what it is the image of; and at its own pixel away from such edges, else NaN.
-    """
-    matched = features.has_stereo
-    u, v = np.rint(features.uv_left[matched]).astype(int).T
-    disparity = (features.uv_left - features.uv_right)[matched, 0]
-    around = np.pad(truth, 5, constant_values=np.nan)
-    offsets = [(i, j) for i in range(11) for j in range(11)]
-    nearest = np.fmin.reduce([np.abs(disparity - around[v + i, u + j]) for i, j in offsets])
-    own = np.abs(disparity - truth[v, u])
-    on_surface = np.where(edges(np.nan_to_num(truth))[v, u], np.nan, own)
-    return np.stack([own, nearest, on_surface])[:, np.isfinite(own)]
-
-
-def summary(own: np.ndarray, nearest: np.ndarray, on_surface: np.ndarray) -> str:
-    """The errors of `disparity_errors` in words."""
-    on_surface = on_surface[np.isfinite(on_surface)]
-    return (
-        f"{np.mean(own < 1):.3f} of them within 1 px ({np.mean(nearest < 1):.3f} of a surface within 5 px), median "
-        f"error {np.median(own):.3f} px; away from depth edges ({len(on_surface) / len(own):.2f} of them) "
-        f"{np.mean(on_surface < 1):.3f} and {np.median(on_surface):.3f} px"
-    )
-
-
-def stereo() -> None:
-    """Stereo matches on pairs with known disparity, and the epipolar residual on recorded ones."""
-    print("\n## Stereo\n")
-    for world in ("aisle", "desk", "street"):
-        sequence = slam.open_sequence(f"synthetic:{world}?frames=60")
-        rig, frontend = sequence.rig, SurfFrontend(sequence.rig)
-        shares, errors = [], []
-        for k in range(0, 60, 10):
-            features = frontend.extract(sequence.frame(k))
-            with np.errstate(divide="ignore"):
-                truth = rig.left.fu * rig.baseline / sequence.depth(k)
-            shares.append(features.has_stereo.mean())
-            errors.append(disparity_errors(features, np.where(np.isfinite(truth), truth, np.nan)))
-        print(f"rendered {world}: {np.mean(shares):.3f} of the features matched, {summary(*np.hstack(errors))}")
-    if DATA:
-        middlebury(DATA / "middlebury_motorcycle")
-        kitti(DATA / "kitti_odometry" / "sequences" / "06")
-
-
-def middlebury(folder: Path) -> None:
-    """Motorcycle of the Middlebury 2014 set."""
-    left, right = (cv2.imread(str(folder / f"motorcycle_{side}.png")) for side in ("left", "right"))
-    with np.load(folder / "motorcycle_disp.npz") as file:
-        truth = file[file.files[0]].astype(float)
-    truth[~np.isfinite(truth)] = np.nan
-    height, width = truth.shape
-    rig = StereoRig.rectified_pair(994.978, 311.193, 254.877, 0.193001, width, height, doffs=31.086)
-    features = SurfFrontend(rig).extract(slam.StereoFrame(0, 0.0, left, right))
-    print(
-        f"Middlebury motorcycle: {features.has_stereo.mean():.3f} of the features matched, "
-        f"{summary(*disparity_errors(features, truth))}"
-    )
-
-
-def kitti(folder: Path) -> None:
-    """Distance from the epipolar line; the median is the data set's own rectification."""
-    sequence = slam.open_sequence(folder)
-    frontend = SurfFrontend(sequence.rig)
-    shares, rows = [], []
-    for frame in sequence:
-        features = frontend.extract(frame)
-        shares.append(features.has_stereo.mean())
-        rows.append((features.uv_right - features.uv_left)[features.has_stereo, 1])
-    off = np.concatenate(rows)
-    print(
-        f"KITTI 06: {np.mean(shares):.3f} matched, {np.mean(np.abs(off) < 1):.3f} within 1 px of the epipolar line "
-        f"(median {np.median(off):+.3f} px, deviation {1.48 * np.median(np.abs(off - np.median(off))):.3f} px)"
-    )
-
-
-SECTIONS = {f.__name__: f for f in (speed, quality, stereo)}
+SECTIONS = {f.__name__: f for f in (speed, quality)}
 
 
 def main() -> None:

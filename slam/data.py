@@ -84,6 +84,7 @@ class StereoFeatures:
         descriptors: unit vectors (N, D) float32.
         threshold: the detector's D_threshold in force (paper A, III.A); NaN where there is none.
         images: in which the features were found, kept for alignment; None if not kept.
+        rectified: whether pixels are those of the rectified pair, not of the rig's own images.
     """
 
     stamp: float
@@ -96,6 +97,7 @@ class StereoFeatures:
     descriptors: NDArray[np.float32]
     threshold: float = float("nan")
     images: ImagePair | None = field(default=None, repr=False, compare=False)
+    rectified: bool = False
 
     def __len__(self) -> int:
         return len(self.uv_left)

@@ -26,7 +26,7 @@ class Frontend(Protocol):
     """Turns a pair of images into features. Created as ``Frontend(rig, **options)``."""
 
     def extract(self, frame: StereoFrame) -> StereoFeatures:
-        """Features of one stereo frame, in pixels of the rig's own images.
+        """Features of one stereo frame, in pixels of the rig's own images or, if marked so, of its rectified pair.
 
         An image without features, or a missing right image, is no error: the result has fewer rows, or none.
 

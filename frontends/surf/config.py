@@ -24,14 +24,12 @@ class SurfConfig:
 
     Attributes:
         features: number of features aimed at in the left image.
-        threshold: D_threshold at the start (paper A, III.A), on OpenCV's scale for 8-bit images.
-        adaptive: adapt D_threshold from frame to frame to keep the number of features.
+        threshold: D_threshold (paper A, III.A) on OpenCV's scale for 8-bit images; a front end begins with it, and
+            adapts it from frame to frame to keep the number of features.
         octaves: number of octaves, 1 to 4 (paper A: 2).
         layers: number of layers searched in each octave, 2 or 3.
         descriptor: dimensions of the descriptors, 16 (paper A, III.B) or 64.
         upright: features have no orientation; for cameras that do not roll.
-        localise: find position and size in a continuous scale space: features stay in place when the image moves
-            or grows, at some cost in time.
         min_depth, max_depth: range of depths [m] looked for in stereo matching; max_depth may be infinite.
         epipolar: largest distance of the right pixel from the epipolar line [px].
         threads: number of threads; the results do not depend on it.
@@ -42,12 +40,10 @@ class SurfConfig:
 
     features: int = 800
     threshold: float = 300.0
-    adaptive: bool = True
     octaves: int = 2
     layers: int = 2
     descriptor: int = 64
     upright: bool = True
-    localise: bool = True
     min_depth: float = 0.3
     max_depth: float = float("inf")
     epipolar: float = 1.5

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.filters import Filters
-from frontends.surf.integral import column_phases
 from slam.runtime.compilation import helper, kernel, vector_helper
 
 #: fixed: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
@@ -172,6 +171,22 @@ def _collect(space, pixels, stride, filters, layer, row, out, found):
     return found
 
 
+def _column_phases(integral: NDArray[np.int32], step: int, first: int, last: int) -> NDArray[np.int32]:
+    """The columns of an integral image sorted by their remainder: ``out[p, y, j] = integral[y, step * j + p]``.
+
+    A filter that moves in steps of `step` then reads neighbouring memory. Shape (step, H+1, ceil((W+1) / step)); only
+    the rows from `first` to before `last` are filled in, and columns beyond the image are not.
+    """
+    rows, columns = integral.shape
+    if step == 1:
+        return integral[None]
+    out = np.empty((step, rows, -(-columns // step)), np.int32)
+    for p in range(step):
+        phase = integral[first:last, p::step]
+        out[p, first:last, : phase.shape[1]] = phase
+    return out
+
+
 def detect_octave(
     integral: NDArray[np.int32], filters: Filters, octave: int, threshold: float, first_row: int, last_row: int
 ) -> NDArray[np.float64]:
@@ -181,7 +196,7 @@ def detect_octave(
         Candidates (N, COLUMNS) in raster order of the grid.
     """
     top, bottom = first_row - 1 - filters.centre[-2], last_row + 1 + filters.centre[-2]  # that inner layers read
-    phases = column_phases(integral, filters.step, max(top, 0) * filters.step, (bottom + 1) * filters.step)
+    phases = _column_phases(integral, filters.step, max(top, 0) * filters.step, (bottom + 1) * filters.step)
     found = _scan(integral, phases, filters, np.float32(threshold), first_row, last_row)
     found[:, 5] = octave
     return found

@@ -26,8 +26,6 @@ class _Space(NamedTuple):
     between: NDArray[np.float32]  # and half a column beside it
     side: int  # of a patch; no constant here, or its loops would be unrolled instead of running on vector registers
     scores: NDArray[np.float32]  # correlations with the places
-    marks: NDArray[np.bool_]  # which of these may be rivals of the best one
-    words: NDArray[np.uint64]  # eight marks each
 
 
 class HalfImage(NamedTuple):
@@ -155,37 +153,17 @@ def _correlate(image, stride, y, first, count, own, space):
 
 
 @vector_helper
-def _largest(scores, first, last):
-    """Largest score from `first` to before `last`; -1 where there is none."""
-    a = b = c = d = np.float32(-1.0)
-    for j in range(first, last - 3, 4):  # four chains: each step of one waits for the step before
-        a, b = max(a, scores[j]), max(b, scores[j + 1])
-        c, d = max(c, scores[j + 2]), max(d, scores[j + 3])
-    for j in range(max(first, last - 3), last):
+def _largest(scores, count):
+    """Largest of the first scores, and the first column that has it."""
+    a = b = c = d = scores[0]
+    for j in range(0, count - 3, 4):  # four chains: each step of one waits for the step before
+        a, b, c, d = max(a, scores[j]), max(b, scores[j + 1]), max(c, scores[j + 2]), max(d, scores[j + 3])
+    for j in range(count - count % 4, count):
         a = max(a, scores[j])
-    return max(max(a, b), max(c, d))
-
-
-@helper
-def _place_of(scores, value):
-    """Column of the first score with a value that there is."""
-    j = 0
-    while scores[j] != value:
-        j += 1
-    return j
-
-
-@vector_helper
-def _mark_contenders(scores, count, least, marks):
-    """Mark the local maxima of at least some score; `scores` goes on beyond its end."""
-    for j in range(1, count - 1):
-        s = scores[j]
-        marks[j] = (s >= least) & (s >= scores[j - 1]) & (s >= scores[j + 1])
-    marks[0] = (scores[0] >= least) & ((count < 2) | (scores[0] >= scores[1]))
-    if count > 1:
-        marks[count - 1] = (scores[count - 1] >= least) & (scores[count - 1] >= scores[count - 2])
-    for j in range(count, (count + 7) & -8):
-        marks[j] = False
+    largest, column = max(max(a, b), max(c, d)), 0
+    while scores[column] != largest:
+        column += 1
+    return largest, column
 
 
 @vector_helper
@@ -250,42 +228,34 @@ def _search(image, shape, band, y, first, last, own, limits, space):
     with the best places between columns: a wrong place of a repeated pattern that happens to lie on a whole column
     looks better than the true one that does not.
     """
-    scores, marks, words = space.scores, space.marks, space.words
-    min_correlation, uniqueness, unresolved = limits
-    rows, stride = shape
-    begin, count = np.int64(0), last - first + 1  # no literal number: Numba would compile a helper again for it
-    one = np.float32(1.0)
+    scores, (min_correlation, uniqueness, unresolved), (rows, stride) = space.scores, limits, shape
+    count, one = last - first + 1, np.float32(1.0)  # no literal number: Numba would compile a helper again for it
     found, row, score, height, rival = -1, -1, np.float32(-1.0), np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
         _correlate(image, stride, v, first, count, own, space)
-        best = _largest(scores, begin, count)
-        better = best > score
+        largest, best = _largest(scores, count)
+        better = largest > score
         if better:
-            place = first + _place_of(scores, best)
-            if abs(place - found) > _NEIGHBOURS:
+            if abs(first + best - found) > _NEIGHBOURS:
                 rival = max(rival, height)
-            found, row, score = place, v, best
+            found, row, score = first + best, v, largest
         if score < min_correlation:
             continue
         harmless = one - unresolved - (one - score) / uniqueness  # a rival up to this height is none
-        _mark_contenders(scores, count, _CONTENDER * harmless, marks)
-        if better:
-            marks[found - first] = True
-        for word in range((count + 7) // 8):
-            if words[word] == 0:
+        least, own_place = np.float32(_CONTENDER) * harmless, best if better else -1
+        for j in range(count):
+            s, itself = scores[j], j == own_place
+            if s < least and not itself:
                 continue
-            for j in range(8 * word, 8 * word + 8):
-                itself = better and first + j == found
-                if not marks[j] or not (itself or abs(first + j - found) > _NEIGHBOURS):
-                    continue
-                s = scores[j]
-                before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
-                side = 1 if after >= before or first + j == _HALF else -1
-                top = _height(image, stride, v, first + j, own, s, side, space)
-                if itself:
-                    height = top
-                else:
-                    rival = max(rival, top)
+            before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
+            if not itself and (s < before or s < after or abs(first + j - found) <= _NEIGHBOURS):
+                continue
+            side = 1 if after >= before or first + j == _HALF else -1
+            top = _height(image, stride, v, first + j, own, s, side, space)
+            if itself:
+                height = top
+            else:
+                rival = max(rival, top)
     if score < min_correlation or one - height > uniqueness * (one - rival - unresolved):
         return -1, -1
     return found, row
@@ -312,10 +282,10 @@ def search_rows(left, right, uv, low, high, band, min_correlation, uniqueness):
     low, high = 0.5 * low, 0.5 * high
     height, width = left.shape
     least, most = np.float32(min_correlation), np.float32(uniqueness)
-    words = np.zeros(width // 8 + 1, np.uint64)
-    patch, pixels, between = np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32)
-    scores = np.empty(width + _LANES, np.float32)
-    space = _Space(patch, pixels, between, _SIDE, scores, words.view(np.bool_), words)
+    space = _Space(
+        np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32), np.zeros(_PADDED, np.float32), _SIDE,
+        np.empty(width + _LANES, np.float32),
+    )  # fmt: skip
     for i in range(len(uv)):
         px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
         x, y = int(np.rint(px)), int(np.rint(py))

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
-from frontends.surf.correlation import align_patches, cut_patches, patch_windows, refine
+from frontends.surf.correlation import align, cut_patches, patch_windows
 from frontends.surf.epipolar import HalfImage, half_image, search_rows
-from frontends.surf.images import FullScale, grey
-from frontends.surf.integral import integral_image
+from frontends.surf.images import Picture, following_white, grey
 from frontends.surf.keypoints import Keypoints
 from frontends.surf.selection import adapted_threshold, spread
 from frontends.surf.surf import Surf
@@ -35,19 +34,18 @@ _OWN_BAND = 1.5  # rows [px] that the search reaches without looking into neighb
 
 
 class _View(NamedTuple):
-    """A rectified image: as it came, as float32, and at half resolution if it is one of two; what counts as white."""
+    """A rectified image."""
 
-    grey: NDArray
-    pixels: NDArray[np.float32]
-    half: HalfImage | None
-    white: float
+    picture: Picture
+    pixels: NDArray[np.float32]  # the same in float32
+    half: HalfImage | None  # at half resolution, if it is one of two
 
 
 class SurfFrontend:
     """Detects SURF features in the left image, matches them along epipolar lines, and refines the right pixels.
 
     Args:
-        rig: the stereo rig; images that are not rectified are rectified inside, results are in the rig's own pixels.
+        rig: the stereo rig; images that are not rectified are rectified. Results are in the rectified pair's pixels.
         **options: see `SurfConfig`.
 
     Raises:
@@ -56,12 +54,10 @@ class SurfFrontend:
 
     def __init__(self, rig: StereoRig, **options: Any) -> None:
         self.rig = rig
-        self.config = config = from_options(SurfConfig, "surf", options)
-        self._surf = Surf(
-            config.threshold, config.octaves, config.layers, config.descriptor, config.upright, config.threads
-        )
-        self._threshold = float(np.clip(config.threshold, *_THRESHOLDS))
-        self._white = FullScale()
+        self.config = c = from_options(SurfConfig, "surf", options)
+        self._surf = Surf(c.threshold, c.octaves, c.layers, c.descriptor, c.upright, c.threads)
+        self._threshold = float(np.clip(c.threshold, *_THRESHOLDS))
+        self._white = 0.0
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
         self._masks: tuple[NDArray | None, NDArray | None] = None, None  # of the last frame: as given, and rectified
 
@@ -78,28 +74,21 @@ class SurfFrontend:
             self._masks = frame.left_mask, self._rectified_mask(frame.left_mask)
         given = [frame.left] if frame.right is None else [frame.left, frame.right]
         given = [self._checked(frame, image, side) for side, image in enumerate(given)]
-        white, paired = self._white.of(given[0]), len(given) > 1
-        views = self._surf.workers.run([partial(self._view, image, k, white, paired) for k, image in enumerate(given)])
-        integral = integral_image(views[0].grey)
-        keypoints, threshold = self._keypoints(views[0], integral)
-        describe = self._surf.describer(integral, keypoints)
+        self._white = white = following_white(given[0], self._white)
+        views = self._surf.workers.run([partial(self._view, image, k, white, len(given) > 1)
+                                        for k, image in enumerate(given)])  # fmt: skip
+        left = views[0].picture
+        keypoints, threshold = self._keypoints(left)
+        keypoints, descriptors = self._surf.describe(left, keypoints)
         images = ImagePair(views[0].pixels, None if frame.right is None else views[1].pixels)
-
-        def finish(first: int, last: int) -> tuple[NDArray, ...]:
-            """Angles, descriptors and right pixels of some of the features."""
-            uv, size = keypoints.uv[first:last], keypoints.size[first:last]
-            right = np.full(uv.shape, np.nan) if images.right is None else self._match(views, images, uv, size)
-            return *describe(first, last), right
-
-        angles, descriptors, uv_right = map(np.concatenate, zip(*self._surf.workers.over(len(keypoints), finish)))
-        good = np.isfinite(angles)
-        uv, uv_right = keypoints.uv[good], uv_right[good]
-        if not self.rig.is_rectified:
-            uv, uv_right = self.rig.rectified.unrectify_left(uv), self.rig.rectified.unrectify_right(uv_right)
-        angles = np.zeros(len(uv)) if self.config.upright else angles[good]
+        uv, size = keypoints.uv, keypoints.size
+        right = np.full_like(uv, np.nan)
+        if frame.right is not None:
+            (right,) = self._surf.workers.over(len(uv), lambda a, b: (self._match(views, uv[a:b], size[a:b]),))
+        angle = np.zeros(len(uv)) if self.config.upright else keypoints.angle
         return StereoFeatures(
-            frame.stamp, uv, uv_right, keypoints.size[good], angles, keypoints.response[good],
-            keypoints.laplacian[good], descriptors[good], threshold, images,
+            frame.stamp, uv, right, size, angle, keypoints.response, keypoints.laplacian, descriptors, threshold,
+            images, rectified=True,
         )  # fmt: skip
 
     def patches(self, images: ImagePair, uv_left: NDArray, size: NDArray) -> Patches:
@@ -111,13 +100,14 @@ class SurfFrontend:
     ) -> tuple[NDArray, NDArray]:
         """Where patches are in a later pair of images, see `slam.interfaces.AligningFrontend`."""
         size = patches.size
-        left = align_patches(
-            images.left, patches.images, patches.centres, warps, size, uv_left, _CORRELATION, _REACH, self._windows[0]
-        )
+        left = align(
+            patches.images, patches.centres, warps, images.left, size, uv_left, _CORRELATION,
+            np.full((1, 2), _REACH), self._windows[:1],
+        )  # fmt: skip
         if images.right is None:
             return left, np.full_like(left, np.nan)
         start = np.column_stack([uv_right[:, 0] + left[:, 0] - uv_left[:, 0], left[:, 1]])
-        return left, self._refine(images, left, size, start)
+        return left, self._refine(images.left, images.right, left, size, start)
 
     def _checked(self, frame: StereoFrame, image: NDArray, side: int) -> NDArray:
         """The image of the left (0) or right (1) camera in grey."""
@@ -131,9 +121,9 @@ class SurfFrontend:
         return image
 
     def _view(self, image: NDArray, side: int, white: float, paired: bool) -> _View:
-        """What is needed of the rectified image of the left (0) or right (1) camera."""
+        """What is needed of the image of the left (0) or right (1) camera."""
         image = self._rectify(image, side)
-        return _View(image, image.astype(np.float32), half_image(image, white) if paired else None, white)
+        return _View(Picture(image, white), image.astype(np.float32), half_image(image, white) if paired else None)
 
     def _rectify(self, image: NDArray, side: int) -> NDArray:
         """Image of the rectified rig's left (0) or right (1) camera."""
@@ -141,67 +131,61 @@ class SurfFrontend:
             return image
         import cv2
 
-        return cv2.remap(image, self.rig.rectified.maps[side], None, cv2.INTER_LINEAR)
+        columns, rows = self.rig.rectified.maps[side]
+        return cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
 
-    def _rectified_mask(self, mask: NDArray | None) -> NDArray[np.uint8] | None:
-        """The mask of a frame, 0 and 1, in the rectified left image."""
+    def _rectified_mask(self, mask: NDArray | None) -> NDArray | None:
+        """The mask of a frame in the rectified left image."""
         if mask is None:
             return None
         if mask.shape != (self.rig.height, self.rig.width):
             size = "x".join(str(n) for n in mask.shape[::-1])
             raise SequenceError(f"mask: {size}, but the images are {self.rig.width}x{self.rig.height}")
-        return (self._rectify((mask != 0).astype(np.uint8), 0) != 0).astype(np.uint8)
+        return self._rectify((mask != 0).astype(np.uint8), 0)
 
-    def _detect(self, white: float, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
+    def _detect(self, picture: Picture) -> tuple[Keypoints, float]:
         """Features, and the D_threshold that found them (paper A, III.A).
 
         It was adapted after the last image. Should it still find less than half of what is wanted, as in the first
         image or after the light went out, it is lowered at once.
         """
-        c = self.config
-        target = int((_CHOICE if c.localise else 1.0) * _SURPLUS * c.features)
+        target = int(_CHOICE * _SURPLUS * self.config.features)
         for _ in range(_TRIES):
             threshold = self._threshold
-            keypoints = self._surf.detect_in(integral, white, self._masks[1], threshold)
-            if c.adaptive:
-                self._threshold = adapted_threshold(threshold, len(keypoints), target, *_THRESHOLDS)
+            keypoints = self._surf.detect(picture, self._masks[1], threshold)
+            self._threshold = adapted_threshold(threshold, len(keypoints), target, *_THRESHOLDS)
             if 2 * len(keypoints) >= target or self._threshold >= threshold:
                 break
         return keypoints, threshold
 
-    def _keypoints(self, view: _View, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
+    def _keypoints(self, picture: Picture) -> tuple[Keypoints, float]:
         """Features of the left image, spread over it, and the D_threshold that found them."""
-        keypoints, threshold = self._detect(view.white, integral)
-        if self.config.localise:
-            keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
-            keypoints = self._surf.localise_in(view.grey, keypoints, view.white)
+        keypoints, threshold = self._detect(picture)
+        keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
+        keypoints = self._surf.localise(picture, keypoints)
         return self._spread(keypoints, self.config.features), threshold
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:
         """At most `limit` features, spread over the image."""
         return keypoints.select(spread(keypoints.uv, limit, _GRID, (self.rig.width, self.rig.height)))
 
-    def _match(self, views: list[_View], images: ImagePair, uv: NDArray, size: NDArray) -> NDArray[np.float64]:
+    def _match(self, views: list[_View], uv: NDArray, size: NDArray) -> NDArray[np.float64]:
         """Right pixels (N, 2) of left features in the rectified images, NaN where unmatched."""
-        c = self.config
+        c, (left, right) = self.config, views
         low, high = self._disparities()
         band = max(int(np.rint(0.5 * (c.epipolar - _OWN_BAND))), 0)
-        left, right = views[0].half, views[1].half
-        assert left is not None and right is not None
-        start = search_rows(left, right, uv, low, high, band, _COARSE * _CORRELATION, _UNIQUENESS)
-        found = self._refine(images, uv, size, start)
+        start = search_rows(left.half, right.half, uv, low, high, band, _COARSE * _CORRELATION, _UNIQUENESS)
+        found = self._refine(left.pixels, right.pixels, uv, size, start)
         disparity = uv[:, 0] - found[:, 0]
         off_line = np.abs(found[:, 1] - uv[:, 1]) > c.epipolar
         found[~((disparity >= low) & (disparity <= high)) | off_line] = np.nan
         return found
 
-    def _refine(self, images: ImagePair, uv: NDArray, size: NDArray, start: NDArray) -> NDArray[np.float64]:
+    def _refine(self, left: NDArray, right: NDArray, uv: NDArray, size: NDArray, start: NDArray) -> NDArray[np.float64]:
         """Right pixels (N, 2) of left ones by correlation, NaN where they do not correlate."""
-        c = self.config
-        assert images.right is not None
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
-        reaches = np.array([(_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)])
-        return refine(images.left, images.right, uv, size, start, _CORRELATION, reaches, self._windows)
+        reaches = np.array([(_REACH, self.config.epipolar), (_FINE_REACH, _FINE_REACH)])
+        return align(left[None], uv, np.zeros((0, 2, 2)), right, size, start, _CORRELATION, reaches, self._windows)
 
     def _disparities(self) -> tuple[float, float]:
         """Range of disparities [px] of the rectified pair for the range of depths."""

@@ -1,6 +1,9 @@
-"""Any image a camera gives, as the grey, contiguous array that the kernels read."""
+"""Any image a camera gives, as the grey, contiguous array that the kernels read, with its integral image."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +14,38 @@ from slam.grey_range import grey_range
 _FALL = 0.98  # of the grey value that counts as white, from image to image
 
 #: Largest pixel value by type: responses are on the scale of 8-bit images.
-FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
+_FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A grey image, ready for detection and description."""
+
+    grey: NDArray  # (H, W) uint8 or uint16, C-contiguous
+    white: float  # grey value that counts as white
+
+    @classmethod
+    def of(cls, image: NDArray | Picture, what: str = "image") -> Picture:
+        """From an image in grey, BGR or BGRA of any layout.
+
+        Raises:
+            SequenceError: not an array (H, W), (H, W, 3|4), uint8 or uint16; the line begins with `what`.
+        """
+        if isinstance(image, Picture):
+            return image
+        pixels = grey(image, what)
+        return cls(pixels, _FULL_SCALE[pixels.dtype])
+
+    @cached_property
+    def integral(self) -> NDArray[np.int32]:
+        """Integral image, see `integral_image`."""
+        return integral_image(self.grey)
 
 
 def grey(image: NDArray, what: str = "image") -> NDArray:
-    """A grey image (H, W), C-contiguous and writeable, uint8 or uint16, from grey, BGR or BGRA of any layout.
-
-    Raises:
-        SequenceError: not an array of such a shape and type; the line begins with `what`.
-    """
+    """A grey image (H, W), C-contiguous and writeable, see `Picture.of`."""
     image = np.asarray(image)
-    if image.dtype.newbyteorder("=") not in FULL_SCALE:
+    if image.dtype.newbyteorder("=") not in _FULL_SCALE:
         raise SequenceError(f"{what}: pixels must be uint8 or uint16, not {image.dtype}")
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.ndim not in (2, 3) or channels not in (1, 3, 4):
@@ -36,34 +60,37 @@ def grey(image: NDArray, what: str = "image") -> NDArray:
     return cv2.cvtColor(native, cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY)
 
 
-class FullScale:
-    """The grey value that counts as white: for 16-bit images it follows the range that they use.
+def integral_image(image: NDArray) -> NDArray[np.int32]:
+    """Integral image (H+1, W+1) int32 of a grey image (H, W): ``sum(y, x) = image[:y, :x].sum()``.
 
-    Thresholds on contrast are on the scale of 8-bit images. A camera that uses a small part of 16 bits would be below
-    all of them. White is twice the used range, and the type's largest value at most: images that use half of their
-    type's range are not scaled. It falls slowly, so that views of little contrast in between keep their scale.
+    Sums wrap around modulo 2**32. Differences of them stay exact as long as one box sum fits 31 bits, which it does
+    for every filter size in use, also with 16-bit pixels.
     """
+    if not image.size:
+        return np.zeros((image.shape[0] + 1, image.shape[1] + 1), np.int32)
+    if image.dtype != np.uint8:  # exact below 2**53
+        return float_integral_image(image).astype(np.int64).astype(np.int32)
+    import cv2
 
-    def __init__(self) -> None:
-        self._last = 0.0
-
-    def of(self, image: NDArray) -> float:
-        """White of an image (H, W) or (H, W, C), uint8 or uint16, the next one of its camera."""
-        most = FULL_SCALE[image.dtype.newbyteorder("=")]
-        if image.dtype.itemsize == 1:
-            return most
-        low, high = grey_range(image)
-        self._last = min(max(2.0 * (high - low), _FALL * self._last, FULL_SCALE[np.dtype(np.uint8)]), most)
-        return self._last
+    return cv2.integral(image, sdepth=cv2.CV_32S)
 
 
-def binary_mask(mask: NDArray, shape: tuple[int, ...], what: str = "mask") -> NDArray[np.uint8]:
-    """A mask (H, W) as 0 and 1.
+def float_integral_image(image: NDArray) -> NDArray[np.float64]:
+    """The same of a grey image that is not empty, in float64, which may be interpolated: no sum wraps around."""
+    import cv2
 
-    Raises:
-        SequenceError: the mask's shape is not the image's.
+    return cv2.integral(image, sdepth=cv2.CV_64F)
+
+
+def following_white(image: NDArray, last: float) -> float:
+    """The grey value that counts as white in an image (H, W), uint8 or uint16, `last` in the image before.
+
+    Thresholds on contrast are on the scale of 8-bit images. A 16-bit camera that uses a small part of its range would
+    be below all of them, so white follows the range in use. It is twice that, and the type's largest value at most:
+    images that use half of their type's range are not scaled. It falls slowly, so that views of little contrast in
+    between keep their scale.
     """
-    mask = np.asarray(mask)
-    if mask.shape != shape:
-        raise SequenceError(f"{what}: shape {mask.shape} is not the image's, {shape}")
-    return (mask != 0).astype(np.uint8)
+    if image.dtype == np.uint8:
+        return 255.0
+    low, high = grey_range(image)
+    return min(max(2.0 * (high - low), _FALL * last, 255.0), 65535.0)

@@ -68,10 +68,6 @@ class Keypoints:
             self.octave[rows],
         )  # fmt: skip
 
-    def to_cv2(self) -> tuple[cv2.KeyPoint, ...]:
-        """As OpenCV has them: angles in degrees, −1 where not measured; ``class_id`` is the sign of the Laplacian."""
-        return tuple(self)
-
     @classmethod
     def from_cv2(cls, keypoints: Iterable[cv2.KeyPoint]) -> Keypoints:
         """Of OpenCV's key points, of any detector, in their order.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import invert
+from slam.kernels.linear import factorise, solve_factorised
 from slam.runtime.compilation import disjoint_vector_helper, helper, kernel, vector_helper
 
 _STEP = 1.0 / 15.0  # of the finite differences in position, in units of the size
@@ -67,12 +67,12 @@ def _response(parts, lanes, x, size):
 
 
 @helper
-def _responses(pixels, stride, x, y, size, step, wide, space, layer, row):
+def _responses(pixels, stride, x, y, size, step, wide, space, out):
     """Responses of a filter at (x, y) and, if `wide`, `step` to its left and right; it must lie inside the image.
 
     The vertical part of the filters is common to the three.
     """
-    corners, fractions, parts, cube, _, _, _ = space
+    corners, fractions, parts = space
     lanes = parts.size // 3
     half = 0.5 * size + (step if wide else 0.0)
     first = np.int64(x + 0.5 - half)
@@ -83,11 +83,11 @@ def _responses(pixels, stride, x, y, size, step, wide, space, layer, row):
         corners[k], fractions[k] = np.uint64(whole * stride + first), v - whole
     _vertical_parts(pixels, np.uint64(stride), corners, fractions, n, parts, np.uint64(lanes))
     for j in range(0 if wide else 1, 3 if wide else 2):
-        cube[layer, row, j] = _response(parts, lanes, x + 0.5 - first + (j - 1) * step, size)
+        out[j] = _response(parts, lanes, x + 0.5 - first + (j - 1) * step, size)
 
 
 @helper
-def _sample(pixels, stride, x, y, size, bend, space):
+def _sample(pixels, stride, x, y, size, bend, space, cube):
     """Responses about (x, y, size), as cube[size, y, x]: those of the gradient and, if `bend`, of the curvature."""
     step = _STEP * size
     for layer in range(3):
@@ -96,23 +96,21 @@ def _sample(pixels, stride, x, y, size, bend, space):
             if bend or sides:
                 wide = sides == 2 or (bend and sides == 1)
                 v, scale = y + (row - 1) * step, size + (layer - 1) * _SIZE_STEP * size
-                _responses(pixels, stride, x, v, scale, step, wide, space, layer, row)
+                _responses(pixels, stride, x, v, scale, step, wide, space, cube[layer, row])
 
 
 @helper
-def _inverse_curvature(space):
-    """Inverse of the Hessian (3, 3) of the responses, in units of the finite differences; False unless a maximum."""
-    c, hessian, inverse = space[3:6]
+def _bends_down(c, curvature):
+    """Minus the Hessian (3, 3) of the responses, in units of the differences, factorised; False if no maximum."""
     v = 2.0 * c[1, 1, 1]
-    xx, yy, ss = c[1, 1, 0] + c[1, 1, 2] - v, c[1, 0, 1] + c[1, 2, 1] - v, c[0, 1, 1] + c[2, 1, 1] - v
-    xy = 0.25 * (c[1, 2, 2] - c[1, 0, 2] - c[1, 2, 0] + c[1, 0, 0])
-    xs = 0.25 * (c[2, 1, 2] - c[0, 1, 2] - c[2, 1, 0] + c[0, 1, 0])
-    ys = 0.25 * (c[2, 2, 1] - c[0, 2, 1] - c[2, 0, 1] + c[0, 0, 1])
-    hessian[0, 0], hessian[1, 1], hessian[2, 2] = xx, yy, ss
-    hessian[0, 1] = hessian[1, 0] = xy
-    hessian[0, 2] = hessian[2, 0] = xs
-    hessian[1, 2] = hessian[2, 1] = ys
-    return invert(hessian, inverse) < 0.0 and xx < 0.0 and xx * yy - xy * xy > 0.0
+    curvature[0, 0] = v - c[1, 1, 0] - c[1, 1, 2]
+    curvature[1, 1] = v - c[1, 0, 1] - c[1, 2, 1]
+    curvature[2, 2] = v - c[0, 1, 1] - c[2, 1, 1]
+    curvature[1, 0] = 0.25 * (c[1, 0, 2] + c[1, 2, 0] - c[1, 2, 2] - c[1, 0, 0])
+    curvature[2, 0] = 0.25 * (c[0, 1, 2] + c[2, 1, 0] - c[2, 1, 2] - c[0, 1, 0])
+    curvature[2, 1] = 0.25 * (c[0, 2, 1] + c[2, 0, 1] - c[2, 2, 1] - c[0, 0, 1])
+    factorise(curvature, 3)
+    return curvature[0, 0] > 0.0 and curvature[1, 1] > 0.0 and curvature[2, 2] > 0.0
 
 
 @kernel
@@ -133,13 +131,10 @@ def localise(integral, uv, size, reach):
     for i in range(len(size)):
         largest = max(largest, size[i])
     lanes = int(_WIDEST * largest) + 2 * _LANES
-    space = (  # corners of a filter, vertical parts, responses, their Hessian and its inverse, and a step
-        np.empty(10, np.uint64), np.empty(10), np.empty(3 * lanes), np.empty((3, 3, 3)), np.empty((3, 3)),
-        np.empty((3, 3)), np.empty(3),
-    )  # fmt: skip
+    space = np.empty(10, np.uint64), np.empty(10), np.empty(3 * lanes)  # corners of a filter, and its vertical parts
+    cube, curvature, step = np.empty((3, 3, 3)), np.empty((3, 3)), np.empty(3)
     pixels = integral.reshape(-1)
     rows, stride = integral.shape
-    cube, _, inverse, step = space[3:]
     for i in range(len(uv)):
         u, v, s = uv[i, 0], uv[i, 1], size[i]
         for k in range(_ITERATIONS):
@@ -148,15 +143,13 @@ def localise(integral, uv, size, reach):
                 break
             # The curvature changes little on the way: it is measured twice, at the start and after two steps.
             bend = k == 0 or k == 2
-            _sample(pixels, stride, u, v, s, bend, space)
-            if bend and not _inverse_curvature(space):
+            _sample(pixels, stride, u, v, s, bend, space, cube)
+            if bend and not _bends_down(cube, curvature):
                 break
-            gx, gy = 0.5 * (cube[1, 1, 2] - cube[1, 1, 0]), 0.5 * (cube[1, 2, 1] - cube[1, 0, 1])
-            gs = 0.5 * (cube[2, 1, 1] - cube[0, 1, 1])
-            largest = 0.0
-            for a in range(3):
-                step[a] = -(inverse[a, 0] * gx + inverse[a, 1] * gy + inverse[a, 2] * gs)
-                largest = max(largest, abs(step[a]))
+            step[0], step[1] = 0.5 * (cube[1, 1, 2] - cube[1, 1, 0]), 0.5 * (cube[1, 2, 1] - cube[1, 0, 1])
+            step[2] = 0.5 * (cube[2, 1, 1] - cube[0, 1, 1])
+            solve_factorised(curvature, 3, step)
+            largest = max(abs(step[0]), abs(step[1]), abs(step[2]))
             shrink = 1.0 if largest <= 1.0 else 1.0 / largest
             u += shrink * step[0] * _STEP * s
             v += shrink * step[1] * _STEP * s

@@ -8,6 +8,9 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 _SMALLEST_SHARE = 32  # cost: items that are worth a task
 
 
@@ -19,7 +22,7 @@ class Workers:
     """
 
     def __init__(self, threads: int) -> None:
-        self.threads = threads
+        self._threads = threads
         self._pool: ThreadPoolExecutor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -28,18 +31,19 @@ class Workers:
 
     def run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         """Results of independent tasks, in their order."""
-        if self.threads == 1 or len(tasks) < 2:
+        if self._threads == 1 or len(tasks) < 2:
             return [task() for task in tasks]
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.threads - 1, thread_name_prefix="surf")
+            self._pool = ThreadPoolExecutor(self._threads - 1, thread_name_prefix="surf")
         futures = [self._pool.submit(task) for task in tasks[1:]]
         first = tasks[0]()
         # The caller takes what nobody has begun yet, from the far end.
         results = [task() if future.cancel() else future for task, future in zip(tasks[:0:-1], futures[::-1])][::-1]
         return [first, *(r.result() if isinstance(r, Future) else r for r in results)]
 
-    def over(self, count: int, function: Callable[[int, int], Any]) -> list[Any]:
-        """Results of ``function(first, last)`` on consecutive shares of `count` items."""
-        shares = 1 if self.threads == 1 else max(1, min(self.threads, count // _SMALLEST_SHARE))
+    def over(self, count: int, function: Callable[[int, int], tuple[NDArray, ...]]) -> list[NDArray]:
+        """The arrays of ``function(first, last)`` of consecutive shares of `count` items, put together."""
+        shares = 1 if self._threads == 1 else max(1, min(self._threads, count // _SMALLEST_SHARE))
         edges = [count * k // shares for k in range(shares + 1)]
-        return self.run([partial(function, a, b) for a, b in pairwise(edges)])
+        found = self.run([partial(function, a, b) for a, b in pairwise(edges)])
+        return list(found[0]) if shares == 1 else [np.concatenate(parts) for parts in zip(*found)]

@@ -332,12 +332,14 @@ class RectifiedRig:
 
     @cached_property
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Tables for ``cv2.remap``, left and right."""
+        """Tables (2, H, W) for ``cv2.remap``, left and right: columns and rows in the original image."""
         v, u = np.mgrid[: self.rig.height, : self.rig.width]
         grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
         pixels = self.unrectify_left(grid), self.unrectify_right(grid)
-        left, right = (np.nan_to_num(uv, nan=-1.0).astype(np.float32).reshape(*u.shape, 2) for uv in pixels)
-        return np.ascontiguousarray(left), np.ascontiguousarray(right)
+        left, right = (
+            np.nan_to_num(uv.T, nan=-1.0).astype(np.float32, order="C").reshape(2, *u.shape) for uv in pixels
+        )
+        return left, right
 
 
 def rectify(rig: StereoRig) -> RectifiedRig:

@@ -97,6 +97,6 @@ class Extractor:
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
         with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
-            features = outside_masks(documented(frontend.extract(frame), self._rig), frame)
+            features = outside_masks(documented(frontend.extract(frame), self._rig), frame, self._rig)
         self._warnings.look(frame, features)
         return Extracted(frame, features, stages.milliseconds, checksum_of(frame))

@@ -14,17 +14,11 @@ from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
-#: Columns of `StereoFeatures`: numbers in a row (−1 for any), kinds of dtype that are taken, the dtype that comes out,
-#: and what a value must be.
-_COLUMNS: dict[str, tuple[tuple[int, ...], str, type, Any]] = {
-    "uv_left": ((2,), "f", np.float64, np.isfinite),
-    "uv_right": ((2,), "f", np.float64, lambda uv: ~np.isinf(uv)),
-    "scale": ((), "f", np.float64, np.isfinite),
-    "angle": ((), "f", np.float64, np.isfinite),
-    "response": ((), "f", np.float64, np.isfinite),
-    "laplacian": ((), "i", np.int8, np.isfinite),
-    "descriptors": ((-1,), "f", np.float32, np.isfinite),
-}
+#: Columns of `StereoFeatures`: numbers in a row (None for any number), and the dtype that comes out.
+_COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
+    "uv_left": ((2,), np.float64), "uv_right": ((2,), np.float64), "scale": ((), np.float64), "angle": ((), np.float64),
+    "response": ((), np.float64), "laplacian": ((), np.int8), "descriptors": ((None,), np.float32),
+}  # fmt: skip
 
 
 def documented(features: Any, rig: StereoRig) -> StereoFeatures:
@@ -50,14 +44,16 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
     return replace(features, stamp=stamp, threshold=threshold, **columns)
 
 
-def outside_masks(features: StereoFeatures, frame: StereoFrame) -> StereoFeatures:
+def outside_masks(features: StereoFeatures, frame: StereoFrame, rig: StereoRig) -> StereoFeatures:
     """The features where the masks of their frame are True; under the right camera's only the right pixel goes."""
     if frame.left_mask is not None:
-        features = features.select(_at(frame.left_mask, features.uv_left))
-    if frame.right_mask is None:
-        return features
-    there = _at(frame.right_mask, features.uv_right)[:, None]
-    return replace(features, uv_right=np.where(there, features.uv_right, np.nan))
+        uv = rig.rectified.unrectify_left(features.uv_left) if features.rectified else features.uv_left
+        features = features.select(_at(frame.left_mask, uv))
+    if frame.right_mask is not None:
+        uv = rig.rectified.unrectify_right(features.uv_right) if features.rectified else features.uv_right
+        there = _at(frame.right_mask, uv)[:, None]
+        features = replace(features, uv_right=np.where(there, features.uv_right, np.nan))
+    return features
 
 
 def _at(mask: BoolArray, uv: Array) -> BoolArray:
@@ -104,7 +100,8 @@ def _number(name: str, value: Any) -> float:
 
 def _column(name: str, array: Any, rows: int) -> Array:
     """One column with its documented dtype."""
-    shape, kinds, dtype, good = _COLUMNS[name]
+    shape, dtype = _COLUMNS[name]
+    kinds = "i" if dtype is np.int8 else "f"
     if not isinstance(array, np.ndarray) or array.ndim != 1 + len(shape) or array.dtype.kind not in kinds:
         got = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
         dimensions = f"{1 + len(shape)} dimensions of {dtype.__name__}"
@@ -114,7 +111,7 @@ def _column(name: str, array: Any, rows: int) -> Array:
     if array.dtype != dtype:
         with np.errstate(over="ignore"):  # reported as not finite
             array = (np.sign(array) if "i" in kinds else array).astype(dtype)
-    if not good(array).all():
+    if np.isinf(array).any() or (name != "uv_right" and np.isnan(array).any()):
         raise MeasurementError(f"features: a value of {name} is not finite")
     return np.asarray(array)
 

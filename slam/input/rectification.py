@@ -50,7 +50,7 @@ class Rectification:
 
     def features_in(self, features: StereoFeatures) -> StereoFeatures:
         """Features in pixels of the rectified pair; those outside of its left image are left out."""
-        if self._none:
+        if self._none or features.rectified:
             return features
         left = self._ways.rectify_left(features.uv_left)
         moved = replace(features, uv_left=left, uv_right=self._right(features.uv_right))
@@ -81,7 +81,7 @@ class Rectification:
         return replace(
             result,
             estimate=self.estimate_out(result.estimate),
-            features=replace(f, uv_left=left, uv_right=right),
+            features=replace(f, uv_left=left, uv_right=right, rectified=False),
             common=replace(common, jacobian=self._adjoint @ common.jacobian),
         )
 

@@ -82,7 +82,7 @@ class _Notice(event.Listener):
     def on_start(self, event: Any) -> None:
         if not _is_own(event):
             return
-        first = compile_clock.start()
+        first = compile_clock.change(1)
         if not self._said:
             self._said = True
             _LOG.info("compiling kernels, once for each back end, half a minute or more; `slam warm-up` does it before")
@@ -91,7 +91,7 @@ class _Notice(event.Listener):
             gc.disable()
 
     def on_end(self, event: Any) -> None:
-        if _is_own(event) and compile_clock.stop() and self._collects:
+        if _is_own(event) and compile_clock.change(-1) and self._collects:
             gc.enable()
 
 

@@ -3,17 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from threading import RLock
-
-
-@dataclass(frozen=True)
-class _State:
-    """Compilations under way (they nest, and threads compile at the same time), since when, and the time before [s]."""
-
-    under_way: int = 0
-    since: float = 0.0
-    seconds: float = 0.0
 
 
 class CompileClock:
@@ -24,31 +14,22 @@ class CompileClock:
 
     def __init__(self) -> None:
         self._lock = RLock()
-        self._state = _State()
+        self._state = 0, 0.0, 0.0  # compilations under way (they nest), since when, and the time before [s]
 
-    def start(self) -> bool:
-        """A compilation begins; whether no other was under way."""
-        with self._lock: return self._start()  # noqa: E701  # fmt: skip
-
-    def stop(self) -> bool:
-        """A compilation has ended; whether none is under way any more."""
-        with self._lock: return self._stop()  # noqa: E701  # fmt: skip
+    def change(self, by: int) -> bool:
+        """A compilation begins (1) or ends (-1); whether it is the only one."""
+        with self._lock: return self._change(by, time.perf_counter())  # noqa: E701  # fmt: skip
 
     def seconds(self) -> float:
         """Wall time in which something was compiled [s]."""
-        s = self._state
-        return s.seconds + (time.perf_counter() - s.since if s.under_way else 0.0)
+        under_way, since, before = self._state
+        return before + (time.perf_counter() - since if under_way else 0.0)
 
-    def _start(self) -> bool:
-        s = self._state
-        self._state = _State(s.under_way + 1, s.since if s.under_way else time.perf_counter(), s.seconds)
-        return not s.under_way
-
-    def _stop(self) -> bool:
-        s = self._state
-        done = 0.0 if s.under_way > 1 else time.perf_counter() - s.since
-        self._state = _State(s.under_way - 1, s.since, s.seconds + done)
-        return s.under_way == 1
+    def _change(self, by: int, now: float) -> bool:
+        under_way, since, before = self._state
+        alone = max(under_way, under_way + by) == 1
+        self._state = under_way + by, now if not under_way else since, before + (now - since if alone and by < 0 else 0)
+        return alone
 
 
 #: Of this process.

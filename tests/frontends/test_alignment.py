@@ -82,14 +82,3 @@ def test_patches_at_the_border_are_not_found():
     found, _ = frontend.align(ImagePair(left, right), patches, np.tile(np.eye(2), (4, 1, 1)), uv, uv)
     assert np.isfinite(found[:, 0]).tolist() == [False, False, True, False]
     assert found[2] == pytest.approx(uv[2], abs=0.01)
-
-
-def test_pixels_far_outside_of_the_image_or_without_numbers_are_not_found():
-    frontend = SurfFrontend(RIG)
-    left, right = (image.astype(np.float32) for image in stereo_pair(DISPARITY))
-    good = np.array([[160.0, 120.0]] * 4)
-    bad = np.array([[np.nan, 120.0], [160.0, np.nan], [1e12, 120.0], [160.0, -1e12]])
-    pair, warps, size = ImagePair(left, right), np.tile(np.eye(2), (4, 1, 1)), np.full(4, 15.0)
-    for cut, start in ((bad, good), (good, bad)):
-        found, _ = frontend.align(pair, frontend.patches(pair, cut, size), warps, start, start)
-        assert np.isnan(found).all()

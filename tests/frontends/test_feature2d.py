@@ -14,16 +14,6 @@ from slam.errors import ConfigurationError, SequenceError
 from tests.frontends.test_surf import IMAGE
 
 
-def test_what_feature2d_has_surf_has():
-    sift = cv2.SIFT_create()
-    for surf in (Surf(100), Surf(100, descriptor=16)):
-        assert surf.descriptorType() == sift.descriptorType()
-        assert surf.defaultNorm() == sift.defaultNorm()
-        assert surf.empty() == sift.empty()
-        assert surf.getDefaultName() == sift.getDefaultName().replace("SIFT", "SURF")
-        assert surf.detectAndCompute(IMAGE, None)[1].shape[1] == surf.descriptorSize()
-
-
 def test_detect_gives_what_opencv_takes_as_key_points():
     found = Surf(100).detect(IMAGE)
     first = found[0]
@@ -74,6 +64,7 @@ def test_the_arguments_and_defaults_are_opencv_s():
     got = surf.getHessianThreshold(), surf.getNOctaves(), surf.getNOctaveLayers(), surf.getExtended(), surf.getUpright()
     assert got == (400.0, 3, 2, False, True)
     assert isinstance(surf, Surf) and surf.descriptorSize() == 64
+    assert surf.defaultNorm() == cv2.SIFT_create().defaultNorm()
 
 
 def test_setters_change_what_is_found():
@@ -92,10 +83,10 @@ def test_setters_change_what_is_found():
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("HessianThreshold", -1, "threshold: must be"),
-        ("HessianThreshold", "a", "threshold: must be"),
-        ("NOctaves", 5, "octaves: must be 1 to 4"),
-        ("NOctaveLayers", 4, "layers: must be 2 or 3"),
+        ("HessianThreshold", -1, "threshold must be"),
+        ("HessianThreshold", "a", "threshold must be"),
+        ("NOctaves", 5, "octaves must be .* from 1 to 4"),
+        ("NOctaveLayers", 4, "layers must be .* from 2 to 3"),
         ("Extended", True, "no descriptors of 128 numbers"),
     ],
 )

@@ -8,12 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-import frontends
 from frontends.surf import SurfFrontend
 from slam.data import StereoFrame
-from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam.errors import ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
-from slam.interfaces import Frontend
 from tests.frontends.scenes import stereo_pair
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
@@ -27,15 +25,6 @@ def bytes_of(features):
         features.descriptors,
     )  # fmt: skip
     return b"".join(a.tobytes() for a in arrays) + np.float64(features.threshold).tobytes()
-
-
-def test_by_name():
-    assert "surf" in frontends.names()
-    frontend = frontends.create("surf", RIG, features=123)
-    assert isinstance(frontend, Frontend)
-    assert frontend.config.features == 123
-    with pytest.raises(UnknownNameError, match="surf"):
-        frontends.create("sift", RIG)
 
 
 def test_fields():
@@ -54,7 +43,7 @@ def test_fields():
     assert np.isnan(features.uv_right).any(axis=1).tolist() == np.isnan(features.uv_right).all(axis=1).tolist()
 
 
-@pytest.mark.parametrize("options", [{}, {"upright": False, "descriptor": 16}, {"localise": False}])
+@pytest.mark.parametrize("options", [{}, {"upright": False, "descriptor": 16}])
 def test_same_bytes_whatever_the_threads(options):
     runs = []
     for threads in (1, 2, 5):
@@ -122,8 +111,6 @@ def test_threshold_keeps_the_number_of_features():
     assert thresholds[15] < 0.2 * thresholds[7]
     assert thresholds[6] == thresholds[7]
     assert thresholds[14] == thresholds[15]
-    fixed = SurfFrontend(RIG, adaptive=False, threshold=777).extract(StereoFrame(0, 0.0, LEFT, None))
-    assert fixed.threshold == 777
 
 
 def test_features_are_spread():

@@ -112,9 +112,11 @@ def test_distorted_and_turned_cameras():
     features = SurfFrontend(rig, features=300).extract(StereoFrame(0, 0.0, *images))
     assert len(features) > 100
     assert features.has_stereo.mean() > 0.8
-    # Raw pixels: triangulated with the rig's own general model, they lie on the wall.
-    points = rig.triangulate(features.uv_left, features.uv_right)[features.has_stereo]
+    # Taken back to raw pixels and triangulated with the rig's own general model, they lie on the wall.
+    assert features.rectified
+    uv_left, uv_right = rig.rectified.unrectify_left(features.uv_left), rig.rectified.unrectify_right(features.uv_right)
+    points = rig.triangulate(uv_left, uv_right)[features.has_stereo]
     assert np.median(points[:, 2]) == pytest.approx(depth, rel=0.005)
     _, expected = rig.project(points * (depth / points[:, 2])[:, None])
-    errors = np.abs(features.uv_right[features.has_stereo] - expected)
+    errors = np.abs(uv_right[features.has_stereo] - expected)
     assert (np.median(errors, axis=0) < 0.1).all()

@@ -199,5 +199,5 @@ def test_unusable_images(image, says):
     ],
 )
 def test_bad_settings_name_their_key(options, key):
-    with pytest.raises(ConfigurationError, match=f"^{key}: "):
+    with pytest.raises(ConfigurationError, match=f"^surf: {key} "):
         Surf(**options)

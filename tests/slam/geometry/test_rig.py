@@ -93,8 +93,8 @@ def test_rectification_maps_agree_with_opencv():
     expected = cv2.initUndistortRectifyMap(
         LEFT.K, np.array(LEFT.distortion), rectified_rig.R_left, K, (rig.width, rig.height), cv2.CV_32FC1
     )
-    np.testing.assert_allclose(rectified_rig.maps[0][..., 0], expected[0], atol=1e-3)  # float32 of values up to 752
-    np.testing.assert_allclose(rectified_rig.maps[0][..., 1], expected[1], atol=1e-3)
+    np.testing.assert_allclose(rectified_rig.maps[0][0], expected[0], atol=1e-3)  # float32 of values up to 752
+    np.testing.assert_allclose(rectified_rig.maps[0][1], expected[1], atol=1e-3)
 
 
 def test_fisheye_pair_keeps_a_useful_view():

@@ -5,9 +5,11 @@ import pytest
 
 import backends
 from slam.config import SystemConfig
+from slam.data import StereoFrame
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
+from slam.input.features import outside_masks
 from slam.input.rectification import Rectification
 from slam.models import models_for
 from slam.system import StereoSlam
@@ -62,3 +64,18 @@ def test_a_fisheyes_pixel_across_its_axis_is_no_right_pixel():
     inside = Rectification(rig).features_in(features)
     assert np.abs(rig.rectified.rectify_right(features.uv_right[:1])).max() > 1e5
     assert np.isnan(inside.uv_right[0]).all() and np.isfinite(inside.uv_right[1:]).all()
+
+
+def test_features_in_pixels_of_the_rectified_pair_are_not_taken_there_again():
+    raw, _ = Cloud(200, rig=GENERAL_RIG).features(np.eye(4), 0.0, 0.1)
+    inside = Rectification(GENERAL_RIG).features_in(raw)
+    marked = replace(inside, rectified=True)
+    assert Rectification(GENERAL_RIG).features_in(marked) is marked
+    row, column = np.indices((GENERAL_RIG.height, GENERAL_RIG.width))
+    masks = column < GENERAL_RIG.width // 2, row < GENERAL_RIG.height // 2  # of the images as they were taken
+    frame = StereoFrame(0, 0.0, *masks, *masks)
+    expected = outside_masks(raw.select(np.isin(raw.response, inside.response)), frame, GENERAL_RIG)
+    found = outside_masks(marked, frame, GENERAL_RIG)
+    np.testing.assert_array_equal(found.response, expected.response)
+    np.testing.assert_array_equal(found.has_stereo, expected.has_stereo)
+    assert 0 < len(found) < len(marked) and 0 < found.has_stereo.sum() < len(found)

@@ -260,11 +260,11 @@ def test_features_under_a_mask_are_not_used(tmp_path: Path, two_folders: Path) -
         assert frame.left_mask is not None and frame.right_mask.all()
         features = system.frontend.extract(frame)
         assert len(features) > 50 and features.uv_left[:, 0].min() >= 150
-        assert outside_masks(features, frame).uv_left[:, 0].min() >= 159.5
+        assert outside_masks(features, frame, sequence.rig).uv_left[:, 0].min() >= 159.5
         system.process(frame)
     right = open_sequence(with_mask(text, f",{tmp_path / 'left half.png'}"))
     frame = next(iter(right))
-    features = outside_masks(slam.StereoSlam(right.rig).frontend.extract(frame), frame)
+    features = outside_masks(slam.StereoSlam(right.rig).frontend.extract(frame), frame, right.rig)
     assert features.uv_left[:, 0].min() < 100
     assert np.nanmin(features.uv_right[:, 0]) >= 159.5
     cv2.imwrite(str(two_folders / "m.png"), np.eye(48, 64, dtype=np.uint8))
