@@ -132,10 +132,11 @@ def run_command(
 ) -> None:
     """Run one sequence through one back end."""
     from slam.commands.display import progress
-    from slam.commands.run import finish, frame_count, prepare, run_folder, shown, title, watches
+    from slam.commands.run import finish, frame_count, prepare, run_folder, title, watches
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
+    from slam.run import drawing, viewer as viewing
     from slam.run.runner import run
     from slam.run.warm_up import compiled_in_background
     from slam.sequences import is_live, with_mask
@@ -146,24 +147,24 @@ def run_command(
     if draw_map and draw is None:
         raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     with noting_inputs() as inputs:
-        opened, options, origin = prepare(
+        opened, options = prepare(
             sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
         )
     shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
-        require_outputs([*options.outputs, *shown(draw, viewer)], [*inputs, *options.inputs], overwrite)
+        written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
+        require_outputs(written, [*inputs, *options.inputs], overwrite)
         if options.config.objects.mode != "off":
             stack.enter_context(compiled_in_background(options.backend))
-        options = replace(options, origin=origin.to_json(folder))
         seen = watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
         end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress(*shown_as)), folder, until))
         summary = run(opened, options, end_of_frame, watches=seen, until=until)
-    finish(summary, folder, picture, quiet)
+    finish(summary, written, picture, quiet)
 
 
 @app.command("replay", short_help="Feed a back end recorded measurements.")
@@ -191,12 +192,12 @@ def replay_command(
     require_settable(settings or [], default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings or [])
     with run_folder(out, loaded.name, name) as folder:
-        options = RunOptions(name, "recording", config, folder, origin={"command": command_line()})
+        options = RunOptions(name, "recording", config, folder, command=command_line())
         require_outputs(options.outputs, [recording], overwrite)
         shown_as = len(loaded), title(loaded, name), quiet
         with progress(*shown_as) as tell, whole_frames(tell, folder) as end_of_frame:
             summary = run_recording(loaded, options, end_of_frame)
-    finish(summary, folder, picture, quiet)
+    finish(summary, options.outputs, picture, quiet)
 
 
 @app.command("plot", short_help="Draw finished runs.")

@@ -86,8 +86,8 @@ def _say(text: str, style: str | None = None) -> None:
     _console.print(escape(text), style=style, highlight=False)
 
 
-def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
-    """A table of finished runs, a column each, and whether their covariances hold."""
+def print_summary(summaries: list[dict[str, Any]], files: Sequence[Path]) -> None:
+    """A table of finished runs, a column each, whether their covariances hold, and what was written."""
     table = Table(title=summaries[0]["sequence"], title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     for summary in summaries:
@@ -98,7 +98,7 @@ def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
     for summary in summaries:
         if words := verdict_of_run(summary):
             _say(f"{summary['backend']}: {words}")
-    _say(f"Files: {out}")
+    _say(f"Files: {', '.join(map(str, files))}")
 
 
 def print_listing(options: bool = False) -> None:

@@ -142,9 +142,9 @@ class Viewer:
         self._recording.log(f"world{path}", what, static=static)
 
 
-def outputs(target: str, option: str) -> list[Output]:
-    """The file that a `Viewer` writes; none where it opens a window."""
-    return [] if target == LIVE else [Output(Path(target), option, makes_folder=True)]
+def outputs(target: str | None, option: str) -> list[Output]:
+    """The file that a `Viewer` writes; none where it opens a window, or there is none."""
+    return [] if target in (None, LIVE) else [Output(Path(target), option, makes_folder=True)]
 
 
 def view_run(folder: Path, target: str, overwrite: bool = False) -> None:

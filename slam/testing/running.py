@@ -103,6 +103,6 @@ def _require_arrays(found: object, shapes: dict[str, tuple[int, ...]], method: s
     """Fail unless the attributes are finite arrays of these shapes."""
     for name, shape in shapes.items():
         value = getattr(found, name)
-        require(isinstance(value, np.ndarray), f"{name} of {method} is a {type(value).__name__}, not an array")
+        require(isinstance(value, np.ndarray), f"{name} of {method} is of type {type(value).__name__}, not an array")
         require(value.shape == shape, f"{name} of {method} has shape {value.shape}, {shape} expected")
         require(np.isfinite(value).all(), f"{name} of {method} is not finite")

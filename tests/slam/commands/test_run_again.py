@@ -104,7 +104,7 @@ GOOD = {"frames": [0, None], "settings": {}, "frontend": "surf", "backend": "ekf
         (None, r"config\.json: No such file"),
         ("", r"config\.json: no valid JSON"),
         ("{}", r"not the config\.json"),
-        ("[]", r"config\.json: must hold an object, not a list"),
+        ("[]", r"config\.json: must hold an object, not list"),
         ("[" * 50_000, r"config\.json: no valid JSON"),
         (json.dumps(GOOD).replace("0", "1e999"), r"not the config\.json"),
         (json.dumps(GOOD | {"settings": {"colour": 1}}), "colour"),
