@@ -276,14 +276,12 @@ def calibrate_command(
 ) -> None:
     """Find what a rig's calibration is off by, from all its recordings together, and whether they agree."""
     from slam.commands.calibrate import calibrate
-    from slam.run.calibrating import Targets
     from slam.run.options import parse_frames
     from slam.sequences import with_mask
 
-    sequences = [with_mask(text, mask) for text in sequences]
-    targets = Targets(out, opencv, kalibr, overwrite)
+    texts, files = [with_mask(text, mask) for text in sequences], {"opencv": opencv, "kalibr": kalibr}
     with leaving("nothing is written"):
-        calibrate(sequences, targets, settings or [], parse_frames(frames), format, quiet)
+        calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, overwrite=overwrite, **files)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

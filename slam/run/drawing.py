@@ -28,6 +28,7 @@ _FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size
 _LEAST_RADIUS = 4  # of a feature's circle [px]
 _LEGEND = 24  # height of the bar with the legend [px]
 _FILM, _DIGITS = ".mp4", 6  # a video's suffix; of a picture's name, at least
+_SHOWN = 1 / 0.9  # of an extent from the 5th to the 95th percentile of points: all of it where they lie evenly
 _PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
 _AHEAD = 0.3  # of the map behind the camera
 _REACH = 2.5  # widths of the map in distances of the first landmarks
@@ -36,6 +37,12 @@ _REACH = 2.5  # widths of the map in distances of the first landmarks
 def body_colour(number: int) -> tuple[int, int, int]:
     """The colour (BGR) of a moving body in images, by its number."""
     return _BODIES[(number - 1) % len(_BODIES)]
+
+
+def _extent(body: MovingObject) -> Array:
+    """Corners (2, 3) of a body's box as drawn, body coordinates."""
+    middle = body.extent.mean(axis=0)
+    return np.asarray(middle + _SHOWN * (body.extent - middle))
 
 
 def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: int = 960) -> np.ndarray:
@@ -70,10 +77,10 @@ def with_legend(picture: np.ndarray, bodies: Sequence[MovingObject] = ()) -> np.
 
     bar = np.full((_LEGEND, picture.shape[1], 3), 255, np.uint8)
     at, middle = 12, _LEGEND // 2
-    known = [(body_colour(body.id), f"body {body.id}", not body.estimate.measured) for body in bodies]
+    known = [(body_colour(body.id), f"body {body.id}", False) for body in bodies]
     marks: list[tuple[tuple[int, int, int], str, bool | None]]
     marks = [(_BEACON, "landmark", None), (_NEW, "new landmark", None), (_MOVING, "feature that moves", None)]
-    marks += known or [(body_colour(1), "body", False)]
+    marks += known or [(body_colour(1), "body: box around its points", False)]
     for colour, text, dashed in [*marks, (marks[-1][0], "body, not seen", True)]:
         (width, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
         if at + 20 + width > bar.shape[1]:
@@ -94,7 +101,7 @@ def _draw_object(picture: np.ndarray, thing: MovingObject, result: FrameResult, 
     import cv2
 
     T_left_object = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
-    lower, upper = thing.extent
+    lower, upper = _extent(thing)
     corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
     measured, length = thing.estimate.measured, 0.6 * max(float((upper - lower).max()), 1e-3)
     lines = [(corners[a], corners[b], body_colour(thing.id), 1 + measured) for a, b in _EDGES]
@@ -116,9 +123,7 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
 
     if not np.isfinite(corners).all():
         return
-    speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
-    state = f"{speed:.2f} m/s" if thing.moving else "at rest"
-    text = f"{thing.id}: {state if thing.estimate.measured else 'not seen'}"
+    text = f"{thing.id}: {_state(thing)}"
     (width, height), base = cv2.getTextSize(text, _FONT, _TEXT, 1)
     u, v = corners.min(axis=0)
     left, top = _pixel(u, v - 3, scale)
@@ -126,6 +131,12 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
     y = min(max(top, height), picture.shape[0] - base)
     cv2.rectangle(picture, (x, y - height), (x + width, y + base), _RING, cv2.FILLED)
     cv2.putText(picture, text, (x, y), _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
+
+
+def _state(body: MovingObject) -> str:
+    if not body.estimate.measured:
+        return "not seen"
+    return f"{float(np.linalg.norm(body.estimate.velocity[3:])):.2f} m/s" if body.moving else "at rest"
 
 
 def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
@@ -173,7 +184,7 @@ class GrowingMap:
         cv2.polylines(picture, [path], False, _PATH, 2, cv2.LINE_AA)
         cv2.circle(picture, path[-1].tolist(), 5, _PATH, -1, cv2.LINE_AA)
         for body in result.objects:
-            colour, extent = body_colour(body.id), body.extent
+            colour, extent = body_colour(body.id), _extent(body)
             corners = np.array([[extent[i, 0], 0, extent[j, 2]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
             outline = pixels(transform(body.estimate.T_world_object, corners))
             cv2.polylines(picture, [outline], True, colour, 2, cv2.LINE_AA)
