@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import recordings, script_options
 from experiments.tables import picture, show
-from slam.compare.trial import Lifetimes
+from slam.compare.trial import MapRecord
 from slam.config import SystemConfig
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
@@ -28,6 +28,7 @@ from slam.registry import ONLINE
 from slam.run.options import RunOptions
 from slam.run.panels import widths
 from slam.run.runner import run
+from slam.run.summary import RunRecord
 from slam.sequences import open_sequence
 
 SEQUENCES = {
@@ -47,11 +48,11 @@ def folder_of(name: str, backend: str, out: Path) -> Path:
 def run_one(name: str, folder: Path, backend: str, out: Path, frames: int | None) -> dict[str, Any]:
     sequence = open_sequence(folder)
     target = folder_of(name, backend, out)
-    lifetimes = Lifetimes()
+    collected, record = MapRecord(sequence), RunRecord()
     config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-    options = RunOptions(backend, "surf", config, target, 0, frames, origin={"kind": sequence.kind})
-    summary = run(sequence, options, lifetimes.add)
-    return {**summary, "lifetime": lifetimes.figures()["lifetime_frames"]}
+    options = RunOptions(backend, "surf", config, target, 0, frames, kind=sequence.kind)
+    summary = run(sequence, options, collected.add, record=record)
+    return {**summary, "lifetime": collected.figures(record, target)["lifetime_frames"]}
 
 
 def row(name: str, summary: dict[str, Any]) -> list[str]:

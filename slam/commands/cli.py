@@ -136,7 +136,8 @@ def run_command(
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
-    from slam.run import drawing, viewer as viewing
+    from slam.run import drawing
+    from slam.run import viewer as viewing
     from slam.run.runner import run
     from slam.run.warm_up import compiled_in_background
     from slam.sequences import is_live, with_mask

@@ -57,9 +57,9 @@ def prepare(
     made_with: dict[str, str] = {}
     before = RunOptions("", "", SystemConfig(), source=sequence or "", prior_map=prior_map, calibration=calibration)
     if config is not None:
+        before, made_with = load(config, sequence, prior_map, calibration)
         if kind is not None:
             raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
-        before, made_with = load(config, sequence, prior_map, calibration)
         if sequence is None:  # a given sequence has a format of its own
             format = format or before.format
     if not before.source and sequence is None:

@@ -183,14 +183,17 @@ class MapRecord:
     """Associations and landmarks against a world's surfaces, lifetimes, and the size of the map.
 
     `start` is the number of the first frame. Associations of a replay are the same for all, and need no check.
+    Landmarks that are still in the map have lived until the last frame.
     """
 
     def __init__(self, sequence: Sequence, start: int = 0, associations: bool = True) -> None:
         self._sequence, self._start, self._associations = sequence, start, associations
         self._truth = SurfacePoints(sequence) if sequence.format == "synthetic" else None
-        self._lifetimes = Lifetimes()
         self._sizes: list[int] = []
         self._right: list[bool] = []
+        self._first: dict[int, int] = {}  # frame in which each landmark of the map joined it
+        self._lived: list[int] = []  # frames, of those that have left it
+        self._last = 0
 
     def add(self, result: FrameResult) -> None:
         """One more frame."""
@@ -200,19 +203,29 @@ class MapRecord:
                 errors = self._truth.errors(number, result.matched, features.uv_left[result.matched_features])
                 self._right += (errors[np.isfinite(errors)] < _RIGHT).tolist()
             self._truth.add(number, result.added, features.uv_left[result.added_features])
-        self._lifetimes.add(result)
+        for i in (*result.added.tolist(), *result.returned.tolist()):
+            self._first.setdefault(i, result.index)
+        for i in result.erased.tolist():
+            if i in self._first:  # else one of an old place, by which a kidnapped camera was found
+                self._lived.append(result.index - self._first.pop(i))
+        self._last = result.index
         self._sizes.append(result.map_size)
 
     def figures(self, record: RunRecord, out: Path) -> dict[str, float]:
         """The figures of a run that is finished and has left its files in `out`."""
-        found = self._lifetimes.figures() | self._landmark_errors(record, out)
-        if self._right:
-            found["association_precision"] = float(np.mean(self._right))
-        if self._sizes:
-            found["map_size"] = float(np.mean(self._sizes))
-        return found
+        lived = [*self._lived, *(self._last - first for first in self._first.values())]
+        errors = self._landmark_errors(record, out)
+        found = {
+            "lifetime_frames": np.median(lived) if lived else None,
+            "lifetime_mean_frames": np.mean(lived) if lived else None,
+            "association_precision": np.mean(self._right) if self._right else None,
+            "map_size": np.mean(self._sizes) if self._sizes else None,
+            "landmark_error_m": np.median(errors) if len(errors) else None,
+            "landmark_error_90_m": np.quantile(errors, 0.9) if len(errors) else None,
+        }
+        return {key: float(value) for key, value in found.items() if value is not None}
 
-    def _landmark_errors(self, record: RunRecord, out: Path) -> dict[str, float]:
+    def _landmark_errors(self, record: RunRecord, out: Path) -> Array:
         """Distances of the map's landmarks from the surface points they are, after the alignment of the poses.
 
         They are turned by the poses' orientations: positions of a camera that hardly moves leave the turn open, which
@@ -223,42 +236,14 @@ class MapRecord:
         pairs = with_truth(final.select(pair(final.stamps, tracked.stamps, _SAME) >= 0), self._sequence)
         rows = list(csv.DictReader(io.StringIO(read_text(out / "landmarks.csv"), newline="")))
         if self._truth is None or pairs is None or not rows:
-            return {}
+            return np.zeros(0)
         own, true = pairs
         R = nearest_rotation((true.poses[:, :3, :3] @ np.swapaxes(own.poses[:, :3, :3], 1, 2)).mean(axis=0))
         t = (true.positions - own.positions @ R.T).mean(axis=0)
         positions = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
         ids = np.array([int(row["id"]) for row in rows], np.int64)
         errors = np.linalg.norm(positions @ R.T + t - self._truth.positions(ids), axis=1)
-        errors = errors[np.isfinite(errors)]
-        if not len(errors):
-            return {}
-        return {"landmark_error_m": float(np.median(errors)), "landmark_error_90_m": float(np.quantile(errors, 0.9))}
-
-
-class Lifetimes:
-    """How long landmarks stay in the map; those still in it have lived until the last frame."""
-
-    def __init__(self) -> None:
-        self._first: dict[int, int] = {}
-        self._ended: list[int] = []
-        self._last = 0
-
-    def add(self, result: FrameResult) -> None:
-        """One more frame."""
-        self._last = result.index
-        for i in (*result.added.tolist(), *result.returned.tolist()):
-            self._first.setdefault(i, result.index)
-        for i in result.erased.tolist():
-            if i in self._first:  # else one of an old place, by which a kidnapped camera was found
-                self._ended.append(result.index - self._first.pop(i))
-
-    def figures(self) -> dict[str, float]:
-        """Median and mean in frames; none where there was no landmark."""
-        lived = [*self._ended, *(self._last - first for first in self._first.values())]
-        if not lived:
-            return {}
-        return {"lifetime_frames": float(np.median(lived)), "lifetime_mean_frames": float(np.mean(lived))}
+        return np.asarray(errors[np.isfinite(errors)])
 
 
 def nees_series(record: RunRecord, sequence: Sequence) -> Array:

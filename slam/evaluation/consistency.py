@@ -54,9 +54,9 @@ def consistency_figures(
 
     Returns:
         "mean NEES" from the start, "NEES over L m" for each of `STRETCHES`; six is right for all of these, and "band
-        low" and "band high" hold 95 % of runs; "doubtful truth over L m" and "no covariance over L m", the shares of stretches
-        left out because the truth contradicts itself or an old place was measured again within them, where there are
-        any; "scale error [%]" and "scale sigma [%]".
+        low" and "band high" hold 95 % of runs; "doubtful truth over L m" and "no covariance over L m", the shares of
+        stretches left out because the truth contradicts itself or an old place was measured again within them, where
+        there are any; "scale error [%]" and "scale sigma [%]".
     """
     start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
     later = np.arange(start + 1, len(own))

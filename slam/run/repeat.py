@@ -56,12 +56,15 @@ def load(
         if str(tree.get("command", "")).startswith("slam replay"):
             raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
         before, (start, stop) = tree.get("source") or {}, tree["frames"]
-        given = {"prior_map": prior_map, "calibration": calibration}
-        files = {key: own or (Path(_found(tree[key], file)) if tree.get(key) else None) for key, own in given.items()}
+
+        def own(key: str) -> Path | None:
+            return Path(_found(tree[key], file)) if tree.get(key) else None
+
         options = RunOptions(
             str(tree["backend"]), str(tree["frontend"]), SystemConfig.from_json(tree["settings"]), Path(), int(start),
             None if stop is None else int(stop), mono=bool(tree.get("mono", False)), format=before.get("format"),
-            source=source or (_found(before, file) if before else ""), kind=str(tree.get("kind", "handheld")), **files,
+            source=source or (_found(before, file) if before else ""), kind=str(tree.get("kind", "handheld")),
+            prior_map=prior_map or own("prior_map"), calibration=calibration or own("calibration"),
         )  # fmt: skip
         return options, dict(tree.get("versions", {}))
     except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:

@@ -90,7 +90,8 @@ METRICS = (
       for key, (over, name, main) in _NEES.items()),
     *(Metric(f"{key}_left_out", f"stretches {over} not judged", "", False, *_PERCENT,
              (*_HONEST, f"no covariance {over}")) for key, (over, _, _) in _NEES.items() if over != "from the start"),
-    Metric("nis_per_dof", "NIS / dof (below 1: less noise than assumed)", place=(*_HONEST, "NIS per degree of freedom")),
+    Metric("nis_per_dof", "NIS / dof (below 1: less noise than assumed)",
+           place=(*_HONEST, "NIS per degree of freedom")),
     Metric("landmark_error_m", "landmark error, median", "lower", True, *_MM),
     Metric("landmark_error_90_m", "landmark error, 90 % below", "lower", False, *_MM),
     Metric("association_precision", "association precision", "higher", False, *_PERCENT),
@@ -145,7 +146,9 @@ def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str
     for one in found:
         if not one.get("compiling", 0.0) > _COMPILED:
             one.pop("compiling", None)
-    bodies = dict.fromkeys(key for f in found for key in f if key.startswith("object bodies") and key.endswith(_OF_BODIES))
+    bodies = dict.fromkeys(
+        key for f in found for key in f if key.startswith("object bodies") and key.endswith(_OF_BODIES)
+    )
     for metric in (*_ABOVE, *METRICS, *map(object_metric, bodies), *_BELOW):
         values = [one.get(metric.key, float("nan")) for one in found]
         if metric.key not in _NOT_OF_ONE_RUN and np.isfinite(values).any():

@@ -65,7 +65,7 @@ def test_it_is_the_prior_of_a_run_and_of_its_repetition(made, tmp_path):
     found = json.loads((tmp_path / "first" / "summary.json").read_text())["self_calibration"]["parameters"]
     expected = json.loads(file.read_text())["parameters"]
     assert [row["mean"] for row in found] == [row["mean"] for row in expected]
-    assert load(tmp_path / "first").origin.calibration == file
+    assert load(tmp_path / "first")[0].calibration == file
     command("run", "--config", tmp_path / "first", "--out", tmp_path / "second", *QUIET)
     one, two = ((tmp_path / name / "trajectory.txt").read_bytes() for name in ("first", "second"))
     assert one == two

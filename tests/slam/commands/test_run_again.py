@@ -70,26 +70,26 @@ def test_a_recording_is_found_by_its_absolute_and_by_its_relative_path(here, rec
     source = json.loads((here / "out/run/config.json").read_text())["source"]
     assert source["relative"] == "../../data?kind=driving"
     assert source["absolute"] == f"{here / 'data'}?kind=driving"
-    assert load(here / "out/run/config.json").origin.sequence == f"{here / 'data'}?kind=driving"
+    assert load(here / "out/run/config.json")[0].source == f"{here / 'data'}?kind=driving"
     (here / "moved").mkdir()
     for name in ("data", "out"):
         (here / name).rename(here / "moved" / name)
-    found = load(here / "moved/out/run")
-    assert found.origin.sequence == f"{here / 'moved/data'}?kind=driving"
-    assert found.origin.kind == "driving"
+    found, _ = load(here / "moved/out/run")
+    assert found.source == f"{here / 'moved/data'}?kind=driving"
+    assert found.kind == "driving"
     (here / "moved/data").rename(here / "elsewhere")
     with pytest.raises(SlamError, match=r"data\?kind=driving is no longer at .*data.* nor .*moved/data"):
         slam("run", "--config", "moved/out/run")
     run("elsewhere", "--config", "moved/out/run", "--out", "third")
-    assert load(here / "third").config == found.config
+    assert load(here / "third")[0].config == found.config
 
 
 def test_a_prior_map_is_found_again(here):
     run(WORLD, "--save-map", "desk.map", "--out", "first")
     run(WORLD, "--map", "desk.map", "--mono", "--frames", "0:3", "--out", "second")
-    before = load(here / "second")
-    assert before.origin.mono
-    assert before.origin.prior_map == here / "desk.map"
+    before, _ = load(here / "second")
+    assert before.mono
+    assert before.prior_map == here / "desk.map"
     assert before.config.map.monocular
     run("--config", "second", "--out", "third")
     assert (here / "second/trajectory.txt").read_bytes() == (here / "third/trajectory.txt").read_bytes()
