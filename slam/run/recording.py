@@ -2,7 +2,7 @@
 
 Keys: ``header`` (JSON: ``format``, ``version``, ``name``, ``kind``, ``rig``, ``models``), ``numbers`` and ``stamps`` of
 the frames (F), ``rows`` (M, 3) of whole numbers: the row of ``stamps``, what it is (0 observed, 1 added, 2 removed),
-and the landmark's id, in the order in which they were given; ``pixels`` (M, 4): uL, vL, uR, vR. Where earlier frames were
+and the landmark's id, in the order in which they were given; ``pixels`` (M, 4): uL, vL, uR, vR. Where frames were
 corrected again, ``corrections``: the parameters of the correction that each frame's pixels have (F, n). Where the true
 path is known, ``truth_stamps`` and ``truth_poses``. Meanings: `slam.run.recorded.Recording`.
 """
