@@ -29,6 +29,9 @@ from slam.rig_error import CommonError
 #: Lengths of the stretches over which relative poses are compared [m].
 STRETCHES = (1.0, 10.0, 100.0)
 
+#: Beside the figures: the cameras are those of the calibration, while the covariances count errors of one.
+EXACT = "exact calibration"
+
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
 _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding
@@ -194,7 +197,3 @@ def _scale(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNo
 
 def _mean(values: Array) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
-
-
-#: Beside the figures: the cameras are those of the calibration, while the covariances count errors of one.
-EXACT = "exact calibration"
