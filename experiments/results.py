@@ -70,8 +70,7 @@ PAGES = {
 ERRORS = "Error of the position along the world's axes, and three times its claimed standard deviation."
 EXPERIMENTS = (
     Experiment(
-        "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."},
-        left_out=("landmark lifetime, median [frames]",),
+        "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
     ),
     Experiment("ablation", "recordings", "What each part is worth"),
     Experiment(

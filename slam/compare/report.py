@@ -32,7 +32,6 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
 
     every = groups(plan, runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.metrics))
-    tested = (Verdict.CERTAIN, Verdict.LIKELY, Verdict.HINT)
     timed = {stage for run in runs for stage in run.milliseconds}
     stages = ["total", *(stage for stage in STAGE_NAMES if stage in timed)]
     environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
@@ -44,7 +43,10 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         short=list(map(wording.conclusions, every)),
         caution=wording.caution(max(group.trials for group in every), most_tests(plan)),
         tests=count_tests(every),
-        strengths=[(verdict.value, wording.badge(verdict, ""), wording.STRENGTH[verdict]) for verdict in tested],
+        strengths=[
+            (verdict.value, wording.badge(verdict, ""), wording.STRENGTH[verdict])
+            for verdict in (Verdict.CERTAIN, Verdict.LIKELY)
+        ],
         fewest=FEWEST,
         level=round(100 * LEVEL),
         sections=[_section(plan, every[at : at + len(plan.modes)]) for at in range(0, len(every), len(plan.modes))],

@@ -180,10 +180,9 @@ def _json(tree: Any) -> bytes:
 
 
 class MapRecord:
-    """Associations and landmarks against a world's surfaces, lifetimes, and the size of the map.
+    """Associations and landmarks against a world's surfaces, and the size of the map.
 
     `start` is the number of the first frame. Associations of a replay are the same for all, and need no check.
-    Landmarks that are still in the map have lived until the last frame.
     """
 
     def __init__(self, sequence: Sequence, start: int = 0, associations: bool = True) -> None:
@@ -191,9 +190,6 @@ class MapRecord:
         self._truth = SurfacePoints(sequence) if sequence.format == "synthetic" else None
         self._sizes: list[int] = []
         self._right: list[bool] = []
-        self._first: dict[int, int] = {}  # frame in which each landmark of the map joined it
-        self._lived: list[int] = []  # frames, of those that have left it
-        self._last = 0
 
     def add(self, result: FrameResult) -> None:
         """One more frame."""
@@ -203,21 +199,12 @@ class MapRecord:
                 errors = self._truth.errors(number, result.matched, features.uv_left[result.matched_features])
                 self._right += (errors[np.isfinite(errors)] < _RIGHT).tolist()
             self._truth.add(number, result.added, features.uv_left[result.added_features])
-        for i in (*result.added.tolist(), *result.returned.tolist()):
-            self._first.setdefault(i, result.index)
-        for i in result.erased.tolist():
-            if i in self._first:  # else one of an old place, by which a kidnapped camera was found
-                self._lived.append(result.index - self._first.pop(i))
-        self._last = result.index
         self._sizes.append(result.map_size)
 
     def figures(self, record: RunRecord, out: Path) -> dict[str, float]:
         """The figures of a run that is finished and has left its files in `out`."""
-        lived = [*self._lived, *(self._last - first for first in self._first.values())]
         errors = self._landmark_errors(record, out)
         found = {
-            "lifetime_frames": np.median(lived) if lived else None,
-            "lifetime_mean_frames": np.mean(lived) if lived else None,
             "association_precision": np.mean(self._right) if self._right else None,
             "map_size": np.mean(self._sizes) if self._sizes else None,
             "landmark_error_m": np.median(errors) if len(errors) else None,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.compare.plan import REPLAY
-from slam.compare.statistics import ALPHA, HINT_ALPHA, Difference, Verdict, certain_of, fewest
+from slam.compare.statistics import ALPHA, Difference, Verdict, certain_of, fewest
 from slam.compare.tables import Group, mean_and_sd
 from slam.run.results import number, verdict
 
@@ -16,10 +16,9 @@ from slam.run.results import number, verdict
 STRENGTH = {
     Verdict.CERTAIN: f"certain (Holm-adjusted p ≤ {ALPHA:g})",
     Verdict.LIKELY: f"likely (p ≤ {ALPHA:g}, not after Holm's adjustment)",
-    Verdict.HINT: f"a hint (p ≤ {HINT_ALPHA:g})",
     Verdict.SINGLE: "in one trial, which cannot say whether that is chance",
 }
-_WORDS = {Verdict.HINT: "a hint", Verdict.SINGLE: "one trial", Verdict.NONE: "no pair", Verdict.UNTESTED: ""}
+_WORDS = {Verdict.SINGLE: "one trial", Verdict.NONE: "no pair", Verdict.UNTESTED: ""}
 
 _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
 _FACTOR = 3.0  # between two means, from which on it is said as a factor
@@ -46,7 +45,7 @@ class Conclusions:
     name: str  # of the group
     verdict: list[str]  # which back end is better in what, a sentence for each but the reference
     failed: str  # which runs failed; empty where none did
-    headlines: list[Line]  # what is certain, likely and a hint, and which main figures are open
+    headlines: list[Line]  # what is certain and likely, and which main figures are open
     honesty: list[str]  # one per back end, on its covariances
 
 
@@ -87,7 +86,7 @@ def direction(d: Difference) -> str:
 def _headlines(differences: Sequence[Difference], other: str) -> list[Line]:
     """What the other back end does better and worse than the reference, the surest first, and what remains open.
 
-    All that is certain, likely, or a hint is named, in both directions; of the rest the main figures, but for those
+    All that is certain or likely is named, in both directions; of the rest the main figures, but for those
     that are perfect in every run.
     """
     lines = []

@@ -100,8 +100,6 @@ METRICS = (
     Metric("frames_predicted", "frames predicted", "", False, *_PERCENT),
     Metric("frames_failed", "frames failed", "", False, *_PERCENT),
     Metric("map_size", "landmarks in the map, mean"),
-    Metric("lifetime_frames", "lifetime of a landmark, median", "", False, *_FRAMES),
-    Metric("lifetime_mean_frames", "lifetime of a landmark, mean", "", False, *_FRAMES),
     Metric("used_per_frame", "observations used per frame"),
 )  # fmt: skip
 
