@@ -59,12 +59,6 @@ def test_a_folder_that_is_missing_or_empty(slam_command, tmp_path):
         fails_with_one_line(slam_command(command, "", "--out", tmp_path / "out"), "path is empty")
 
 
-def test_cameras_swapped(slam_command, euroc, tmp_path):
-    sensor = euroc / "mav0" / "cam1" / "sensor.yaml"
-    sensor.write_text(sensor.read_text().replace("0.11", "-0.11"))
-    fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out"), "left")
-
-
 def test_a_truncated_image_is_said_and_the_rest_goes_on(slam_command, euroc, tmp_path):
     image = sorted((euroc / "mav0" / "cam0" / "data").iterdir())[1]
     image.write_bytes(image.read_bytes()[:-200])
@@ -81,7 +75,6 @@ def test_a_truncated_image_is_said_and_the_rest_goes_on(slam_command, euroc, tmp
     [
         (["--backend", "foo"], ["foo", "ekf", "smoother"]),
         (["--frontend", "foo"], ["foo", "surf"]),
-        (["--set", "map.colour=1"], ["colour"]),
         (["--set", "backend.colour=1"], ["colour"]),
         (["--set", "frontend.colour=1"], ["colour"]),
         (["--kind", "flying"], ["flying", "handheld"]),
