@@ -73,10 +73,9 @@ def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str
         for line in found.headlines:
             style = f"{'bold ' if line.verdict == 'certain' else ''}{_COLOURS[line.direction]}"
             table.add_row(f"  [{style}]{escape(line.badge)}[/]", escape(line.text))
-        if found.headlines:
-            _console.print(table, highlight=False)
         for text in found.honesty:
-            _say(f"  {text}")
+            table.add_row("  covariances", escape(text.replace(": covariances ", ": they ")))
+        _console.print(table, highlight=False)
     used = {line.verdict for found in every for line in found.headlines}
     if meanings := [meaning for verdict, meaning in STRENGTH.items() if verdict in used]:
         _say(f"Better or worse than {reference}: {'; '.join(meanings)}.")

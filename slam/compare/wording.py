@@ -150,10 +150,9 @@ def caution(trials: int, tests: int) -> str:
     if trials < fewest(1):
         chance = f"chance alone does as much in {200 / 2**trials:.2g} % of such comparisons"
         return f"With {trials} trials nothing can be certain: even where all agree, {chance}. {more}"
-    return (
-        f"With {trials} trials a difference that has the same sign in all is certain where up to {certain_of(trials)} "
-        f"figures are tested. {more}"
-    )
+    few = certain_of(trials)
+    at_most = "a single figure is" if few == 1 else f"up to {few} figures are"
+    return f"With {trials} trials a difference that has the same sign in all is certain where {at_most} tested. {more}"
 
 
 def measurements(mode: str, reference: str) -> str:

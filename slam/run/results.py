@@ -122,7 +122,7 @@ _BELOW = (
     Metric("behind_most", "behind, most", unit="ms", place=("live", "milliseconds behind", "max")),
     Metric("milliseconds", "stages of a frame, median", unit="ms", place=("milliseconds", "median_total")),
     Metric("rate", "frames per second", place=("frames_per_second",)),
-    Metric("compiling", "kernels compiled, beside these times", unit="s", place=("compile_seconds",)),
+    Metric("compiling", "kernels compiled, apart", unit="s", place=("compile_seconds",)),
 )
 _COMPILED = 0.05  # compile times below this [s] are not worth a row
 
@@ -241,10 +241,9 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
 def object_metric(key: str) -> Metric:
     """A figure of moving objects by the key that `object_figures` gives it."""
     text = key.removeprefix("object ")
-    body = re.match(r"bodies (\d+) (ME )?", text)
     label = f"objects: {text}"
-    if body:
-        label = f"body {body[1]}: {'motion error, ' if body[2] else ''}{text[body.end() :]}"
+    if body := re.match(r"bodies (\d+) (ME (\w+))?", text):
+        label = f"body {body[1]}: {f'{body[3]} error,' if body[2] else ''}{text[body.end() :]}"
     if key.endswith(_SHARES):
         return Metric(key, label, "higher", False, *_PERCENT)
     if key.endswith(_BODY_NEES):
