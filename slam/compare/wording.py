@@ -63,7 +63,7 @@ def conclusions(group: Group) -> Conclusions:
     variant = "" if group.variant.name == "surf" else f", {group.variant.name}"
     return Conclusions(
         f"{group.sequence}{variant}, {group.mode}",
-        [_in_short(differences, first, other) for other, differences in own.items()],
+        [in_short(differences, first, other) for other, differences in own.items()],
         failed if counts else "",
         [line for other, differences in own.items() for line in _headlines(differences, other)],
         [f"{backend}: {text}." for backend, text in honesty.items() if text],
@@ -105,7 +105,7 @@ def _headlines(differences: Sequence[Difference], other: str) -> list[Line]:
     return lines or [Line(f"{other}: errors (the true path is not known)", "", Verdict.NONE)]
 
 
-def _in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
+def in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
     """Which of two back ends is better in what, in one sentence: in the main figures that can be told apart."""
     sure = (Verdict.CERTAIN, Verdict.LIKELY)
     told = [d for d in differences if d.metric.main and d.verdict in sure and not is_trifle(d)]

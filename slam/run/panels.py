@@ -226,7 +226,7 @@ def time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     margin = 0.7 if len(runs) > 1 else 1.2
     right = 1.25 * max(float(left.max()), 1e-3)
     axis.set(xlim=(0, right), xlabel="time per frame [ms]", ylim=(-margin, len(runs) - 1 + margin))
-    set_title(axis, "Median time of a frame, and the shares of its stages")
+    set_title(axis, "Median time of a frame, by stage")
     _legend_below([axis])
 
 

@@ -14,9 +14,10 @@ import numpy as np
 from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
 from slam.evaluation.summary import rotation_errors
+from slam.evaluation.truth_error import truth_covariances
 from slam.files import read_object, read_text
-from slam.geometry.se3 import Array, hat, so3_exp
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.se3 import Array, adjoint, hat, inverse, so3_exp
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import printable
 from slam.run.schema import OLD_LANDMARKS, STAGES
 
@@ -41,6 +42,7 @@ class RunData:
     sequence: str
     backend: str
     folder: Path
+    truth_noise: TruthNoise  # how far the truth may be off
     truth_is_exact: bool  # whether the truth has no errors of its own: that of a world
     loops: np.ndarray  # rows of `final` whose places are the same (L, 2), the later one first
     refused: np.ndarray  # rows of `final` whose places only looked alike (L, 2), the later one first
@@ -80,7 +82,9 @@ class RunData:
         bodies: dict[str, list[list[float]]] = {}
         for _, body, position in read_objects(folder):
             bodies.setdefault(body, []).append(position)
-        truth, old, summary = folder / "truth.txt", folder / OLD_LANDMARKS, folder / "summary.json"
+        truth, old, path = folder / "truth.txt", folder / OLD_LANDMARKS, folder / "summary.json"
+        summary = read_object(path) if path.exists() else {}
+        noise: dict[str, Any] = {key: float(value) for key, value in summary.get("truth", {}).items()}
         return cls(
             name=printable(name),
             online=Trajectory.read_tum(folder / "trajectory.txt"),
@@ -96,13 +100,14 @@ class RunData:
             sequence=printable(str(config["sequence"])),
             backend=printable(str(config["backend"])),
             folder=folder,
+            truth_noise=TruthNoise(**noise),
             truth_is_exact=config["format"] == "synthetic",
             loops=pairs("loop"),
             refused=pairs("refused"),
             keyframes=rows_at([float(row["stamp"]) for row in frames if row["keyframe"] == "1"]),
             old=_numbers(_rows(old) if old.exists() else [], ("x", "y", "z")),
             bodies={body: np.array(positions) for body, positions in bodies.items()},
-            summary=read_object(summary) if summary.exists() else {},
+            summary=summary,
         )
 
     @property
@@ -171,7 +176,7 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
 
     The first three columns are the position along the axes of the run's world [m], see `place_of_truth`; the last one
     is the angle of the rotation's error [deg]. Without a truth the errors are zero. Standard deviations are those that
-    the back end claims and those of the truth, here and at the start, together, as NEES has them.
+    the back end claims and those of the truth together, as the NEES from the start has them.
     """
     if run.truth is None:
         stamps = run.online.stamps
@@ -181,10 +186,13 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
     expected = true.positions @ T[:3, :3].T + T[:3, 3]
     turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)
     errors = np.column_stack([own.positions - expected, np.degrees(turned)])
-    noise = run.summary.get("truth", {})
-    of_truth = np.repeat([noise.get("sigma [m]", 0.0), np.degrees(np.sqrt(3) * noise.get("sigma [rad]", 0.0))], (3, 1))
+    first, last = np.zeros(len(own), np.intp), np.arange(len(own))
+    A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
+    P, R = truth_covariances(true, run.truth_noise, first, last, A), own.poses[:, :3, :3]
+    of_truth = np.diagonal(R @ P[:, 3:, 3:] @ np.swapaxes(R, 1, 2), axis1=1, axis2=2)
+    of_truth = np.column_stack([of_truth, np.degrees(1) ** 2 * np.trace(P[:, :3, :3], axis1=1, axis2=2)])
     claimed = run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
-    return own.stamps - run.online.stamps[0], errors, np.hypot(claimed, np.sqrt(2) * of_truth)
+    return own.stamps - run.online.stamps[0], errors, np.sqrt(claimed**2 + np.maximum(of_truth, 0.0))
 
 
 def well_known(run: RunData) -> np.ndarray:

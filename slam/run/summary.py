@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -143,7 +143,7 @@ def results_of(
     }
     noise: TruthNoise | None = getattr(sequence, "truth_noise", None)
     if found["accuracy"]["online"] and noise is not None:  # for the picture's band, which is that of the verdict
-        found["truth"] = {"sigma [m]": noise.translation, "sigma [rad]": noise.rotation}
+        found["truth"] = asdict(noise)
     if isinstance(system, StereoSlam):
         values = getattr(sequence, "values", None)  # of a world: with recordings nobody knows
         if "mean NEES" in found["consistency"] and system.config.self_calibration.enabled and values is not None:

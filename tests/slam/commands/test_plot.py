@@ -8,7 +8,9 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.geometry.trajectory import Trajectory
+from slam.evaluation.truth_error import truth_covariances
+from slam.geometry.se3 import adjoint, inverse
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.options import RunOptions
 from slam.run.plots import KINDS
 from slam.run.plots import plot_folders as plot_runs
@@ -62,6 +64,22 @@ def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
     summary = run_.summary["accuracy"]["online"]
     assert np.sqrt(np.mean(error[:, 3] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
     assert (error[1:, 3] < 5 * sigma[1:, 3]).all() and (sigma[1:, 3] > 0).all()
+
+
+def test_the_band_has_the_truth_s_own_errors_as_the_verdict_has_them(runs):
+    run_ = RunData.read(runs / "a", "a")
+    _, error, claimed = pose_errors(run_)
+    noise = TruthNoise(rotation=0.01, translation=0.1)
+    _, same, both = pose_errors(replace(run_, truth_noise=noise))
+    np.testing.assert_array_equal(same, error)
+    own, true = run_.online, run_.truth
+    first, last = np.zeros(len(own), np.intp), np.arange(len(own))
+    A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
+    P = truth_covariances(true, noise, first, last, A)
+    np.testing.assert_allclose(
+        both[:, 3] ** 2 - claimed[:, 3] ** 2, np.degrees(1) ** 2 * np.trace(P[:, :3, :3], 0, 1, 2)
+    )
+    assert (both[1:] > claimed[1:]).all()
 
 
 def test_a_recorded_truth_of_a_straight_path_is_not_turned_about_it(runs):
