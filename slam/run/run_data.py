@@ -14,7 +14,7 @@ import numpy as np
 from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
 from slam.evaluation.summary import rotation_errors
-from slam.evaluation.truth_error import truth_covariances
+from slam.evaluation.truth_error import interpolated, truth_covariances
 from slam.files import read_object, read_text
 from slam.geometry.se3 import Array, adjoint, hat, inverse, so3_exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -146,6 +146,13 @@ def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
     return np.array([[float(row[c] or "nan") for c in columns] for row in rows]).reshape(-1, len(columns))
 
 
+def _paired(run: RunData, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """The online and the true path at common stamps, without poses of the truth that were not measured."""
+    own, true = associate(run.online, truth, 0.02, interpolated=True)
+    rows = np.flatnonzero(~interpolated(true, run.truth_noise))
+    return (own.select(rows), true.select(rows)) if len(rows) else (own, true)
+
+
 def place_of_truth(run: RunData, truth: Trajectory) -> Array:
     """Pose (4, 4) of the true path's world in the run's, in which both paths begin at the same position.
 
@@ -154,7 +161,7 @@ def place_of_truth(run: RunData, truth: Trajectory) -> Array:
     What the paths do not tell, such as a turn about a straight path, stays as it was. Where no little turn makes them
     fit, the truth's orientations are in other axes, and the paths alone count.
     """
-    own, true = associate(run.online, truth, 0.02, interpolated=True)
+    own, true = _paired(run, truth)
     T, turn = np.eye(4), own.poses[0, :3, :3] @ true.poses[0, :3, :3].T
     T[:3, :3] = turn
     if not run.truth_is_exact:
@@ -181,7 +188,7 @@ def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
     if run.truth is None:
         stamps = run.online.stamps
         return stamps - stamps[0], np.zeros((len(stamps), 4)), run.deviations
-    own, true = associate(run.online, run.truth, 0.02, interpolated=True)
+    own, true = _paired(run, run.truth)
     T = place_of_truth(run, run.truth)
     expected = true.positions @ T[:3, :3].T + T[:3, 3]
     turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)

@@ -93,3 +93,12 @@ def test_a_recorded_truth_of_a_straight_path_is_not_turned_about_it(runs):
     _, error, _ = pose_errors(replace(run_, online=next(made), truth=next(made), truth_is_exact=False))
     assert np.abs(error[:, 3]).max() < 0.01
     assert np.abs(error[:, :3]).max() < 0.01
+
+
+def test_truth_that_was_not_measured_is_no_error_in_the_picture(runs, monkeypatch):
+    """The first steps of KITTI 06 are extrapolated, which the verdict leaves out."""
+    monkeypatch.setattr("slam.run.run_data.interpolated", lambda true, noise: np.arange(len(true)) < 3)
+    run_ = RunData.read(runs / "a", "a")
+    time, error, _ = pose_errors(run_)
+    assert time[0] == pytest.approx(run_.online.stamps[3] - run_.online.stamps[0])
+    np.testing.assert_allclose(error[0], 0, atol=1e-9)
