@@ -72,7 +72,7 @@ EXPERIMENTS = (
     Experiment(
         "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
     ),
-    Experiment("ablation", "recordings", "What each part is worth"),
+    Experiment("ablation", "recordings", "What each part is worth", left_out=("smaller in", "lost")),
     Experiment(
         "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
             "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."
@@ -90,6 +90,7 @@ EXPERIMENTS = (
         "One 320x240 webcam image: 837 features at D_threshold 0, 41 at 10000; "
         "radii grow with the octave and numbers fall; octaves 3 and 4 are left out.",
         {"detector": "Left: features found with a threshold, by octave. Middle: time to detect them. Right: radii."},
+        left_out=("octave 3", "octave 4", "ms, 1 octave"),
     ),
     Experiment(
         "descriptors", "papers", "16 and 64 dimensions, known points (A, III.B, first experiment)",
