@@ -38,7 +38,7 @@ from slam.worlds import WorldSequence
 #: Files of a run by name.
 Files = dict[str, bytes]
 
-RESULT, TIMING, SERIES, RECORDING = "result.json", "timing.json", "series.csv", "recording.npz"
+RESULT, SERIES, RECORDING = "result.json", "series.csv", "recording.npz"
 COMPLETED = "completed"
 
 #: Columns of `SERIES`: time of a frame [s], and NEES of its pose since the start; NaN where it was not measured.
@@ -79,7 +79,7 @@ def run_trial(trial: Trial, recording: bytes | None = None) -> Files:
 def failed(trial: Trial, error: BaseException) -> Files:
     """What is kept of a run that an exception ended: its outcome, and no figures."""
     outcome = f"failed: {type(error).__name__}: {' '.join(str(error).split())}"
-    return {RESULT: _json({"trial": asdict(trial), "outcome": outcome, "metrics": {}})}
+    return {RESULT: _json({"trial": asdict(trial), "outcome": outcome, "metrics": {}, "milliseconds": {}})}
 
 
 def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
@@ -168,8 +168,8 @@ def _run(trial: Trial, recording: bytes | None, out: Path) -> Files:
     milliseconds |= {"total": times["median_total"]} if times else {}
     text = io.StringIO()
     np.savetxt(text, nees_series(record, sequence), "%.9g", ",", header=",".join(SERIES_COLUMNS), comments="")
-    result = {"trial": asdict(trial), "outcome": COMPLETED, "metrics": metrics}
-    return {RESULT: _json(result), TIMING: _json(milliseconds), SERIES: text.getvalue().encode()}
+    result = {"trial": asdict(trial), "outcome": COMPLETED, "metrics": metrics, "milliseconds": milliseconds}
+    return {RESULT: _json(result), SERIES: text.getvalue().encode()}
 
 
 def _json(tree: Any) -> bytes:

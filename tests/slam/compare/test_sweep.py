@@ -23,7 +23,7 @@ from slam.run.results import BY_KEY
 pytestmark = pytest.mark.slow  # all share one sweep
 
 PLAN = Plan(("synthetic:aisle?frames=8",), ("ekf", "smoother"), (Variant("simulated", "simulated"),), 2)
-TABLES = ("runs.csv", "means.csv", "differences.csv")
+TABLES = ("runs.csv", "differences.csv")
 
 
 def tables(folder):
