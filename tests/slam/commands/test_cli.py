@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from slam.sequences import open_sequence
+from slam.worlds.export import write_euroc
+
 
 def in_a_new_process(*arguments, **more):
     command = [sys.executable, "-m", "slam", *map(str, arguments)]
@@ -25,20 +28,10 @@ def fails_with_one_line(done, *words):
 @pytest.fixture
 def euroc(tmp_path):
     """A tiny EuRoC folder of noise images."""
-    rng, folder = np.random.default_rng(0), tmp_path / "euroc"
-    for camera, x in (("cam0", 0.0), ("cam1", 0.11)):
-        data = folder / "mav0" / camera / "data"
-        data.mkdir(parents=True)
-        stamps = [1_000_000_000 + 50_000_000 * k for k in range(3)]
-        for stamp in stamps:
-            cv2.imwrite(str(data / f"{stamp}.png"), rng.integers(0, 255, (120, 160), dtype=np.uint8))
-        rows = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
-        (data.parent / "data.csv").write_text(f"#timestamp [ns],filename\n{rows}")
-        (data.parent / "sensor.yaml").write_text(
-            f"sensor_type: camera\nT_BS:\n  rows: 4\n  cols: 4\n  data: [1,0,0,{x}, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n"
-            "resolution: [160, 120]\ncamera_model: pinhole\nintrinsics: [150, 150, 80, 60]\n"
-            "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
-        )
+    folder, rng = tmp_path / "euroc", np.random.default_rng(0)
+    write_euroc(open_sequence("synthetic:desk?frames=3&width=160&height=120"), folder, truth_images=False)
+    for image in sorted(folder.rglob("cam?/data/*.png")):
+        cv2.imwrite(str(image), rng.integers(0, 255, (120, 160), dtype=np.uint8))
     return folder
 
 

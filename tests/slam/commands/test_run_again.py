@@ -117,9 +117,6 @@ def test_a_bad_config_is_one_line(tmp_path, text, words):
         (tmp_path / "config.json").write_text(text)
     with pytest.raises(SlamError, match=words):
         slam("run", WORLD, "--config", tmp_path, "--kind", "driving")
-
-
-def test_no_config_and_no_sequence():
     with pytest.raises(SlamError, match="name a sequence"):
         slam("run")
 
