@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
@@ -36,6 +36,9 @@ def argument(help: str, metavar: str, show_default: bool = False) -> Any:
     """An argument of a command."""
     return typer.Argument(metavar=metavar, help=help, show_default=show_default)
 
+
+_File: TypeAlias = Path | None
+_Text: TypeAlias = str | None
 
 #: Options that several commands share.
 _Out = Annotated[Path, option("Folder for the files.", "DIR", "--out", "-o")]
@@ -93,39 +96,31 @@ def common_options(version: _Version = False) -> None:
 @app.command("run", short_help="Run one sequence through one back end.")
 def run_command(
     sequence: Annotated[
-        str | None,
+        _Text,
         argument(
             "A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
             "SEQUENCE",
         ),
     ] = None,
     out: _RunOut = None,
-    config: Annotated[
-        Path | None, option("config.json of an earlier run, to repeat it; other options change it.", "FILE")
-    ] = None,
+    config: Annotated[_File, option("config.json of an earlier run; other options change it.", "FILE")] = None,
     backend: _Backend = None,
-    frontend: Annotated[str | None, option("Front end, see `slam list`; default: surf.", "NAME")] = None,
+    frontend: Annotated[_Text, option("Front end, see `slam list`; default: surf.", "NAME")] = None,
     settings: _Set = None,
     frames: _Frames = None,
-    kind: Annotated[str | None, option("handheld or driving; default: the sequence's own.", "KIND")] = None,
+    kind: Annotated[_Text, option("handheld or driving; default: the sequence's own.", "KIND")] = None,
     format: _Format = None,
-    record: Annotated[Path | None, option("Record what the back end is given, for `slam replay`.", "FILE.npz")] = None,
-    prior_map: Annotated[Path | None, option("Start in the map of an earlier run.", "FILE", "--map")] = None,
-    save_map: Annotated[Path | None, option("Keep the map.", "FILE", "--save-map")] = None,
+    record: Annotated[_File, option("Record what the back end is given, for `slam replay`.", "FILE.npz")] = None,
+    prior_map: Annotated[_File, option("Start in the map of an earlier run.", "FILE", "--map")] = None,
+    save_map: Annotated[_File, option("Keep the map.", "FILE", "--save-map")] = None,
     mono: Annotated[bool, option("Left images alone, in a prior map.", None, "--mono")] = False,
-    calibration: Annotated[
-        Path | None, option("What is known of the rig: from `slam calibrate`, or an earlier run.", "FILE")
-    ] = None,
+    calibration: Annotated[_File, option("The rig's errors, from `slam calibrate` or a run.", "FILE")] = None,
     mask: _Mask = None,
-    viewer: Annotated[str | None, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
-    draw: Annotated[Path | None, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
+    viewer: Annotated[_Text, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
+    draw: Annotated[_File, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
     draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
-    overlap: Annotated[
-        bool, option("Extract the next frame's features while this one is estimated; same results.")
-    ] = True,
-    live: Annotated[
-        bool, option("Frames at their own rate; those that come too late are dropped.", None, "--live")
-    ] = False,
+    overlap: Annotated[bool, option("Extract the next frame while this one is estimated; same results.")] = True,
+    live: Annotated[bool, option("Frames at their own rate; late ones are dropped.", None, "--live")] = False,
     picture: _Picture = True,
     overwrite: _Overwrite = False,
     quiet: _Quiet = False,
@@ -204,9 +199,7 @@ def replay_command(
 @app.command("plot", short_help="Draw finished runs.")
 def plot_command(
     folders: Annotated[list[Path], argument("Left by `slam run`.", "DIR")],
-    out: Annotated[
-        Path | None, option("PNG, PDF or SVG; default: a PNG in the first folder.", "FILE", "--out", "-o")
-    ] = None,
+    out: Annotated[_File, option("PNG, PDF or SVG; default: a PNG in the first folder.", "FILE", "--out", "-o")] = None,
     figure: Annotated[str, option("summary, path, map, errors or time.", "NAME")] = "summary",
     width: Annotated[float | None, option("Width of the picture, such as 88 for a journal's column.", "MM")] = None,
     overwrite: _Overwrite = False,
@@ -234,16 +227,14 @@ def compare_command(
     out: Annotated[Path, option("Folder; a comparison that was stopped in it goes on.", "DIR", "--out", "-o")],
     backends: Annotated[str, option("Back ends; the first is the reference.", "A,B,...")] = ",".join(ONLINE),
     frontends: Annotated[str, option("Front ends; simulated: a world's own features, no images.", "A,B,...")] = "",
-    variant: Annotated[
-        list[str] | None, option("A front end with settings, NAME:FRONTEND:KEY=VALUE:...", "VARIANT")
-    ] = None,
+    variant: Annotated[list[str] | None, option("A front end, NAME:FRONTEND:KEY=VALUE:...", "VARIANT")] = None,
     settings: _Set = None,
     mask: _Mask = None,
     trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N", min=1)] = 12,
     frames: _Frames = None,
     replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
-    scheduler: Annotated[str | None, option("A Dask scheduler to be used.", "ADDRESS")] = None,
+    scheduler: Annotated[_Text, option("A Dask scheduler to be used.", "ADDRESS")] = None,
     quick: Annotated[bool, option("30 frames, 2 trials: does it work?", None, "--quick")] = False,
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
@@ -266,8 +257,8 @@ def compare_command(
 def calibrate_command(
     sequences: Annotated[list[str], argument("Recordings of one rig.", "SEQUENCE")],
     out: Annotated[Path, option("For `slam run --calibration`.", "FILE", "--out", "-o")] = Path("rig_errors.json"),
-    opencv: Annotated[Path | None, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
-    kalibr: Annotated[Path | None, option("The same in the form of Kalibr's camchain.", "FILE.yaml")] = None,
+    opencv: Annotated[_File, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
+    kalibr: Annotated[_File, option("The same in the form of Kalibr's camchain.", "FILE.yaml")] = None,
     settings: _Set = None,
     frames: _Frames = None,
     format: _Format = None,
