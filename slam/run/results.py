@@ -90,7 +90,7 @@ METRICS = (
       for key, (over, name, main) in _NEES.items()),
     *(Metric(f"{key}_left_out", f"stretches {over} not judged", "", False, *_PERCENT,
              (*_HONEST, f"no covariance {over}")) for key, (over, _, _) in _NEES.items() if over != "from the start"),
-    Metric("nis_per_dof", "NIS / dof (well below 1 is usual)",
+    Metric("nis_per_dof", "NIS / dof (up to 1 is right)",
            place=(*_HONEST, "NIS per degree of freedom")),
     Metric("landmark_error_m", "landmark error, median", "lower", True, *_MM),
     Metric("landmark_error_90_m", "landmark error, 90 % below", "lower", False, *_MM),

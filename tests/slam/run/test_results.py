@@ -75,4 +75,4 @@ def test_a_nees_of_which_most_stretches_had_no_covariance_is_no_figure():
 
 def test_the_nis_is_not_judged_by_a_value_that_no_run_has():
     """Below 1 the noise is smaller than assumed, which is no fault."""
-    assert BY_KEY["nis_per_dof"].better == "" and "well below 1 is usual" in BY_KEY["nis_per_dof"].label
+    assert BY_KEY["nis_per_dof"].better == "" and "up to 1 is right" in BY_KEY["nis_per_dof"].label
