@@ -36,11 +36,14 @@ _DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determ
 class BatchConfig:
     """Options of `BatchBackend`.
 
+    Attributes:
+        online: whether each frame's pose is that of the problem solved so far, and not the smoother's.
+
     Raises:
         ConfigurationError: it is neither true nor false.
     """
 
-    online: bool = False  # whether the pose alone is the solved one as well, and not the smoother's
+    online: bool = False
 
     def __post_init__(self) -> None:
         require_not_negative(self, {}, "batch")

@@ -25,7 +25,7 @@ from slam.calibration.posterior import RigPosterior
 from slam.config import SystemConfig
 from slam.naming import count
 from slam.registry import ONLINE
-from slam.run.calibrating import Targets, calibrate
+from slam.run.calibrating import calibrate
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
@@ -85,8 +85,9 @@ def world_row(world: str, options: str, backend: str, seeds: int) -> list[str]:
 
 def show_drives(drives: Mapping[str, Path], out: Path, frames: int | None) -> None:
     """Corrections by each drive that both of them show, and how far apart they are."""
-    sequences, targets = [open_sequence(f) for f in drives.values()], Targets(out / "rig.json", overwrite=True)
-    result = calibrate(sequences, targets, lambda *_: nullcontext(lambda _: None), (), (0, frames))
+    sequences = [open_sequence(f) for f in drives.values()]
+    quiet = nullcontext(lambda _: None)
+    result = calibrate(sequences, out / "rig.json", lambda *_: quiet, (), (0, frames), overwrite=True)
     apart = result.agreed.largest if result.agreed is not None else np.full(len(result.units), np.nan)
     rows = [
         [

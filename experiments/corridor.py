@@ -10,7 +10,6 @@ of the means over so many runs; NEES above it says that errors are larger than c
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import backends
 from experiments.common import script_options
 from experiments.long_run import DT, MODELS, RIG, Corridor, measured
-from experiments.tables import markdown
+from experiments.tables import picture, show
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.geometry import se3
 from slam.geometry.se3 import Array
@@ -92,8 +91,9 @@ def run(name: str, options: Mapping[str, object], frames: int, seed: int) -> Run
 
 
 HEADER = (
-    "filter", "NEES, first tenth", "NEES, last tenth (6)", "frames in the band", "heading at the end [deg]", "claimed",
-    "position at the end [m]", "claimed", "lost updates",
+    "filter", "NEES, first tenth", "NEES, last tenth (6)", "frames in the band", "heading at the end [deg]",
+    "heading claimed [deg]",
+    "position at the end [m]", "position claimed [m]", "lost updates",
 )  # fmt: skip
 
 
@@ -118,34 +118,14 @@ def row(name: str, runs: list[Run]) -> list[str]:
 
 def draw(path: Path, done: Mapping[str, list[Run]]) -> None:
     """Mean NEES frame by frame, and the claimed deviation of the heading."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
-    for name, runs in done.items():
-        left.semilogy(np.mean([r.nees for r in runs], axis=0), label=name, linewidth=0.9)
-        right.plot(np.rad2deg(np.mean([r.deviations[:, HEADING] for r in runs], axis=0)), label=name, linewidth=0.9)
-    left.axhspan(*chi_square_band(6, len(next(iter(done.values())))), color="0.85")
-    left.set(xlabel="frame", ylabel="mean NEES of the pose")
-    right.set(xlabel="frame", ylabel="claimed deviation of the heading [deg]", ylim=(0, None))
-    left.legend(fontsize="small")
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
-def write_csv(path: Path, done: Mapping[str, list[Run]]) -> None:
-    """A row per filter and frame: means over the runs."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["filter", "frame", "nees", "rmse_m", "rmse_heading_rad", "claimed_heading_rad"])
+    with picture(path, 10, 3.6, 1, 2) as (left, right):
         for name, runs in done.items():
-            for k in range(len(runs[0].nees)):
-                errors, claimed = np.array([r.errors[k] for r in runs]), np.array([r.deviations[k] for r in runs])
-                mean = np.mean([r.nees[k] for r in runs])
-                writer.writerow([name, k, mean, rms(errors, AT), rms(errors, HEADING), rms(claimed, HEADING)])
+            left.semilogy(np.mean([r.nees for r in runs], axis=0), label=name, linewidth=0.9)
+            right.plot(np.rad2deg(np.mean([r.deviations[:, HEADING] for r in runs], axis=0)), linewidth=0.9)
+        left.axhspan(*chi_square_band(6, len(next(iter(done.values())))), color="0.85")
+        left.set(xlabel="frame", ylabel="mean NEES of the pose")
+        right.set(xlabel="frame", ylabel="claimed deviation of the heading [deg]", ylim=(0, None))
+        left.legend(fontsize="small")
 
 
 def main() -> int:
@@ -162,9 +142,7 @@ def main() -> int:
         print(row(name, done[name]), file=sys.stderr, flush=True)
     low, high = chi_square_band(6, seeds)
     print(f"{seeds} runs of {frames} frames; 95 % of the means lie between {low:.1f} and {high:.1f}.\n")
-    print(markdown(HEADER, [row(name, runs) for name, runs in done.items()], 1))
-    given.out.mkdir(parents=True, exist_ok=True)
-    write_csv(given.out / "corridor.csv", done)
+    show(given.out / "table.json", HEADER, [row(name, runs) for name, runs in done.items()])
     draw(given.out / "corridor.png", done)
     return 0
 

@@ -39,13 +39,12 @@ PARTS = (
         "frame", "Whole frames",
         "Median times of a frame, images in memory, the detector of moving objects on, and their ratios to `cv2.SIFT` "
         "on one image and to ORB-SLAM3 on the same images; with overlap, times from one result to the next. CPU "
-        "time adds up all threads. Frames lost: without a pose. The second table has the CPU time of each stage, and "
-        "the way of a frame through the code outside the back end: files entered, calls between files, Python calls.",
+        "time adds up all threads.",
     ),
     Part(
         "growth", "How it grows",
-        "CPU time, and of what cannot be done without (floor): the filter's bare `dsyrk`, gtsam's own calls, SURF "
-        "alone, the same frames without the detector.",
+        "CPU time over the number of landmarks, features, moving cars and frames, and of what cannot be done without "
+        "(floor, dashed): the filter's bare `dsyrk`, gtsam's own calls, SURF alone, no detector.",
     ),
     Part(
         "command", "Whole runs",

@@ -20,7 +20,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import recordings, script_options
 from experiments.tables import picture, show
-from slam.compare.trial import Lifetimes
 from slam.config import SystemConfig
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
@@ -36,8 +35,7 @@ SEQUENCES = {
     "KITTI raw 0013": "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync",
     "EuRoC V1_01, 20 keyframes": "euroc/V1_01_keyframes_a",
 }
-HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", "NEES over 1 m", "NEES over 10 m",
-          "landmark lifetime, median [frames]")  # fmt: skip
+HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", "NEES over 1 m", "NEES over 10 m")
 
 
 def folder_of(name: str, backend: str, out: Path) -> Path:
@@ -47,11 +45,9 @@ def folder_of(name: str, backend: str, out: Path) -> Path:
 def run_one(name: str, folder: Path, backend: str, out: Path, frames: int | None) -> dict[str, Any]:
     sequence = open_sequence(folder)
     target = folder_of(name, backend, out)
-    lifetimes = Lifetimes()
     config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-    options = RunOptions(backend, "surf", config, target, 0, frames, origin={"kind": sequence.kind})
-    summary = run(sequence, options, lifetimes.add)
-    return {**summary, "lifetime": lifetimes.figures()["lifetime_frames"]}
+    options = RunOptions(backend, "surf", config, target, 0, frames, kind=sequence.kind)
+    return run(sequence, options)
 
 
 def row(name: str, summary: dict[str, Any]) -> list[str]:
@@ -62,7 +58,7 @@ def row(name: str, summary: dict[str, Any]) -> list[str]:
     for length in (1, 10):
         nees = summary["consistency"].get(f"NEES over {length} m")
         texts.append("–" if nees is None else f"{nees:.1f}")
-    return [name, summary["backend"], tracked, *texts, f"{summary['lifetime']:.0f}"]
+    return [name, summary["backend"], tracked, *texts]
 
 
 def draw(names: dict[str, Path], out: Path) -> None:

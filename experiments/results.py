@@ -12,7 +12,6 @@ which spoils their times. ``--only`` replaces the sections of some scripts and l
 from __future__ import annotations
 
 import argparse
-import ast
 import os
 import shutil
 import subprocess
@@ -42,6 +41,7 @@ class Experiment:
         paper: what the paper had; empty for our own.
         pictures: captions of those that are shown, by name.
         arguments: of its long form.
+        left_out: columns of its tables that are not shown on the page; they are in the files that it leaves.
     """
 
     name: str
@@ -50,6 +50,7 @@ class Experiment:
     paper: str = ""
     pictures: dict[str, str] | None = None
     arguments: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def command(self, quick: bool) -> list[str]:
         """Script and arguments, without the folder."""
@@ -71,16 +72,12 @@ EXPERIMENTS = (
     Experiment(
         "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
     ),
-    Experiment("ablation", "recordings", "What each part is worth"),
-    Experiment(
-        "recorded_tracks", "recordings", "Recorded tracks of a drive, with more and more wrong matches",
-        arguments=("--wrong", "0", "0.2", "--seeds", "5"),
-        pictures={"recorded_tracks": "From above; all begin at the same pose, nothing is aligned."},
-    ),
+    Experiment("ablation", "recordings", "What each part is worth", left_out=("smaller in", "lost")),
     Experiment(
         "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
             "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."
         },
+        left_out=("frames inside", "leaves at", "pixel NIS"),
     ),
     Experiment(
         "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "4"), pictures={
@@ -93,6 +90,7 @@ EXPERIMENTS = (
         "One 320x240 webcam image: 837 features at D_threshold 0, 41 at 10000; "
         "radii grow with the octave and numbers fall; octaves 3 and 4 are left out.",
         {"detector": "Left: features found with a threshold, by octave. Middle: time to detect them. Right: radii."},
+        left_out=("octave 3", "octave 4", "ms, 1 octave"),
     ),
     Experiment(
         "descriptors", "papers", "16 and 64 dimensions, known points (A, III.B, first experiment)",
@@ -108,11 +106,13 @@ EXPERIMENTS = (
             "errors": ERRORS,
             "top_view": "The map from above with ellipses of two standard deviations (paper A, Fig. 6).",
         },
+        left_out=("end [cm]", "doubled", "NIS/dof"),
     ),
     Experiment(
         "startup", "papers", "Start-up from stored features (B, 4.2, Fig. 6)",
         "Camera truly at [3, −70, 2.7] cm, started at [0, 0, 0]: stopped at [0, −55.8, 3.7], 15 cm off.",
         {"startup": "Left and middle: from three wrong starts to the true place in one frame. Right: the error then."},
+        left_out=("frame 10 [cm]", "frames above 1 cm"),
     ),
     Experiment(
         "walking_robot", "papers", "Walking robot (B, 4.3, Fig. 8)",
@@ -122,18 +122,26 @@ EXPERIMENTS = (
         "moving_objects", "objects", "Moving box, moving objects (B, 4.4, Table 1, Fig. 10)",
         "A box at four places by three features; Table 1 prints roll, pitch, yaw and translation, no ground truth.",
         {"box": "Error of the box's pose while it moves and rests, body frames aligned once."},
+        left_out=("camera NEES", "false moving per 1000 still", "objects [ms]", "absolute [deg]", "absolute [mm]",
+                  "rows", "frames in view", "labelled [m/s]", "longest [frames]", "not measured [rows]"),
     ),
     Experiment(
         "loops", "loops", "Long drives that come back: loops closed",
         arguments=("--paths", "00", "05", "06", "07", "09", "--set", *loops.QUICK),
         pictures={"loops": "From above: true, without loops, and at the end with loops; circles: loops closed."},
+        left_out=("keyframes", "places found again [%]", "final length [%]", "memory [kB a frame]", "median frame [ms]",
+                  "without, scale fitted [m]", "final, scale fitted [m]"),
     ),
     Experiment(
         "faults", "faults", "Blackout, dropped frames, a kidnapped camera",
         pictures={"faults": "Error of the position, frame by frame; the fault is grey."},
+        left_out=("error before [cm]", "added while lost"),
     ),
-    Experiment("perturbations", "faults", "Real drives many times over, and spoilt"),
-    Experiment("cost", "cost", "What a frame costs, next to others", pictures={"growth": "Floors are dashed."}),
+    Experiment("perturbations", "faults", "Real drives many times over, and spoilt", left_out=("lost",)),
+    Experiment(
+        "cost", "cost", "What a frame costs, next to others", pictures={"growth": "Floors are dashed."},
+        left_out=("by", "ATE [mm]", "frames lost", "wall / SIFT", "CPU / SIFT", "cv2.SIFT at 752x480, wall / CPU [ms]"),
+    ),
 )  # fmt: skip
 
 #: What the first page shows: of which experiment, which picture.
@@ -160,11 +168,24 @@ def run(experiment: Experiment, folder: Path, quick: bool) -> tuple[str, str]:
     return done.stdout, failure
 
 
-def described(experiment: Experiment) -> str:
-    """What a script is about: the first paragraph of its docstring."""
-    script = ROOT / "experiments" / f"{experiment.name}.py"
-    text = ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) if script.exists() else None
-    return " ".join((text or "").split("\n\n")[0].split())
+def readable(text: str, left_out: Sequence[str] = ()) -> str:
+    """Tables without some columns (without the first: not at all), and first cells only where they change."""
+    out: list[str] = []
+    kept, before = None, ""
+    for line in text.splitlines():
+        if not line.startswith("|"):
+            kept, before = None, ""
+            out.append(line)
+            continue
+        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        if kept is None:
+            kept = [i for i, name in enumerate(cells) if name not in left_out]
+        if 0 not in kept:
+            continue
+        cells = [cells[i] for i in kept]
+        before, first = cells[0], "" if cells[0] == before and len(kept) > 2 else cells[0]
+        out.append(f"| {' | '.join([first, *cells[1:]])} |".replace("|  |", "| |"))
+    return "\n".join(out)
 
 
 def copied_pictures(experiment: Experiment, out: Path, page: Path) -> list[str]:
@@ -175,14 +196,15 @@ def copied_pictures(experiment: Experiment, out: Path, page: Path) -> list[str]:
         if (out / f"{name}.png").exists():
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(out / f"{name}.png", target)
-            shown.append(f"![{said}](../images/results/{target.name})\n\n*{said}*")
+            shown.append(f"![{name}](../images/results/{target.name})\n\n*{said}*")
     return shown
 
 
 def section(experiment: Experiment, printed: str, failure: str, pictures: Sequence[str], quick: bool) -> str:
     """A script's section of its page; headings that it printed stand below the section's."""
     text = "\n".join(f"##{line}" if line.startswith("#") else line for line in printed.strip().splitlines())
-    parts = [f"## {experiment.title}", described(experiment)]
+    text = readable(text, experiment.left_out)
+    parts = [f"## {experiment.title}"]
     parts += [f"**The paper:** {experiment.paper}"] if experiment.paper else []
     parts += [f"**Failed:** {failure}"] if failure else []
     return "\n\n".join([*parts, text, *pictures, f"`python {' '.join(experiment.command(quick))}`\n"])
@@ -197,14 +219,10 @@ def with_section(page: str, title: str, text: str) -> str:
 
 
 def page_head(name: str, quick: bool) -> str:
-    """Title, question, and with what the page was made."""
-    used = ", ".join(f"{package} {version}" for package, version in versions().items())
-    short = " in its short form, which shows that everything runs, and no more" if quick else ""
+    """Title and question."""
+    short = " In the short form, which shows that everything runs, and no more." if quick else ""
     title, question = PAGES[name]
-    return (
-        f"# {title}\n\n{question} Errors, covariances and NEES: see [concepts](../concepts.md). Written by "
-        f"`python experiments/results.py`{short}, with {used}.\n"
-    )
+    return f"# {title}\n\n{question}{short} Errors, covariances and NEES: see [concepts](../concepts.md).\n"
 
 
 def first_page() -> str:
@@ -215,7 +233,9 @@ def first_page() -> str:
     pictures = [f"![{captions.get(shown, shown[0])}](images/results/{'_'.join(shown)}.png)" for shown in SHOWN]
     pages = [f"- [{title}](results/{name}.md): {question}" for name, (title, question) in PAGES.items()]
     right = "NEES says whether [covariances](concepts.md#evaluation) are as large as the errors: 6 is right."
-    return "\n\n".join(["# Results", table, right, *pictures, "\n".join(pages)]) + "\n"
+    used = ", ".join(f"{package} {version}" for package, version in versions().items())
+    made = f"Written by `python experiments/results.py`, with {used}."
+    return "\n\n".join(["# Results", table, right, *pictures, "\n".join(pages), made]) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

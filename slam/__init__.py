@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from slam.calibration.saved import SavedCalibration as SavedCalibration
     from slam.calibration.saved import load_calibration as load_calibration
     from slam.calibration.saved import save_calibration as save_calibration
+    from slam.config import SystemConfig as SystemConfig
     from slam.geometry.rig import StereoRig as StereoRig
     from slam.geometry.trajectory import Trajectory as Trajectory
     from slam.mapping.map_io import SavedMap as SavedMap
@@ -42,6 +43,7 @@ _PUBLIC = {
     "StereoFrame": "slam.data",
     "StereoRig": "slam.geometry.rig",
     "StereoSlam": "slam.system",
+    "SystemConfig": "slam.config",
     "Trajectory": "slam.geometry.trajectory",
     "load_calibration": "slam.calibration.saved",
     "load_map": "slam.mapping.map_io",

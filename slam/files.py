@@ -91,7 +91,7 @@ def read_object(path: str | Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as fault:
         raise SlamError(f"{path}: no valid JSON: {fault}") from fault
     if not isinstance(tree, dict):
-        raise SlamError(f"{path}: must hold an object, not a {type(tree).__name__}")
+        raise SlamError(f"{path}: must hold an object, not {type(tree).__name__}")
     return tree
 
 

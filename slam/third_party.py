@@ -41,7 +41,7 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     """
     what, (kind, attributes) = f"{type(owner).__name__}.{method}", _ANSWERS[method]
     if not isinstance(answer, kind):
-        raise SlamError(f"{what}: must give a {kind.__name__}, got {type(answer).__name__}")
+        raise SlamError(f"{what}: must be of type {kind.__name__}, got {type(answer).__name__}")
     for name, wanted in attributes.items():
         value, where = getattr(answer, name), what if name == "real" else f"{what}: {name}"
         if isinstance(wanted, tuple):
@@ -59,7 +59,7 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
             if name in _FINITE and not np.isfinite(value).all():
                 raise SlamError(f"{where} is not finite")
         elif not isinstance(value, wanted):
-            raise SlamError(f"{where} must be a {wanted.__name__}, got {type(value).__name__}")
+            raise SlamError(f"{where} must be of type {wanted.__name__}, got {type(value).__name__}")
         elif name == "stamp" and not abs(value) <= LATEST_STAMP:
             raise SlamError(f"{where} must be within {LATEST_STAMP:g} s")
     return answer

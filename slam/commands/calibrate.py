@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -15,7 +16,7 @@ from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import ConfigurationError
 from slam.files import noting_inputs
-from slam.run.calibrating import Calibrated, Targets
+from slam.run.calibrating import Calibrated
 from slam.run.calibrating import calibrate as run
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
@@ -26,13 +27,14 @@ _COLUMNS = 3  # most recordings with a column of their own
 
 def calibrate(
     texts: Sequence[str],
-    targets: Targets,
+    out: Path,
     settings: Sequence[str],
     frames: tuple[int, int | None],
     format: str | None,
     quiet: bool,
+    **files: Path | bool | None,
 ) -> None:
-    """Run recordings of one rig; write and print what they say of it.
+    """Run recordings of one rig; write and print what they say of it; `files` as `slam.run.calibrating` has them.
 
     Raises:
         SlamError: bad input; one line says what and where.
@@ -47,37 +49,34 @@ def calibrate(
     require_settable(settings, SystemConfig().to_json(), "surf")
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
-    done = run(opened, targets, show, settings, frames, inputs)
+    done = run(opened, out, show, settings, frames, inputs, **files)  # type: ignore[arg-type]
     if done.warning:
         logging.getLogger(__name__).warning("%s", done.warning)
     if not quiet:
         _print(done)
-        if targets.opencv is not None or targets.kalibr is not None:
+        if files.get("opencv") or files.get("kalibr"):
             print(f"The corrected calibration holds the corrections to {done.off:.3f} px, and no uncertainty.")
-        print(f"Use it: slam run SEQUENCE --calibration {targets.out}")
+        print(f"Use it: slam run SEQUENCE --calibration {out}")
 
 
 def _print(done: Calibrated) -> None:
     """The table, and what it says."""
-    console, joint = Console(), done.kept.posterior
+    console, joint, agreed = Console(), done.kept.posterior, done.agreed
     shown = done.found if len(done.found) <= _COLUMNS else ()
     table = Table(title="corrections: mean ± standard deviation", show_lines=False)
     table.add_column("parameter")
     table.add_column("unit")
-    for name in ("all", *(f"({number})" for number in range(1, len(shown) + 1))):
+    for name in ("all", *(f"({number})" for number in range(1, len(shown) + 1)), *(["apart"] if agreed else [])):
         table.add_column(name, justify="right", no_wrap=True)
-    if done.agreed is not None:
-        table.add_column("apart", justify="right")
     for row, (name, (factor, unit)) in enumerate(zip(joint.names, done.units)):
         beliefs = [joint, *(one.posterior for one in shown)]
         cells = [f"{factor * p.mean[row]:.2f} ± {factor * p.sigma[row]:.2f}" for p in beliefs]
-        if done.agreed is not None:
-            apart = done.agreed.largest[row]
-            cells.append(f"{apart:.1f} σ" if np.isfinite(apart) else "–")
+        if agreed is not None:
+            cells.append(f"{agreed.largest[row]:.1f} σ" if np.isfinite(agreed.largest[row]) else "–")
         table.add_row(name, unit, *cells)
     console.print(table)
     for number, one in enumerate(done.found, 1):
         tells = "" if one.evidence is not None else ": no motion that shows anything, left out"
         console.print(f"({number}) {one.name}: {one.frames} frames, {one.pairs} pairs of views{tells}", markup=False)
-    if done.agreed is not None:
-        console.print(done.agreed.words, markup=False)
+    for text in filter(None, (done.judgement, agreed and agreed.words)):
+        console.print(text, markup=False, highlight=False)

@@ -10,12 +10,11 @@ from contextlib import ExitStack
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from slam.commands.error_exit import one_line_errors
-from slam.commands.signals import catch_signals, leaving, whole_frames
+from slam.commands.ending import catch_signals, leaving, one_line_errors, whole_frames
 from slam.registry import ONLINE
 from slam.runtime.memory import require_address_space
 
@@ -38,28 +37,31 @@ def argument(help: str, metavar: str, show_default: bool = False) -> Any:
     return typer.Argument(metavar=metavar, help=help, show_default=show_default)
 
 
+_File: TypeAlias = Path | None
+_Text: TypeAlias = str | None
+
 #: Options that several commands share.
-_OutOption = Annotated[Path, option("Folder for the files.", "DIR", "--out", "-o")]
-_RunOutOption = Annotated[
+_Out = Annotated[Path, option("Folder for the files.", "DIR", "--out", "-o")]
+_RunOut = Annotated[
     Path | None, option("Folder for the files; default: results/SEQUENCE-BACKEND-N.", "DIR", "--out", "-o")
 ]
-_OverwriteOption = Annotated[bool, option("Replace files that are there; never an input.", None, "--overwrite")]
-_SetOption = Annotated[
+_Overwrite = Annotated[bool, option("Replace files that are there; never an input.", None, "--overwrite")]
+_Set = Annotated[
     list[str] | None,
     option("A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.", "KEY=VALUE", "--set"),
 ]
-_BackendOption = Annotated[str | None, option("Back end, see `slam list`; default: ekf.", "NAME")]
-_FramesOption = Annotated[str | None, option("Range of frames, B left out.", "A:B")]
-_QuietOption = Annotated[bool, option("No progress, no table.", None, "--quiet", "-q")]
-_PictureOption = Annotated[bool, option("Leave a picture of the run.", None, "--picture/--no-picture")]
-_FormatOption = Annotated[str | None, option("Format; default: found out from the folder.", "FORMAT")]
-_MaskOption = Annotated[
+_Backend = Annotated[str | None, option("Back end, see `slam list`; default: ekf.", "NAME")]
+_Frames = Annotated[str | None, option("Range of frames, B left out.", "A:B")]
+_Quiet = Annotated[bool, option("No progress, no table.", None, "--quiet", "-q")]
+_Picture = Annotated[bool, option("Leave a picture of the run.", None, "--picture/--no-picture")]
+_Format = Annotated[str | None, option("Format; default: found out from the folder.", "FORMAT")]
+_Mask = Annotated[
     str | None, option("Image that is black where a camera sees its own car; left, right.", "FILE[,FILE]")
 ]
 
 
 def main() -> None:
-    """Entry point; errors end as `slam.commands.error_exit` says."""
+    """Entry point; errors end as `slam.commands.ending` says."""
     os.environ["MPLBACKEND"] = "agg"  # pictures are files here, whatever windows are to be drawn with elsewhere
     catch_signals()
     for stream in (sys.stdout, sys.stderr):
@@ -75,67 +77,62 @@ def main() -> None:
 def _print_version(wanted: bool) -> None:
     """What ``--version`` prints."""
     if wanted:
-        from slam.run.repeat import versions
+        from slam.version import __version__
 
-        print(f"surf-stereo-slam {versions()['surf-stereo-slam']}")
+        print(f"surf-stereo-slam {__version__}")
         raise typer.Exit
 
 
+_Version = Annotated[
+    bool, option("Show the version and exit.", None, "--version", callback=_print_version, is_eager=True)
+]
+
+
 @app.callback()
-def common_options(
-    version: Annotated[
-        bool, option("Show the version and exit.", None, "--version", callback=_print_version, is_eager=True)
-    ] = False,
-) -> None:
+def common_options(version: _Version = False) -> None:
     """Options of the command itself."""
 
 
 @app.command("run", short_help="Run one sequence through one back end.")
 def run_command(
     sequence: Annotated[
-        str | None,
+        _Text,
         argument(
             "A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
             "SEQUENCE",
         ),
     ] = None,
-    out: _RunOutOption = None,
-    config: Annotated[
-        Path | None, option("config.json of an earlier run, to repeat it; other options change it.", "FILE")
-    ] = None,
-    backend: _BackendOption = None,
-    frontend: Annotated[str | None, option("Front end, see `slam list`; default: surf.", "NAME")] = None,
-    settings: _SetOption = None,
-    frames: _FramesOption = None,
-    kind: Annotated[str | None, option("handheld or driving; default: the sequence's own.", "KIND")] = None,
-    format: _FormatOption = None,
-    record: Annotated[Path | None, option("Record what the back end is given, for `slam replay`.", "FILE.npz")] = None,
-    prior_map: Annotated[Path | None, option("Start in the map of an earlier run.", "FILE", "--map")] = None,
-    save_map: Annotated[Path | None, option("Keep the map.", "FILE", "--save-map")] = None,
+    out: _RunOut = None,
+    config: Annotated[_File, option("config.json of an earlier run; other options change it.", "FILE")] = None,
+    backend: _Backend = None,
+    frontend: Annotated[_Text, option("Front end, see `slam list`; default: surf.", "NAME")] = None,
+    settings: _Set = None,
+    frames: _Frames = None,
+    kind: Annotated[_Text, option("handheld or driving; default: the sequence's own.", "KIND")] = None,
+    format: _Format = None,
+    record: Annotated[_File, option("Record what the back end is given, for `slam replay`.", "FILE.npz")] = None,
+    prior_map: Annotated[_File, option("Start in the map of an earlier run.", "FILE", "--map")] = None,
+    save_map: Annotated[_File, option("Keep the map.", "FILE", "--save-map")] = None,
     mono: Annotated[bool, option("Left images alone, in a prior map.", None, "--mono")] = False,
-    calibration: Annotated[
-        Path | None, option("What is known of the rig: from `slam calibrate`, or an earlier run.", "FILE")
-    ] = None,
-    mask: _MaskOption = None,
-    viewer: Annotated[str | None, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
-    draw: Annotated[Path | None, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
+    calibration: Annotated[_File, option("The rig's errors, from `slam calibrate` or a run.", "FILE")] = None,
+    mask: _Mask = None,
+    viewer: Annotated[_Text, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
+    draw: Annotated[_File, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
     draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
-    overlap: Annotated[
-        bool, option("Extract the next frame's features while this one is estimated; same results.")
-    ] = True,
-    live: Annotated[
-        bool, option("Frames at their own rate; those that come too late are dropped.", None, "--live")
-    ] = False,
-    picture: _PictureOption = True,
-    overwrite: _OverwriteOption = False,
-    quiet: _QuietOption = False,
+    overlap: Annotated[bool, option("Extract the next frame while this one is estimated; same results.")] = True,
+    live: Annotated[bool, option("Frames at their own rate; late ones are dropped.", None, "--live")] = False,
+    picture: _Picture = True,
+    overwrite: _Overwrite = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Run one sequence through one back end."""
     from slam.commands.display import progress
-    from slam.commands.run import finish, frame_count, prepare, run_folder, shown, title, watches
+    from slam.commands.run import finish, frame_count, prepare, run_folder, title, watches
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
+    from slam.run import drawing
+    from slam.run import viewer as viewing
     from slam.run.runner import run
     from slam.run.warm_up import compiled_in_background
     from slam.sequences import is_live, with_mask
@@ -146,35 +143,35 @@ def run_command(
     if draw_map and draw is None:
         raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     with noting_inputs() as inputs:
-        opened, options, origin = prepare(
+        opened, options = prepare(
             sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
         )
     shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
-        require_outputs([*options.outputs, *shown(draw, viewer)], [*inputs, *options.inputs], overwrite)
+        written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
+        require_outputs(written, [*inputs, *options.inputs], overwrite)
         if options.config.objects.mode != "off":
             stack.enter_context(compiled_in_background(options.backend))
-        options = replace(options, origin=origin.to_json(folder))
         seen = watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
         end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress(*shown_as)), folder, until))
         summary = run(opened, options, end_of_frame, watches=seen, until=until)
-    finish(summary, folder, picture, quiet)
+    finish(summary, written, picture, quiet)
 
 
 @app.command("replay", short_help="Feed a back end recorded measurements.")
 def replay_command(
     recording: Annotated[Path, argument("Made by `slam run --record`.", "FILE.npz")],
-    out: _RunOutOption = None,
-    backend: _BackendOption = None,
-    settings: _SetOption = None,
-    picture: _PictureOption = True,
-    overwrite: _OverwriteOption = False,
-    quiet: _QuietOption = False,
+    out: _RunOut = None,
+    backend: _Backend = None,
+    settings: _Set = None,
+    picture: _Picture = True,
+    overwrite: _Overwrite = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Give a back end the same measurements that another one was given."""
     from slam.commands.display import progress
@@ -191,23 +188,21 @@ def replay_command(
     require_settable(settings or [], default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings or [])
     with run_folder(out, loaded.name, name) as folder:
-        options = RunOptions(name, "recording", config, folder, origin={"command": command_line()})
+        options = RunOptions(name, "recording", config, folder, command=command_line())
         require_outputs(options.outputs, [recording], overwrite)
         shown_as = len(loaded), title(loaded, name), quiet
         with progress(*shown_as) as tell, whole_frames(tell, folder) as end_of_frame:
             summary = run_recording(loaded, options, end_of_frame)
-    finish(summary, folder, picture, quiet)
+    finish(summary, options.outputs, picture, quiet)
 
 
 @app.command("plot", short_help="Draw finished runs.")
 def plot_command(
     folders: Annotated[list[Path], argument("Left by `slam run`.", "DIR")],
-    out: Annotated[
-        Path | None, option("PNG, PDF or SVG; default: a PNG in the first folder.", "FILE", "--out", "-o")
-    ] = None,
+    out: Annotated[_File, option("PNG, PDF or SVG; default: a PNG in the first folder.", "FILE", "--out", "-o")] = None,
     figure: Annotated[str, option("summary, path, map, errors or time.", "NAME")] = "summary",
     width: Annotated[float | None, option("Width of the picture, such as 88 for a journal's column.", "MM")] = None,
-    overwrite: _OverwriteOption = False,
+    overwrite: _Overwrite = False,
 ) -> None:
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
     from slam.run.plots import plot_folders
@@ -232,18 +227,16 @@ def compare_command(
     out: Annotated[Path, option("Folder; a comparison that was stopped in it goes on.", "DIR", "--out", "-o")],
     backends: Annotated[str, option("Back ends; the first is the reference.", "A,B,...")] = ",".join(ONLINE),
     frontends: Annotated[str, option("Front ends; simulated: a world's own features, no images.", "A,B,...")] = "",
-    variant: Annotated[
-        list[str] | None, option("A front end with settings, NAME:FRONTEND:KEY=VALUE:...", "VARIANT")
-    ] = None,
-    settings: _SetOption = None,
-    mask: _MaskOption = None,
+    variant: Annotated[list[str] | None, option("A front end, NAME:FRONTEND:KEY=VALUE:...", "VARIANT")] = None,
+    settings: _Set = None,
+    mask: _Mask = None,
     trials: Annotated[int, option("Seeds 0 to N - 1 of every synthetic world.", "N", min=1)] = 12,
-    frames: _FramesOption = None,
+    frames: _Frames = None,
     replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
-    scheduler: Annotated[str | None, option("A Dask scheduler to be used.", "ADDRESS")] = None,
+    scheduler: Annotated[_Text, option("A Dask scheduler to be used.", "ADDRESS")] = None,
     quick: Annotated[bool, option("30 frames, 2 trials: does it work?", None, "--quick")] = False,
-    overwrite: _OverwriteOption = False,
+    overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
@@ -264,32 +257,30 @@ def compare_command(
 def calibrate_command(
     sequences: Annotated[list[str], argument("Recordings of one rig.", "SEQUENCE")],
     out: Annotated[Path, option("For `slam run --calibration`.", "FILE", "--out", "-o")] = Path("rig_errors.json"),
-    opencv: Annotated[Path | None, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
-    kalibr: Annotated[Path | None, option("The same in the form of Kalibr's camchain.", "FILE.yaml")] = None,
-    settings: _SetOption = None,
-    frames: _FramesOption = None,
-    format: _FormatOption = None,
-    mask: _MaskOption = None,
-    overwrite: _OverwriteOption = False,
-    quiet: _QuietOption = False,
+    opencv: Annotated[_File, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
+    kalibr: Annotated[_File, option("The same in the form of Kalibr's camchain.", "FILE.yaml")] = None,
+    settings: _Set = None,
+    frames: _Frames = None,
+    format: _Format = None,
+    mask: _Mask = None,
+    overwrite: _Overwrite = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Find what a rig's calibration is off by, from all its recordings together, and whether they agree."""
     from slam.commands.calibrate import calibrate
-    from slam.run.calibrating import Targets
     from slam.run.options import parse_frames
     from slam.sequences import with_mask
 
-    sequences = [with_mask(text, mask) for text in sequences]
-    targets = Targets(out, opencv, kalibr, overwrite)
+    texts, files = [with_mask(text, mask) for text in sequences], {"opencv": opencv, "kalibr": kalibr}
     with leaving("nothing is written"):
-        calibrate(sequences, targets, settings or [], parse_frames(frames), format, quiet)
+        calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, overwrite=overwrite, **files)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")
 def render_command(
     sequence: Annotated[str, argument("A folder, or synthetic:NAME?key=value.", "SEQUENCE")],
-    out: _OutOption,
-    frames: _FramesOption = None,
+    out: _Out,
+    frames: _Frames = None,
     truth_images: Annotated[bool, option("Depth and object images as well.")] = True,
     quiet: Annotated[bool, option("No progress.", None, "--quiet", "-q")] = False,
 ) -> None:
@@ -316,7 +307,7 @@ def render_command(
 def view_command(
     folder: Annotated[Path, argument("Left by `slam run`.", "DIR")],
     target: Annotated[str, option("A window, or a file.", "live|FILE.rrd", "--to")] = "live",
-    overwrite: _OverwriteOption = False,
+    overwrite: _Overwrite = False,
 ) -> None:
     """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
     from slam.run.viewer import view_run
@@ -335,7 +326,7 @@ def list_command(
 
 
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
-def warm_up_command(quiet: _QuietOption = False) -> None:
+def warm_up_command(quiet: _Quiet = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
     from slam.run.warm_up import compiled_in_background, warm_up
 
@@ -347,10 +338,10 @@ def warm_up_command(quiet: _QuietOption = False) -> None:
 
 @app.command("demo", short_help="Try three back ends on a built-in scene.")
 def demo_command(
-    out: _OutOption = Path("slam_demo"),
+    out: _Out = Path("slam_demo"),
     frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
-    overwrite: _OverwriteOption = False,
-    quiet: _QuietOption = False,
+    overwrite: _Overwrite = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Run three back ends on a built-in scene, compare them, and draw pictures."""
     from slam.commands.demo import demo

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import timedelta
+from math import ceil
 from pathlib import Path
 
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
@@ -79,7 +80,7 @@ def compare(
     if not quiet:
         heavy = [t.mode == CLOSED_LOOP and t.variant.frontend != SIMULATED for t in plan.every]  # images are rendered
         seconds = sum(frames[t.sequence] * (0.12 if h else 0.03) for t, h in zip(plan.every, heavy)) / count
-        about = f": about {timedelta(seconds=round(seconds, -1))}" if address is None else ""
+        about = f": about {timedelta(seconds=10 * ceil(seconds / 10))}" if address is None else ""
         print(f"{len(plan.every)} runs, {total} frames in all, {where}{about}")
         if most_tests(plan):
             print(limits or f"{plan.trials} trials are enough for certainty in all figures.", flush=True)

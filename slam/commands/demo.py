@@ -60,7 +60,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
         (frame,) = sequence.frames(last.index, last.index + 1)
         write_png(out / _FRAME, with_legend(draw_objects(frame.left, last, sequence.rig), last.objects))
     if not quiet:
-        print_summary(summaries, out)
+        print_summary(summaries, [out])
         print(_WHY)
         print(f"Open first: {out / PICTURE}; then {out / _FRAME}, the box in the image")
     return summaries

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from rich.progress import Progress as RichProgress
 from rich.table import Table
 
 from slam.data import FrameResult
+from slam.errors import SlamError
 from slam.run.results import rows, verdict_of_run
 from slam.runtime.compile_clock import working_time
 
@@ -71,10 +73,9 @@ def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str
         for line in found.headlines:
             style = f"{'bold ' if line.verdict == 'certain' else ''}{_COLOURS[line.direction]}"
             table.add_row(f"  [{style}]{escape(line.badge)}[/]", escape(line.text))
-        if found.headlines:
-            _console.print(table, highlight=False)
         for text in found.honesty:
-            _say(f"  {text}")
+            table.add_row("  covariances", escape(text.replace(": covariances ", ": they ")))
+        _console.print(table, highlight=False)
     used = {line.verdict for found in every for line in found.headlines}
     if meanings := [meaning for verdict, meaning in STRENGTH.items() if verdict in used]:
         _say(f"Better or worse than {reference}: {'; '.join(meanings)}.")
@@ -86,8 +87,8 @@ def _say(text: str, style: str | None = None) -> None:
     _console.print(escape(text), style=style, highlight=False)
 
 
-def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
-    """A table of finished runs, a column each, and whether their covariances hold."""
+def print_summary(summaries: list[dict[str, Any]], files: Sequence[Path]) -> None:
+    """A table of finished runs, a column each, whether their covariances hold, and what was written."""
     table = Table(title=summaries[0]["sequence"], title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     for summary in summaries:
@@ -98,7 +99,7 @@ def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
     for summary in summaries:
         if words := verdict_of_run(summary):
             _say(f"{summary['backend']}: {words}")
-    _say(f"Files: {out}")
+    _say(f"Files: {', '.join(map(str, files))}")
 
 
 def print_listing(options: bool = False) -> None:
@@ -106,18 +107,22 @@ def print_listing(options: bool = False) -> None:
     from slam import registry, worlds
     from slam.sequences import formats
 
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_row("back ends", ", ".join(registry.names("backends")))
-    table.add_row("front ends", ", ".join(registry.names("frontends")))
-    table.add_row("formats", ", ".join(formats()))
-    _console.print(table)
     if options:
         for text in (*(f"synthetic:{worlds.describe(name)}" for name in worlds.names()), worlds.describe_common()):
             _say(f"\n{text}")
         return
     table = Table.grid(padding=(0, 2))
+    for role, title in (("backends", "back ends"), ("frontends", "front ends")):
+        table.add_row(f"[bold]{title}[/]")
+        for name in registry.names(role):
+            try:
+                text = cleandoc(registry.resolve(role, name).__doc__ or "").partition("\n\n")[0]
+            except SlamError as error:  # one of another package that is broken
+                text = str(error)
+            table.add_row(escape(name), escape(" ".join(text.split())))
+    table.add_row("[bold]built-in sequences[/]")
     for name in worlds.names():
         table.add_row(f"synthetic:{name}", escape(worlds.describe(name).splitlines()[0].partition(": ")[2]))
-    _console.print("built-in sequences")
-    _console.print(table)
-    _console.print("`slam list --options` shows the options of each", highlight=False)
+    table.add_row("[bold]formats[/]", ", ".join(formats()))
+    _console.print(table, highlight=False)
+    _say("`slam list --options` shows the options of each built-in sequence, `slam settings NAME` those of the others.")

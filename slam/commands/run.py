@@ -19,14 +19,14 @@ from slam.commands.display import print_summary
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
-from slam.run import drawing
-from slam.run import viewer as viewing
+from slam.run.drawing import FramePictures
 from slam.run.options import RunOptions, parse_frames
 from slam.run.outcome import nothing_tracked
 from slam.run.plots import leave_picture
 from slam.run.recorded import Recording
-from slam.run.repeat import Origin, changed_versions, load, versions
+from slam.run.repeat import changed_versions, load, versions
 from slam.run.runner import Watch
+from slam.run.viewer import Viewer
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live, open_sequence
 from slam.settings import require_settable
@@ -48,32 +48,31 @@ def prepare(
     prior_map: Path | None = None,
     mono: bool = False,
     calibration: Path | None = None,
-) -> tuple[StereoSequence, RunOptions, Origin]:
+) -> tuple[StereoSequence, RunOptions]:
     """The sequence, opened, and what to do with it; the folder is still to be chosen.
 
     Arguments are those of the command line, None where it says nothing; `config` is the ``config.json`` of an earlier
     run, whose choices hold then. Raises SlamError on bad input; one line says what and where.
     """
-    start, stop, text = 0, None, sequence
-    before = None if config is None else load(config, sequence, prior_map, calibration)
-    if before is not None:
+    made_with: dict[str, str] = {}
+    before = RunOptions("", "", SystemConfig(), source=sequence or "", prior_map=prior_map, calibration=calibration)
+    if config is not None:
+        before, made_with = load(config, sequence, prior_map, calibration)
         if kind is not None:
             raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
         if sequence is None:  # a given sequence has a format of its own
-            format = format or before.origin.format
-        text, kind, start, stop = before.origin.sequence, before.origin.kind, before.start, before.stop
-        frontend, backend = frontend or before.frontend, backend or before.backend
-        mono, prior_map, calibration = mono or before.origin.mono, before.origin.prior_map, before.origin.calibration
-    if not text and sequence is None:
+            format = format or before.format
+    if not before.source and sequence is None:
         raise ConfigurationError("name a sequence (see `slam list`), or --config FILE of an earlier run")
-    opened = open_sequence(text or "", format=format)
-    frontend, backend, kind = frontend or _FRONTEND, backend or _BACKEND, kind or opened.kind
-    if mono and prior_map is None:
+    opened = open_sequence(before.source, format=format)
+    kind = kind or before.kind or opened.kind
+    frontend, backend = frontend or before.frontend or _FRONTEND, backend or before.backend or _BACKEND
+    mono = mono or before.mono
+    if mono and before.prior_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
     chosen = SystemConfig.for_kind(kind, frontend, backend)
-    if before is not None:  # options of another front end or back end than its are the defaults
-        changed = changed_versions(before.versions, versions())
-        if changed:
+    if config is not None:  # options of another front end or back end than its are the defaults
+        if changed := changed_versions(made_with, versions()):
             logging.getLogger(__name__).warning("made with other versions, results may differ: %s", "; ".join(changed))
         chosen = replace(
             before.config,
@@ -82,18 +81,11 @@ def prepare(
         )
     require_settable(settings, chosen.to_json(), frontend)
     chosen = chosen.with_settings([*(["map.monocular=true"] if mono else []), *settings])
-    if frames is not None:
-        start, stop = parse_frames(frames)
-    options = RunOptions(
-        backend, frontend, chosen, Path(), start, stop, prior_map=prior_map, mono=mono, calibration=calibration
-    )
-    return opened, options, Origin(command_line(), text or "", format, kind, prior_map, mono, calibration)
-
-
-def shown(draw: Path | None, viewer: str | None) -> list[Output]:
-    """What is written for people who watch: pictures or a video, and a file for Rerun."""
-    pictures = [] if draw is None else [drawing.output(draw)]
-    return pictures + ([] if viewer is None else viewing.outputs(viewer, "--viewer"))
+    start, stop = (before.start, before.stop) if frames is None else parse_frames(frames)
+    return opened, replace(
+        before, backend=backend, frontend=frontend, config=chosen, start=start, stop=stop, mono=mono, format=format,
+        kind=kind, command=command_line(),
+    )  # fmt: skip
 
 
 def watches(
@@ -102,9 +94,9 @@ def watches(
     """What is shown of every frame: the viewer, and pictures in a folder or a video; the stack closes them."""
     found: list[Watch] = []
     if viewer is not None:
-        found.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
+        found.append(stack.enter_context(Viewer(viewer, opened.rig, opened.ground_truth)).show)
     if draw is not None:
-        found.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
+        found.append(stack.enter_context(FramePictures(draw, draw_map)).show)
     return found
 
 
@@ -121,18 +113,19 @@ def frame_count(sequence: StereoSequence, start: int, stop: int | None) -> int |
     return len(range(len(sequence))[start:stop])
 
 
-def finish(summary: dict[str, Any], folder: Path, picture: bool, quiet: bool) -> None:
-    """Leave the picture of a run and print its table, and a line where many frames were not tracked.
+def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, quiet: bool) -> None:
+    """Leave the picture of a run and print its table, its files, and a line where many frames were not tracked.
 
-    The exit status is 1 where none was.
+    The first of `written` is its folder. The exit status is 1 where no frame was tracked.
     """
+    folder = written[0].path
     if not summary["frames"]:
         print(f"slam: the run ended before its first frame; files: {folder}", file=sys.stderr)
         return
     if picture:
         leave_picture(folder)
     if not quiet:
-        print_summary([summary], folder)
+        print_summary([summary], [output.path for output in written])
     if summary["tracking"]:
         print(f"slam: {summary['tracking']}", file=sys.stderr)
     if nothing_tracked(summary):
@@ -148,23 +141,14 @@ def command_line() -> str:
 def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
     """The folder for a run: `out`, or ``results/<sequence>-<backend>-<n>`` with the first number that is free.
 
-    One that was made here is removed where nothing was written into it. Raises SlamError where none can be made.
+    One that was made here, so that no other run can take it, is removed where nothing was written into it. Raises
+    SlamError where none can be made.
     """
     if out is not None:
         yield out
         return
-    folder = _claimed(f"{_short(sequence)}-{_short(backend)}")
-    try:
-        yield folder
-    finally:
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()
-
-
-def _claimed(name: str) -> Path:
-    """A new folder of this name and the first free number; made here, so that no other run can take it."""
     for number in count(1):
-        folder = RESULTS / f"{name}-{number}"
+        folder = RESULTS / f"{_short(sequence)}-{_short(backend)}-{number}"
         try:
             folder.mkdir(parents=True)
             break
@@ -173,7 +157,11 @@ def _claimed(name: str) -> Path:
                 raise SlamError(f"{RESULTS}: a file where the folder of all results should be; give --out") from None
         except OSError as error:
             raise SlamError(f"cannot write to {folder}: {error.strerror or error}; give --out") from error
-    return folder
+    try:
+        yield folder
+    finally:
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()
 
 
 def _short(text: str) -> str:

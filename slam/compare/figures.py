@@ -44,17 +44,17 @@ def pictures(group: Group) -> Iterator[tuple[str, str, Figure]]:
     if main is not None and group.trials > 1:
         text = f"{main.label}, of every trial; lines join the back ends' runs on the same recording."
         yield main.label, text, _draw_pairs(group, main)
-    yield "Paths from above", f"Paths from above{of_seed}.", drawn(runs, "path", _WIDTH)
+    yield "Paths from above", f"Paths from above{of_seed}.", drawn(runs, "path", _WIDTH)[0]
     if "nees_per_dof" in known:
         text = f"Error of the position{of_seed}, and the ±3σ that each back end claims (shaded)."
-        yield "Error over time", text, drawn(runs, "errors", _WIDTH)
+        yield "Error over time", text, drawn(runs, "errors", _WIDTH)[0]
         text = (
             "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
             "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
         )
         yield "NEES over time", text, _draw_nees(group)
     text = f"Time per frame by stage{of_seed}, one thread; it depends on the machine."
-    yield "Time per stage", text, drawn(runs, "time", _WIDTH)
+    yield "Time per stage", text, drawn(runs, "time", _WIDTH)[0]
 
 
 def _colours(group: Group) -> dict[str, str]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam.compare import figures, wording
 from slam.compare.plan import Plan
-from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
+from slam.compare.statistics import FEWEST, LEVEL, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_and_sd, most_tests, run_rows
 from slam.files import read_object, write_text
@@ -32,7 +32,8 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
 
     every = groups(plan, runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.metrics))
-    tested = (Verdict.CERTAIN, Verdict.LIKELY, Verdict.HINT)
+    timed = {stage for run in runs for stage in run.milliseconds}
+    stages = ["total", *(stage for stage in STAGE_NAMES if stage in timed)]
     environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
     text = environment.get_template("report.html.j2").render(
         title=f"{' against '.join(plan.backends)}: a paired comparison",
@@ -42,17 +43,21 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         short=list(map(wording.conclusions, every)),
         caution=wording.caution(max(group.trials for group in every), most_tests(plan)),
         tests=count_tests(every),
-        strengths=[(verdict.value, wording.badge(verdict, ""), wording.STRENGTH[verdict]) for verdict in tested],
+        strengths=[
+            (verdict.value, wording.badge(verdict, ""), wording.STRENGTH[verdict])
+            for verdict in (Verdict.CERTAIN, Verdict.LIKELY)
+        ],
         fewest=FEWEST,
         level=round(100 * LEVEL),
         sections=[_section(plan, every[at : at + len(plan.modes)]) for at in range(0, len(every), len(plan.modes))],
         workers=workers,
-        **_times(every),
+        stages=["whole frame", *map(STAGE_NAMES.get, stages[1:])],
+        times=[_times(group, backend, stages) for group in every for backend in group.runs],
         run_columns=(*RUN_COLUMNS, *keys),
         run_rows=run_rows(runs, keys, number),
         command=f"{plan.command()} --out DIR",
         versions=read_object(out / SWEEP)["versions"],
-        settings=_settings(every),
+        settings=_settings(runs),
         script=Markup((TEMPLATES / "map3d.js").read_text(encoding="utf-8")),
     )
     write_text(out / "report.html", text)
@@ -91,7 +96,7 @@ def _table(group: Group) -> dict[str, Any]:
 
 
 def _row(group: Group, metric: Metric) -> dict[str, Any]:
-    """The figure of each back end, and its differences from the first one's."""
+    """The figure of each back end, and its differences from the first one's; a badge's colour is the direction."""
     means, failed, label = [], [0] * len(group.runs), metric.title
     for backend in group.runs:
         mean, sd = (metric.scale * value for value in mean_and_sd(group.finite(backend, metric.key)))
@@ -99,40 +104,29 @@ def _row(group: Group, metric: Metric) -> dict[str, Any]:
     if metric is COMPLETED:
         failed, label = list(map(group.failures, group.runs)), metric.label
         means = [(f"{group.trials - count} of {group.trials}", "") for count in failed]
-    cells = [_cells(d) for d in group.differences(metric).values()]
+    cells = []
+    for d in group.differences(metric).values():
+        way = wording.direction(d)
+        cell = {"verdict": d.verdict.value, "direction": way, "words": wording.badge(d.verdict, way)}
+        cell["mean"], cell["interval"] = wording.shown_difference(d)
+        cell["p"], cell["p_holm"] = (wording.shown_p(p) if d.varies else "–" for p in (d.p, d.p_holm))
+        cells.append(cell)
     return {"label": label, "means": means, "failed": failed, "cells": cells}
 
 
-def _cells(d: Difference) -> dict[str, str]:
-    """A difference's cells; the badge's colour is the direction, its strength the verdict."""
-    mean, interval = wording.shown_difference(d)
-    p, p_holm = (wording.shown_p(value) if d.varies else "–" for value in (d.p, d.p_holm))
-    way = wording.direction(d)
-    return {
-        "verdict": d.verdict.value, "direction": way, "words": wording.badge(d.verdict, way), "mean": mean,
-        "interval": interval, "p": p, "p_holm": p_holm,
-    }  # fmt: skip
+def _times(group: Group, backend: str, stages: Sequence[str]) -> tuple[str, ...]:
+    """A row of medians."""
+    own = group.runs[backend]
+    values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in stages)
+    cells = (f"{np.median(each):.2f}" if each else "–" for each in values)
+    return (group.sequence, group.variant.name, group.mode, backend, *cells)
 
 
-def _times(every: Sequence[Group]) -> dict[str, Any]:
-    """What the stages do, and a row of medians per group and back end."""
-    timed = {stage for group in every for runs in group.runs.values() for run in runs for stage in run.milliseconds}
-    known = ["total", *(stage for stage in STAGE_NAMES if stage in timed)]
-    rows = []
-    for group in every:
-        for backend, own in group.runs.items():
-            values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in known)
-            cells = (f"{np.median(each):.2f}" if each else "–" for each in values)
-            rows.append((group.sequence, group.variant.name, group.mode, backend, *cells))
-    return {"stages": ["whole frame", *map(STAGE_NAMES.get, known[1:])], "times": rows}
-
-
-def _settings(every: Sequence[Group]) -> str:
-    """``config.json`` of the first completed run of each variant and back end."""
+def _settings(runs: Sequence[Run]) -> str:
+    """``config.json`` of the first run of each variant and back end that has one."""
     shown: dict[str, Any] = {}
-    for group in every:
-        for backend, runs in group.runs.items():
-            file = next((r.folder / "config.json" for r in runs if (r.folder / "config.json").exists()), None)
-            if file is not None:
-                shown.setdefault(f"{group.variant.name} · {backend}", read_object(file))
+    for run in runs:
+        name = f"{run.trial.variant.name} · {run.trial.backend}"
+        if name not in shown and (run.folder / "config.json").exists():
+            shown[name] = read_object(run.folder / "config.json")
     return json.dumps(shown, indent=1)

@@ -102,19 +102,15 @@ def _in_pool(waiting: deque[Job], workers: int, deliver: Deliver) -> list[Job]:
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool whose processes begin with one thread each, and end with this block however it ends."""
-    before = {process.pid for process in multiprocessing.active_children()}
+    before = set(multiprocessing.active_children())
     kept = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin_worker)
     try:
         yield pool
     except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        own = [process for process in multiprocessing.active_children() if process.pid not in before]
-        for process in own:
+        for process in set(multiprocessing.active_children()) - before:
             process.terminate()
-        for process in own:
-            process.join()
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

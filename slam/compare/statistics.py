@@ -28,9 +28,6 @@ LEVEL = 0.95
 #: p up to which a difference is significant: Holm-adjusted it is certain, before the adjustment likely.
 ALPHA = 0.05
 
-#: p, before the adjustment, up to which a difference is a hint.
-HINT_ALPHA = 0.1
-
 _RESAMPLES = 9999
 _SEED = 0
 _EXACT = 16  # pairs up to which all 2ᴺ patterns of signs are tried; for more as many are drawn
@@ -41,7 +38,6 @@ class Verdict(StrEnum):
 
     CERTAIN = "certain"
     LIKELY = "likely"
-    HINT = "hint"
     OPEN = "open"
     EQUAL = "equal"
     SINGLE = "single"
@@ -103,10 +99,8 @@ class Difference:
             return Verdict.UNTESTED
         if self.pairs == 1:  # without any spread to judge it by
             return Verdict.SINGLE
-        if self.low <= 0 <= self.high or self.p > HINT_ALPHA:
+        if self.low <= 0 <= self.high or self.p > ALPHA:
             return Verdict.OPEN
-        if self.p > ALPHA:
-            return Verdict.HINT
         return Verdict.CERTAIN if self.p_holm <= ALPHA else Verdict.LIKELY
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from slam import registry
 from slam.compare.plan import CLOSED_LOOP, REPLAY, SIMULATED, Plan, Trial
 from slam.compare.scheduler import Job, Scheduler
-from slam.compare.trial import COMPLETED, RECORDING, RESULT, TIMING, Files, config_of, failed, run_trial
+from slam.compare.trial import COMPLETED, RECORDING, RESULT, Files, config_of, failed, run_trial
 from slam.errors import SlamError
 from slam.files import noting_inputs, read_object, remove_file
 from slam.outputs import Output, require_outputs
@@ -28,7 +28,7 @@ from slam.sequences.faults import said_before
 RUNS, SWEEP = "runs", "sweep.json"
 
 #: What a comparison leaves in its folder.
-NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "means.csv", "differences.csv", "timings.csv", "report.html")
+NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "timings.csv", "report.html")
 
 
 @dataclass(frozen=True)
@@ -157,10 +157,10 @@ def read_run(trial: Trial, out: Path) -> Run:
         SlamError: it is not there, or cannot be read.
     """
     folder = out / RUNS / trial.folder
-    result, timing = read_object(folder / RESULT), folder / TIMING
+    result = read_object(folder / RESULT)
     if not isinstance(result.get("outcome"), str):
         raise SlamError(f"{folder / RESULT}: does not say how the run ended")
-    trees: tuple[Any, Any] = result.get("metrics"), read_object(timing) if timing.exists() else {}
+    trees: list[Any] = [result.get("metrics"), result.get("milliseconds")]
     try:
         metrics, milliseconds = ({name: float(value) for name, value in tree.items()} for tree in trees)
     except (AttributeError, TypeError, ValueError, OverflowError) as error:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.compare.plan import Plan, Variant
-from slam.compare.statistics import Difference, adjusted, difference, interval
+from slam.compare.statistics import Difference, adjusted, difference
 from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
@@ -20,9 +20,6 @@ from slam.run.results import BY_KEY, COMPLETED, METRICS, Metric, object_metric
 DIFFERENCE_COLUMNS = (
     "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
     "difference", "low", "high", "p", "p_holm", "other_lower", "other_higher", "verdict",
-)  # fmt: skip
-MEAN_COLUMNS = (
-    "sequence", "variant", "mode", "backend", "figure", "runs", "failed", "mean", "sd", "low", "high", "min", "max",
 )  # fmt: skip
 RUN_COLUMNS = ("sequence", "variant", "frontend", "mode", "seed", "backend", "outcome")
 
@@ -96,14 +93,13 @@ def most_tests(plan: Plan) -> int:
 
 
 def write_tables(plan: Plan, runs: Sequence[Run], out: Path) -> None:
-    """Write runs.csv, means.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
+    """Write runs.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
     keys = [*BY_KEY, *sorted({key for run in runs for key in run.metrics} - set(BY_KEY))]
     stages = list(dict.fromkeys(stage for run in runs for stage in run.milliseconds))
     times = [*RUN_COLUMNS, *(f"ms_{stage}" for stage in stages)]
     every = groups(plan, runs)
     for name, columns, rows in (
         ("runs", (*RUN_COLUMNS, *keys), run_rows(runs, keys, _number)),
-        ("means", MEAN_COLUMNS, [row for group in every for row in _mean_rows(group)]),
         ("differences", DIFFERENCE_COLUMNS, [row for group in every for row in _difference_rows(group)]),
         ("timings", times, [(*_head(r), *(_number(r.milliseconds.get(s, np.nan)) for s in stages)) for r in runs]),
     ):
@@ -119,16 +115,6 @@ def _head(run: Run) -> tuple[str, ...]:
     """Cells of `RUN_COLUMNS`."""
     t = run.trial
     return t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
-
-
-def _mean_rows(group: Group) -> Iterable[tuple[object, ...]]:
-    for metric in group.metrics:
-        for backend in group.runs:
-            values = group.finite(backend, metric.key)
-            ends = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
-            head = (group.sequence, group.variant.name, group.mode, backend, metric.key)
-            figures = map(_number, (*mean_and_sd(values), *interval(values), *ends))
-            yield (*head, len(values), group.failures(backend), *figures)
 
 
 def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:

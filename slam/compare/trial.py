@@ -38,7 +38,7 @@ from slam.worlds import WorldSequence
 #: Files of a run by name.
 Files = dict[str, bytes]
 
-RESULT, TIMING, SERIES, RECORDING = "result.json", "timing.json", "series.csv", "recording.npz"
+RESULT, SERIES, RECORDING = "result.json", "series.csv", "recording.npz"
 COMPLETED = "completed"
 
 #: Columns of `SERIES`: time of a frame [s], and NEES of its pose since the start; NaN where it was not measured.
@@ -76,7 +76,7 @@ def run_trial(trial: Trial, recording: bytes | None = None) -> Files:
 def failed(trial: Trial, error: BaseException) -> Files:
     """What is kept of a run that an exception ended: its outcome, and no figures."""
     outcome = f"failed: {type(error).__name__}: {' '.join(str(error).split())}"
-    return {RESULT: _json({"trial": asdict(trial), "outcome": outcome, "metrics": {}})}
+    return {RESULT: _json({"trial": asdict(trial), "outcome": outcome, "metrics": {}, "milliseconds": {}})}
 
 
 def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
@@ -165,8 +165,8 @@ def _run(trial: Trial, recording: bytes | None, out: Path) -> Files:
     milliseconds |= {"total": times["median_total"]} if times else {}
     text = io.StringIO()
     np.savetxt(text, nees_series(record, sequence), "%.9g", ",", header=",".join(SERIES_COLUMNS), comments="")
-    result = {"trial": asdict(trial), "outcome": COMPLETED, "metrics": metrics}
-    return {RESULT: _json(result), TIMING: _json(milliseconds), SERIES: text.getvalue().encode()}
+    result = {"trial": asdict(trial), "outcome": COMPLETED, "metrics": metrics, "milliseconds": milliseconds}
+    return {RESULT: _json(result), SERIES: text.getvalue().encode()}
 
 
 def _json(tree: Any) -> bytes:
@@ -177,7 +177,7 @@ def _json(tree: Any) -> bytes:
 
 
 class MapRecord:
-    """Associations and landmarks against a world's surfaces, lifetimes, and the size of the map.
+    """Associations and landmarks against a world's surfaces, and the size of the map.
 
     `start` is the number of the first frame. Associations of a replay are the same for all, and need no check.
     """
@@ -185,7 +185,6 @@ class MapRecord:
     def __init__(self, sequence: Sequence, start: int = 0, associations: bool = True) -> None:
         self._sequence, self._start, self._associations = sequence, start, associations
         self._truth = SurfacePoints(sequence) if sequence.format == "synthetic" else None
-        self._lifetimes = Lifetimes()
         self._sizes: list[int] = []
         self._right: list[bool] = []
 
@@ -197,19 +196,20 @@ class MapRecord:
                 errors = self._truth.errors(number, result.matched, features.uv_left[result.matched_features])
                 self._right += (errors[np.isfinite(errors)] < _RIGHT).tolist()
             self._truth.add(number, result.added, features.uv_left[result.added_features])
-        self._lifetimes.add(result)
         self._sizes.append(result.map_size)
 
     def figures(self, record: RunRecord, out: Path) -> dict[str, float]:
         """The figures of a run that is finished and has left its files in `out`."""
-        found = self._lifetimes.figures() | self._landmark_errors(record, out)
-        if self._right:
-            found["association_precision"] = float(np.mean(self._right))
-        if self._sizes:
-            found["map_size"] = float(np.mean(self._sizes))
-        return found
+        errors = self._landmark_errors(record, out)
+        found = {
+            "association_precision": np.mean(self._right) if self._right else None,
+            "map_size": np.mean(self._sizes) if self._sizes else None,
+            "landmark_error_m": np.median(errors) if len(errors) else None,
+            "landmark_error_90_m": np.quantile(errors, 0.9) if len(errors) else None,
+        }
+        return {key: float(value) for key, value in found.items() if value is not None}
 
-    def _landmark_errors(self, record: RunRecord, out: Path) -> dict[str, float]:
+    def _landmark_errors(self, record: RunRecord, out: Path) -> Array:
         """Distances of the map's landmarks from the surface points they are, after the alignment of the poses.
 
         They are turned by the poses' orientations: positions of a camera that hardly moves leave the turn open, which
@@ -220,42 +220,14 @@ class MapRecord:
         pairs = with_truth(final.select(pair(final.stamps, tracked.stamps, _SAME) >= 0), self._sequence)
         rows = list(csv.DictReader(io.StringIO(read_text(out / "landmarks.csv"), newline="")))
         if self._truth is None or pairs is None or not rows:
-            return {}
+            return np.zeros(0)
         own, true = pairs
         R = nearest_rotation((true.poses[:, :3, :3] @ np.swapaxes(own.poses[:, :3, :3], 1, 2)).mean(axis=0))
         t = (true.positions - own.positions @ R.T).mean(axis=0)
         positions = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
         ids = np.array([int(row["id"]) for row in rows], np.int64)
         errors = np.linalg.norm(positions @ R.T + t - self._truth.positions(ids), axis=1)
-        errors = errors[np.isfinite(errors)]
-        if not len(errors):
-            return {}
-        return {"landmark_error_m": float(np.median(errors)), "landmark_error_90_m": float(np.quantile(errors, 0.9))}
-
-
-class Lifetimes:
-    """How long landmarks stay in the map; those still in it have lived until the last frame."""
-
-    def __init__(self) -> None:
-        self._first: dict[int, int] = {}
-        self._ended: list[int] = []
-        self._last = 0
-
-    def add(self, result: FrameResult) -> None:
-        """One more frame."""
-        self._last = result.index
-        for i in result.added.tolist():
-            self._first.setdefault(i, result.index)
-        for i in result.erased.tolist():
-            if i in self._first:  # else one of an old place, by which a kidnapped camera was found
-                self._ended.append(result.index - self._first.pop(i))
-
-    def figures(self) -> dict[str, float]:
-        """Median and mean in frames; none where there was no landmark."""
-        lived = [*self._ended, *(self._last - first for first in self._first.values())]
-        if not lived:
-            return {}
-        return {"lifetime_frames": float(np.median(lived)), "lifetime_mean_frames": float(np.mean(lived))}
+        return np.asarray(errors[np.isfinite(errors)])
 
 
 def nees_series(record: RunRecord, sequence: Sequence) -> Array:

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from slam.compare.plan import REPLAY
-from slam.compare.statistics import ALPHA, HINT_ALPHA, Difference, Verdict, certain_of, fewest
+from slam.compare.statistics import ALPHA, Difference, Verdict, certain_of, fewest
 from slam.compare.tables import Group, mean_and_sd
 from slam.run.results import number, verdict
 
-#: Verdicts that a badge has other words for than their own.
-_WORDS = {Verdict.HINT: "a hint", Verdict.SINGLE: "one trial", Verdict.NONE: "no pair", Verdict.UNTESTED: ""}
-
-#: What a badge means that says better or worse.
+#: What a verdict means that says better or worse.
 STRENGTH = {
     Verdict.CERTAIN: f"certain (Holm-adjusted p ≤ {ALPHA:g})",
     Verdict.LIKELY: f"likely (p ≤ {ALPHA:g}, not after Holm's adjustment)",
-    Verdict.HINT: f"a hint (p ≤ {HINT_ALPHA:g})",
     Verdict.SINGLE: "in one trial, which cannot say whether that is chance",
 }
+_WORDS = {Verdict.SINGLE: "one trial", Verdict.NONE: "no pair", Verdict.UNTESTED: ""}
 
 _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
-_MISSING = 0.5  # of what the smaller of two shares lacks: with a larger difference, nearly all is not as good as all
 _FACTOR = 3.0  # between two means, from which on it is said as a factor
 
 
@@ -38,7 +34,7 @@ class Line:
 
     @property
     def badge(self) -> str:
-        """Direction and strength."""
+        """Direction and strength in two words."""
         return badge(self.verdict, self.direction)
 
 
@@ -49,7 +45,7 @@ class Conclusions:
     name: str  # of the group
     verdict: list[str]  # which back end is better in what, a sentence for each but the reference
     failed: str  # which runs failed; empty where none did
-    headlines: list[Line]  # what is certain, likely and a hint, and which main figures are open
+    headlines: list[Line]  # what is certain and likely, and which main figures are open
     honesty: list[str]  # one per back end, on its covariances
 
 
@@ -69,7 +65,7 @@ def conclusions(group: Group) -> Conclusions:
         f"{group.sequence}{variant}, {group.mode}",
         [in_short(differences, first, other) for other, differences in own.items()],
         failed if counts else "",
-        [line for other, differences in own.items() for line in headline(differences, other)],
+        [line for other, differences in own.items() for line in _headlines(differences, other)],
         [f"{backend}: {text}." for backend, text in honesty.items() if text],
     )
 
@@ -87,10 +83,10 @@ def direction(d: Difference) -> str:
     return "better" if d.better else "worse"
 
 
-def headline(differences: Sequence[Difference], other: str) -> list[Line]:
+def _headlines(differences: Sequence[Difference], other: str) -> list[Line]:
     """What the other back end does better and worse than the reference, the surest first, and what remains open.
 
-    All that is certain, likely, or a hint is named, in both directions; of the rest the main figures, but for those
+    All that is certain or likely is named, in both directions; of the rest the main figures, but for those
     that are perfect in every run.
     """
     lines = []
@@ -123,13 +119,14 @@ def in_short(differences: Sequence[Difference], reference: str, other: str) -> s
 def is_trifle(d: Difference) -> bool:
     """Whether two means are so near that nobody would choose by them, however sure their difference is.
 
-    Shares such as that of tracked frames are judged by what they lack, too: 99.2 % is not equal to 100 %.
+    Of shares such as that of tracked frames what they lack counts: 99.2 % is not equal to 100 %.
     """
-    apart, larger = abs(d.other - d.reference), max(abs(d.reference), abs(d.other))
-    same = _shown(d, d.reference) == _shown(d, d.other)
-    if d.metric.better == "higher" and d.metric.unit == "%" and not same:
-        return bool(apart < _TRIFLE * larger and apart < _MISSING * (1 - min(d.reference, d.other)))
-    return bool(apart < _TRIFLE * larger or same)
+    if shown(d.metric.scale * d.reference) == shown(d.metric.scale * d.other):
+        return True
+    limit = _TRIFLE * max(abs(d.reference), abs(d.other))
+    if d.metric.better == "higher" and d.metric.unit == "%":
+        limit = min(limit, 0.5 * (1 - min(d.reference, d.other)))
+    return bool(abs(d.other - d.reference) < limit)
 
 
 def caution(trials: int, tests: int) -> str:
@@ -153,10 +150,9 @@ def caution(trials: int, tests: int) -> str:
     if trials < fewest(1):
         chance = f"chance alone does as much in {200 / 2**trials:.2g} % of such comparisons"
         return f"With {trials} trials nothing can be certain: even where all agree, {chance}. {more}"
-    return (
-        f"With {trials} trials a difference that has the same sign in all is certain where up to {certain_of(trials)} "
-        f"figures are tested. {more}"
-    )
+    few = certain_of(trials)
+    at_most = "a single figure is" if few == 1 else f"up to {few} figures are"
+    return f"With {trials} trials a difference that has the same sign in all is certain where {at_most} tested. {more}"
 
 
 def measurements(mode: str, reference: str) -> str:
@@ -200,25 +196,16 @@ def shown_p(p: float) -> str:
 
 def _name(d: Difference) -> str:
     """A label that can stand in a list."""
-    return d.metric.label.replace(", ", " ").removesuffix(" (expected 1)")
+    return d.metric.label.replace(", ", " ").partition(" (")[0]
 
 
 def _brief(d: Difference) -> str:
-    """The figure from the reference's value to the other's, and by how much of the reference's that is."""
-    unit = d.metric.unit and f" {d.metric.unit}"
-    return f"{_name(d)} {_shown(d, d.reference)} → {_shown(d, d.other)}{unit}{''.join(_apart(d))}"
-
-
-def _shown(d: Difference, value: float) -> str:
-    return shown(d.metric.scale * value)
-
-
-def _apart(d: Difference) -> Iterator[str]:
-    """By how much the other's mean is above or below the reference's: a factor where percentages are enormous."""
+    """The figure from the reference's value to the other's, and the change: a factor where percentages are enormous."""
+    values = [shown(d.metric.scale * value) for value in (d.reference, d.other)]
+    text = f"{_name(d)} {' → '.join(values)}{d.metric.unit and f' {d.metric.unit}'}"
     small, large = sorted((d.reference, d.other))
     if d.metric.better != "lower" or d.reference <= 0:
-        return
-    if small <= 0 or large / small < _FACTOR:
-        yield f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
-    else:
-        yield f" ({number(large / small)} times as {'much' if d.other > d.reference else 'little'})"
+        return text
+    if small > 0 and large / small >= _FACTOR:
+        return f"{text} ({number(large / small)} times as {'much' if d.other > d.reference else 'little'})"
+    return f"{text} ({100 * (d.other / d.reference - 1):+.2g} %)".replace("(-", "(−")

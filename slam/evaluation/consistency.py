@@ -29,6 +29,9 @@ from slam.rig_error import CommonError
 #: Lengths of the stretches over which relative poses are compared [m].
 STRETCHES = (1.0, 10.0, 100.0)
 
+#: Beside the figures: the cameras are those of the calibration, while the covariances count errors of one.
+EXACT = "exact calibration"
+
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
 _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding
@@ -43,8 +46,7 @@ def consistency_figures(
 ) -> dict[str, float]:
     """The figures of a run's summary; those that the path is too short for are left out.
 
-    One run's errors are correlated over time: its mean may leave the band, which holds for independent ones, without
-    a fault. The first pose defines the world and is left out; the start is the first pose whose truth was measured.
+    The first pose defines the world and is left out; the start is the first pose whose truth was measured.
 
     Args:
         own: the online path (N poses).
@@ -54,15 +56,15 @@ def consistency_figures(
         common: the part of the covariances that the poses share (N); None for none.
 
     Returns:
-        "mean NEES" from the start and its 95 % band for independent errors, "NEES over L m" for each of `STRETCHES`;
-        six is right for all of these; "doubtful truth over L m" and "no covariance over L m", the shares of stretches
-        left out because the truth contradicts itself or an old place was measured again within them, where there are
-        any; "scale error [%]" and "scale sigma [%]".
+        "mean NEES" from the start, "NEES over L m" for each of `STRETCHES`; six is right for all of these, and "band
+        low" and "band high" hold 95 % of runs; "doubtful truth over L m" and "no covariance over L m", the shares of
+        stretches left out because the truth contradicts itself or an old place was measured again within them, where
+        there are any; "scale error [%]" and "scale sigma [%]".
     """
     start = int(np.argmin(interpolated(true, noise)))  # the first pose that was measured
     later = np.arange(start + 1, len(own))
     from_start = stretch_nees(own, true, covariances, noise, np.full(len(later), start), later, common)
-    low, high = chi_square_band(_DOF, max(int(np.isfinite(from_start).sum()), 1))
+    low, high = chi_square_band(_DOF)  # of one value: errors of the rig make all frames of a run as good as one
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
     closed = _closings(covariances)
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(true.positions, axis=0), axis=1).cumsum()])
@@ -195,7 +197,3 @@ def _scale(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNo
 
 def _mean(values: Array) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
-
-
-#: Beside the figures: the cameras are those of the calibration, while the covariances count errors of one.
-EXACT = "exact calibration"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,11 +43,11 @@ def _of_motions(E: Array) -> PathErrors:
 
 def _summed(errors: PathErrors) -> dict[str, float]:
     """Median and RMSE of rotation and translation; empty without errors."""
-    parts = (("rotation", "deg", errors.rotation), ("translation", "m", errors.translation))
     figures: dict[str, float] = {}
-    for name, unit, values in parts if len(errors.rotation) else ():
-        figures[f"{name} median [{unit}]"] = float(np.median(values))
-        figures[f"{name} RMSE [{unit}]"] = float(np.sqrt(np.mean(values**2)))
+    for name, unit, values in (("rotation", "deg", errors.rotation), ("translation", "m", errors.translation)):
+        if len(values):
+            figures[f"{name} median [{unit}]"] = float(np.median(values))
+            figures[f"{name} RMSE [{unit}]"] = float(np.sqrt(np.mean(values**2)))
     return figures
 
 
@@ -96,7 +97,7 @@ class _Life:
 
     frames: list[int] = field(default_factory=list)
     things: list[MovingObject] = field(default_factory=list)
-    votes: dict[int, int] = field(default_factory=dict)  # number of its features on each body, 0 for the still world
+    votes: Counter[int] = field(default_factory=Counter)  # its features on each body, 0 for the still world
 
     @property
     def truth(self) -> int:
@@ -126,15 +127,12 @@ class ObjectScore:
     """
 
     def __init__(self, bodies: Array, stamps: Array, cameras: Array, focal: float, pixel: float = 1.0) -> None:
-        self.bodies = bodies
-        self.cameras = cameras
-        self.stamps = stamps
+        self.bodies, self.cameras, self.stamps = bodies, cameras, stamps
         self.moves_from = [_first_motion(poses, cameras, focal, pixel) for poses in bodies]
-        self.lives: dict[int, _Life] = {}
-        self._right = self._wrong = self._missed = self._still = 0  # features
-        self._frames = self._false_frames = self._counted_right = 0  # frames
-        self._covered: dict[int, list[bool]] = {}
-        self._world: Array | None = None
+        self.lives: defaultdict[int, _Life] = defaultdict(_Life)
+        self._count: Counter[str] = Counter()  # of features and frames
+        self._covered: defaultdict[int, list[bool]] = defaultdict(list)
+        self._world: Any = None  # (4, 4): the truth's world in the run's; None before the first frame
         self._seen_from: dict[int, Array] = {}  # the camera's pose by frame, as it was estimated
 
     def add(self, frame: int, result: FrameResult, labels: NDArray) -> None:
@@ -153,41 +151,37 @@ class ObjectScore:
         started = np.array([False] + [frame >= k for k in self.moves_from])
         moving = (labels > 0) & started[np.maximum(labels, 0)] & result.features.has_stereo
         still = labels == 0
-        self._right += int((flagged & moving).sum())
-        self._missed += int((~flagged & moving).sum())
-        self._wrong += int((flagged & still).sum())
-        self._still += int(still.sum())
+        rows = {"right": flagged & moving, "missed": ~flagged & moving, "wrong": flagged & still, "still": still}
+        self._count.update({name: int(found.sum()) for name, found in rows.items()})
         named = set()
         for thing in result.objects:
-            life = self.lives.setdefault(thing.id, _Life())
-            for label in labels[thing.features].tolist():
-                if label >= 0:
-                    life.votes[label] = life.votes.get(label, 0) + 1
+            life = self.lives[thing.id]
+            life.votes.update(label for label in labels[thing.features].tolist() if label >= 0)
             life.frames.append(frame)
             life.things.append(thing)
             if thing.estimate.measured:
                 named.add((thing.id, life.truth))
-        in_view = {b for b in range(1, len(self.bodies) + 1) if (moving & (labels == b)).sum() > MINIMAL_POINTS}
+        in_view = [b for b in range(1, len(self.bodies) + 1) if (moving & (labels == b)).sum() > MINIMAL_POINTS]
+        truths = [truth for _, truth in named]
         for body in in_view:
-            self._covered.setdefault(body, []).append(any(truth == body for _, truth in named))
-        relevant = [truth for _, truth in named if truth == 0 or truth in in_view]
-        self._frames += 1
-        self._counted_right += sorted(relevant) == sorted(in_view)
-        self._false_frames += any(truth == 0 for _, truth in named)
+            self._covered[body].append(body in truths)
+        counted = sorted(truth for truth in truths if truth == 0 or truth in in_view)
+        self._count.update({"frames": 1, "counted right": counted == in_view, "false frames": 0 in truths})
 
     def summary(self) -> dict[str, Any]:
         """All figures; see docs/objects.md."""
-        precision = self._right / max(self._right + self._wrong, 1)
-        recall = self._right / max(self._right + self._missed, 1)
+        count = self._count
+        precision = count["right"] / max(count["right"] + count["wrong"], 1)
+        recall = count["right"] / max(count["right"] + count["missed"], 1)
         return {
             "features": {
                 "precision": precision,
                 "recall": recall,
                 "F1": 2 * precision * recall / max(precision + recall, 1e-12),
-                "false moving per 1000 still": 1e3 * self._wrong / max(self._still, 1),
+                "false moving per 1000 still": 1e3 * count["wrong"] / max(count["still"], 1),
             },
-            "false movers per frame": self._false_frames / max(self._frames, 1),
-            "counted right": self._counted_right / max(self._frames, 1),
+            "false movers per frame": count["false frames"] / max(count["frames"], 1),
+            "counted right": count["counted right"] / max(count["frames"], 1),
             "bodies": {str(b): self.body(b) for b in range(1, len(self.bodies) + 1)},
             "false objects": [len(life.frames) for life in self.lives.values() if life.truth == 0],
         }
@@ -195,30 +189,25 @@ class ObjectScore:
     def body(self, body: int) -> dict[str, Any]:
         """Figures of one true body; its longest-lived object is measured."""
         lives = {id: life for id, life in self.lives.items() if life.truth == body}
-        covered = self._covered.get(body, [])
-        figures: dict[str, Any] = {
-            "frames in view": len(covered),
-            "coverage": float(np.mean(covered)) if covered else None,
-            "ids": sorted(lives),
-        }
-        if not lives or self._world is None:
+        covered = self._covered[body]
+        coverage = float(np.mean(covered)) if covered else None
+        figures: dict[str, Any] = {"frames in view": len(covered), "coverage": coverage, "ids": sorted(lives)}
+        life = self._longest(body)
+        if life is None:
             return figures
-        first = min(min(life.frames) for life in lives.values())
-        figures["delay [frames]"] = first - self.moves_from[body - 1]
-        life = max(lives.values(), key=lambda one: len(one.frames))
+        figures["delay [frames]"] = min(min(one.frames) for one in lives.values()) - self.moves_from[body - 1]
         rows, frames, own = life.measured, np.array(life.frames), life.poses
         if len(rows) < 3:
             return figures
         true = self._world @ self.bodies[body - 1][frames]
         both = rows[1:][(np.diff(rows) == 1) & (np.diff(frames[rows]) == 1)]
-        me = [motion_errors(own[[k - 1, k]], true[[k - 1, k]]) for k in both]
-        errors = PathErrors(np.array([e.translation[0] for e in me]), np.array([e.rotation[0] for e in me]))
+        E = [motion_errors(own[[k - 1, k]], true[[k - 1, k]]) for k in both]
+        translations, rotations = (np.array([getattr(e, name)[0] for e in E]) for name in ("translation", "rotation"))
         values = self._nees(body, life)
-        figures["ME"] = _summed(errors)
+        figures["ME"] = _summed(PathErrors(translations, rotations))
         figures["relative, 10 frames"] = _summed(motion_errors(own, true, 10)) if len(own) > 10 else {}
         figures["absolute"] = _summed(absolute_pose_errors(own[rows], true[rows]))
-        figures["mean NEES"] = float(np.mean(values)) if len(values) else None
-        figures["dof"] = 6.0
+        figures["mean NEES"], figures["dof"] = float(np.mean(values)) if len(values) else None, 6.0
         return figures
 
     def poses_of(self, body: int) -> tuple[NDArray[np.intp], Array, Array] | None:
@@ -227,19 +216,22 @@ class ObjectScore:
         Returns:
             frames (M,), its poses and the true ones (M, 4, 4) in the same world frame; None where there is no object.
         """
-        lives = [life for life in self.lives.values() if life.truth == body]
-        if not lives or self._world is None:
+        life = self._longest(body)
+        if life is None:
             return None
-        life = max(lives, key=lambda one: len(one.frames))
         frames = np.array(life.frames)[life.measured]
         return frames, life.poses[life.measured], self._world @ self.bodies[body - 1][frames]
+
+    def _longest(self, body: int) -> _Life | None:
+        """The longest-lived object of a body."""
+        lives = [life for life in self.lives.values() if life.truth == body]
+        return max(lives, key=lambda one: len(one.frames), default=None)
 
     def _nees(self, body: int, life: _Life) -> Array:
         """NEES of an object's motion since its estimate began, which may have been before it was first reported.
 
         Where an estimate restarted, it is that of the motion since.
         """
-        assert self._world is not None
         rows, poses = life.measured, life.poses
         begun = np.array([thing.found_at for thing in life.things])
         P = np.array([thing.estimate.covariance for thing in life.things])

@@ -84,26 +84,17 @@ def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array
     R, R_true = (poses[:, :3, :3] for poses in since_start)
     R_left = np.swapaxes(R, 1, 2)
     errors = so3_log(R_left @ R_true)
-    return _remounted(errors, R_left, mounting) if mounting else errors
+    if not mounting or not errors.any():
+        return errors
+    J = (np.eye(3) - R_left).reshape(-1, 3)  # a constant turn w of the truth's sensor explains ``(1 − Rᵀ) w``
+    prior = np.mean(errors**2) / mounting**2
+    turn = np.linalg.solve(J.T @ J + prior * np.eye(3), J.T @ errors.ravel())
+    return np.asarray(errors - (J @ turn).reshape(-1, 3))
 
 
 def _from_start(own: Trajectory, true: Trajectory, mounting: float) -> dict[str, float]:
     errors = rotation_errors(own, true, mounting)
     return {"rotation RMSE from start [deg]": float(np.degrees(np.sqrt(np.mean(np.sum(errors**2, axis=1)))))}
-
-
-def _remounted(errors: Array, R_left: Array, mounting: float) -> Array:
-    """Rotation errors (N, 3) without what a constant turn w of the truth's sensor explains: ``(1 − Rᵀ) w``.
-
-    Args:
-        errors: with ``R_true = R exp(e)``, of rotations since the start [rad].
-        R_left: those rotations, transposed (N, 3, 3).
-        mounting: standard deviation of each axis of w beforehand [rad].
-    """
-    J = (np.eye(3) - R_left).reshape(-1, 3)
-    prior = np.mean(errors**2) / mounting**2
-    turn = np.linalg.solve(J.T @ J + prior * np.eye(3), J.T @ errors.ravel()) if prior else np.zeros(3)
-    return np.asarray(errors - (J @ turn).reshape(-1, 3))
 
 
 def _relative(own: Trajectory, true: Trajectory) -> dict[str, float]:

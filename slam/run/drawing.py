@@ -5,7 +5,8 @@ The colours are those of paper B, Fig. 10. Beside a frame, `GrowingMap` draws th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ _FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size
 _LEAST_RADIUS = 4  # of a feature's circle [px]
 _LEGEND = 24  # height of the bar with the legend [px]
 _FILM, _DIGITS = ".mp4", 6  # a video's suffix; of a picture's name, at least
+_SHOWN = 1 / 0.9  # of an extent from the 5th to the 95th percentile of points: all of it where they lie evenly
 _PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
 _AHEAD = 0.3  # of the map behind the camera
 _REACH = 2.5  # widths of the map in distances of the first landmarks
@@ -36,6 +38,12 @@ _REACH = 2.5  # widths of the map in distances of the first landmarks
 def body_colour(number: int) -> tuple[int, int, int]:
     """The colour (BGR) of a moving body in images, by its number."""
     return _BODIES[(number - 1) % len(_BODIES)]
+
+
+def _extent(body: MovingObject) -> Array:
+    """Corners (2, 3) of a body's box as drawn, body coordinates."""
+    middle = body.extent.mean(axis=0)
+    return np.asarray(middle + _SHOWN * (body.extent - middle))
 
 
 def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: int = 960) -> np.ndarray:
@@ -47,15 +55,15 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     corners = [_draw_object(picture, thing, result, rig, scale) for thing in result.objects]
     beacons = result.matched_features[~np.isin(result.matched_features, result.moving_features)]
-    radius = max(2 * scale, _LEAST_RADIUS)
-    for rows, circles in (
-        (beacons, [(radius, _BEACON, 1)]),
-        (result.added_features, [(radius, _NEW, 1)]),
-        (np.unique(result.moving_features), [(radius + 1, _RING, 1), (radius, _MOVING, 2)]),
+    radius, moving = max(2 * scale, _LEAST_RADIUS), np.unique(result.moving_features)
+    for rows, size, colour, thickness in (
+        (beacons, radius, _BEACON, 1),
+        (result.added_features, radius, _NEW, 1),
+        (moving, radius + 1, _RING, 1),
+        (moving, radius, _MOVING, 2),
     ):
         for u, v in result.features.uv_left[rows]:
-            for size, colour, thickness in circles:
-                cv2.circle(picture, _pixel(u, v, scale), size, colour, thickness, cv2.LINE_AA)
+            cv2.circle(picture, _pixel(u, v, scale), size, colour, thickness, cv2.LINE_AA)
     for thing, pixels in zip(result.objects, corners):  # over all else
         _draw_label(picture, thing, pixels, scale)
     return picture
@@ -69,21 +77,20 @@ def with_legend(picture: np.ndarray, bodies: Sequence[MovingObject] = ()) -> np.
     import cv2
 
     bar = np.full((_LEGEND, picture.shape[1], 3), 255, np.uint8)
+    circles = [(_BEACON, "landmark"), (_NEW, "new landmark"), (_MOVING, "feature that moves")]
+    boxes = [(body_colour(body.id), f"body {body.id}") for body in bodies] or [(body_colour(1), "body")]
+    marks = [*((mark, "circle") for mark in circles), *((mark, "box") for mark in boxes)]
     at, middle = 12, _LEGEND // 2
-    known = [(body_colour(body.id), f"body {body.id}", not body.estimate.measured) for body in bodies]
-    marks: list[tuple[tuple[int, int, int], str, bool | None]]
-    marks = [(_BEACON, "landmark", None), (_NEW, "new landmark", None), (_MOVING, "feature that moves", None)]
-    marks += known or [(body_colour(1), "body", False)]
-    for colour, text, dashed in [*marks, (marks[-1][0], "body, not seen", True)]:
+    for (colour, text), shape in [*marks, ((boxes[-1][0], "body, not seen"), "dashed box")]:
         (width, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
         if at + 20 + width > bar.shape[1]:
             break
-        if dashed is None:
+        if shape == "circle":
             cv2.circle(bar, (at, middle), 5, colour, 2, cv2.LINE_AA)
         else:
-            for left, right in ((-6, -1), (2, 7)) if dashed else ((-6, 6),):
+            for left, right in ((-6, 6),) if shape == "box" else ((-6, -1), (2, 7)):
                 for edge in (-5, 5):
-                    cv2.line(bar, (at + left, middle + edge), (at + right, middle + edge), colour, 2 - dashed)
+                    cv2.line(bar, (at + left, middle + edge), (at + right, middle + edge), colour, 1 + (shape == "box"))
         cv2.putText(bar, text, (at + 12, middle + height // 2), _FONT, 0.8 * _TEXT, _MOVING, 1, cv2.LINE_AA)
         at += width + 36
     return np.concatenate([picture, bar])
@@ -94,12 +101,11 @@ def _draw_object(picture: np.ndarray, thing: MovingObject, result: FrameResult, 
     import cv2
 
     T_left_object = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
-    lower, upper = thing.extent
+    lower, upper = _extent(thing)
     corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
     measured, length = thing.estimate.measured, 0.6 * max(float((upper - lower).max()), 1e-3)
     lines = [(corners[a], corners[b], body_colour(thing.id), 1 + measured) for a, b in _EDGES]
-    for axis, colour in enumerate(_AXES if measured else ()):
-        lines.append((np.zeros(3), length * np.eye(3)[axis], colour, 4))
+    lines += [(np.zeros(3), length * axis, colour, 4) for axis, colour in zip(np.eye(3), _AXES if measured else ())]
     for begin, end, colour, thickness in lines:
         uv = rig.left.project(transform(T_left_object, np.linspace(begin, end, _PARTS)))
         seen = np.asarray((np.abs(np.nan_to_num(uv, nan=np.inf)) < 20 * rig.width).all(axis=1))  # not behind it
@@ -116,9 +122,7 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
 
     if not np.isfinite(corners).all():
         return
-    speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
-    state = f"{speed:.2f} m/s" if thing.moving else "at rest"
-    text = f"{thing.id}: {state if thing.estimate.measured else 'not seen'}"
+    text = f"{thing.id}: {_state(thing)}"
     (width, height), base = cv2.getTextSize(text, _FONT, _TEXT, 1)
     u, v = corners.min(axis=0)
     left, top = _pixel(u, v - 3, scale)
@@ -126,6 +130,12 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
     y = min(max(top, height), picture.shape[0] - base)
     cv2.rectangle(picture, (x, y - height), (x + width, y + base), _RING, cv2.FILLED)
     cv2.putText(picture, text, (x, y), _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
+
+
+def _state(body: MovingObject) -> str:
+    if not body.estimate.measured:
+        return "not seen"
+    return f"{float(np.linalg.norm(body.estimate.velocity[3:])):.2f} m/s" if body.moving else "at rest"
 
 
 def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
@@ -173,7 +183,7 @@ class GrowingMap:
         cv2.polylines(picture, [path], False, _PATH, 2, cv2.LINE_AA)
         cv2.circle(picture, path[-1].tolist(), 5, _PATH, -1, cv2.LINE_AA)
         for body in result.objects:
-            colour, extent = body_colour(body.id), body.extent
+            colour, extent = body_colour(body.id), _extent(body)
             corners = np.array([[extent[i, 0], 0, extent[j, 2]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
             outline = pixels(transform(body.estimate.T_world_object, corners))
             cv2.polylines(picture, [outline], True, colour, 2, cv2.LINE_AA)
@@ -209,19 +219,16 @@ class FramePictures:
     """
 
     def __init__(self, path: Path, with_map: bool = False) -> None:
-        self.path = path
+        self.path, self._film = path, path.suffix.lower() == _FILM
         self._map = GrowingMap() if with_map else None
-        self._film = path.suffix.lower() == _FILM
-        self._first: tuple[float, np.ndarray] | None = None
+        self._first: tuple[float, np.ndarray] | None = None  # stamp and picture that wait for the video's rate
         self._video: Any = None
         if path.suffix and not self._film:
             raise SlamError(f"{path}: pictures go to a folder, or to a video FILE.mp4")
         if self._film:
             require_utf8(path)
-        try:
+        with self._written(path):
             (path.parent if self._film else path).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise SlamError(f"{path}: cannot be written: {error.strerror or error}") from error
 
     def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
         """Append a step's picture; a `slam.run.runner.Watch`."""
@@ -233,23 +240,27 @@ class FramePictures:
         picture = with_legend(picture, result.objects)
         if not self._film:
             file = self.path / f"{frame.index:0{_DIGITS}d}.png"
-            try:
+            with self._written(file):
                 write_png(file, picture)
-            except OSError as error:
-                raise SlamError(f"{file}: cannot be written: {reason(error)}") from error
         elif self._first is None:
             self._first = (frame.stamp, picture)
         else:
             if self._video is None:
-                self._open(1.0 / (frame.stamp - self._first[0]))
+                self._open(1.0 / (frame.stamp - self._first[0]), self._first[1])
             self._video.write(picture)
 
-    def _open(self, rate: float) -> None:
+    @staticmethod
+    @contextmanager
+    def _written(path: Path) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise SlamError(f"{path}: cannot be written: {reason(error)}") from error
+
+    def _open(self, rate: float, picture: np.ndarray) -> None:
         """Begin the video with the first picture."""
         import cv2
 
-        assert self._first is not None
-        picture = self._first[1]
         size = (picture.shape[1], picture.shape[0])
         self._video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
         if not self._video.isOpened():
@@ -261,6 +272,6 @@ class FramePictures:
 
     def __exit__(self, *error: object) -> None:
         if self._video is None and self._first is not None:
-            self._open(1.0)
+            self._open(1.0, self._first[1])
         if self._video is not None:
             self._video.release()

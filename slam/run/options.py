@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from slam.calibration import load_calibration
 from slam.config import SystemConfig
@@ -24,7 +22,7 @@ class RunOptions:
     backend: str
     frontend: str
     config: SystemConfig
-    out: Path  # folder for the files
+    out: Path = Path()  # folder for the files
     start: int = 0
     stop: int | None = None  # range of frames; None for all
     record: Path | None = None  # file for a recording of what the back end is given, see `slam.run.replay`
@@ -34,7 +32,10 @@ class RunOptions:
     mono: bool = False  # use the left images alone
     overlap: bool = True  # read and extract the next frame while the present one is estimated; same results
     live: bool = False  # take frames at their own rate, and leave out those that come too late; of a camera always
-    origin: Mapping[str, Any] = field(default_factory=dict)  # for ``config.json``: what else it takes to repeat the run
+    source: str = ""  # the sequence as `slam.open_sequence` takes it, for ``config.json``; empty where not known
+    format: str | None = None  # of the sequence; None for found out
+    kind: str = ""  # of motion that the settings are for; empty where not known
+    command: str = ""  # the command line, for ``config.json``
 
     @property
     def inputs(self) -> list[Path]:

@@ -22,14 +22,12 @@ _TRACKED = "tracked"
 #: The median over the recordings and worlds at hand is .02 to .4; of times ten times too short it is 30 times as large.
 _JERKY = 3.0
 _LEAST_CHANGES = 10  # guard: changes of velocity of which a median is taken
-
 _ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
 
 #: guard: Median speeds [m/s] that no camera in a hand and no vehicle has, and median distances [m] that neither sees.
 _FASTEST = {False: 10.0, True: 100.0}
 _NEAREST = {False: 0.05, True: 1.0}
 _WIDEST = {False: 1.0, True: np.inf}  # guard: baseline [m] that no hand carries
-
 _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is said
 
 
@@ -55,32 +53,25 @@ def outcome(
         driving: the motion is known to be that of a vehicle.
     """
     untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
-    frames = len(record.statuses) - 1
-    tracked = frames - len(untracked)
-    if frames < 1 or len(untracked) <= _MANY * frames:
+    frames, missed = len(record.statuses) - 1, len(untracked)
+    if frames < 1 or missed <= _MANY * frames:
         return ""
-    causes = []
-    frozen = 2 * record.repeated > len(untracked)
+    frozen = 2 * record.repeated > missed
     first = next((line for line in warnings if REPEATED not in line), "")
     if not first and not frozen:
         first = _cause(record, untracked, rig, in_map) or doubt
         if not first and dropped < frames:  # where most came, the gaps are hardly all of it
             first = _any_cause(record, rig, driving)
-    if first:
-        causes.append(first)
+    causes = [first] if first else []
     if frozen:
         causes.append(f"in {record.repeated} of them {REPEATED}")
     if dropped:
-        causes.append(
-            f"{'a frame was' if dropped == 1 else f'{dropped} frames were'} dropped, and the frames about them are far "
-            "apart: make a frame cheaper (smaller images, --set objects.mode=off), or move more slowly"
-        )
-    if not tracked:
-        counted = "no frame was tracked"
-    elif 2 * tracked < frames:
-        counted = f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'} tracked"
-    else:
-        counted = f"{frames - tracked} of {frames} frames {'was' if frames - tracked == 1 else 'were'} not tracked"
+        were = "a frame was" if dropped == 1 else f"{dropped} frames were"
+        cheaper = "make a frame cheaper (smaller images, --set objects.mode=off), or move more slowly"
+        causes.append(f"{were} dropped, and the frames about them are far apart: {cheaper}")
+    few, word = (frames - missed, "tracked") if 2 * missed > frames else (missed, "not tracked")
+    counted = f"{few} of {frames} frames {'was' if few == 1 else 'were'} {word}"
+    counted = "no frame was tracked" if missed == frames else f"only {counted}" if word == _TRACKED else counted
     return f"{counted}; likely cause: {'; and '.join(causes)}"
 
 
@@ -115,7 +106,7 @@ def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
     """What may be the cause where each step gave enough, with what is known."""
     depth, speeds = _depth(record), _speeds(record)
     apart = f"the cameras are {rig.baseline:.3g} m apart"
-    if depth is not None:
+    if np.isfinite(depth):
         apart += f" and what they see is {_rounded(depth)} m away in the median"
     if rig.baseline > _WIDEST[driving]:
         return (
@@ -125,10 +116,8 @@ def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
     moved, vehicle = "", "" if driving else "a vehicle's camera without --kind driving, "
     if len(speeds):
         turn, way = speeds.max(axis=0)
-        moved = (
-            f" (where it was tracked the camera moved at up to {_rounded(way)} m/s and turned at up to "
-            f"{_rounded(np.degrees(turn))}°/s)"
-        )
+        most = f"{_rounded(way)} m/s and turned at up to {_rounded(np.degrees(turn))}°/s"
+        moved = f" (where it was tracked the camera moved at up to {most})"
     return (
         "features are found in both images, but not again in the next frame: "
         f"{vehicle}frames too far apart{moved}, images that "
@@ -144,17 +133,15 @@ def scale_doubt(record: RunRecord, rig: StereoRig, driving: bool = False) -> str
     Empty where they are possible, or too few are known.
     """
     speeds, depth = _speeds(record), _depth(record)
-    if len(speeds) < _LEAST_CHANGES or depth is None:
+    if len(speeds) < _LEAST_CHANGES or not np.isfinite(depth):
         return ""
     asked = f"by the calibration the cameras are {rig.baseline:.3g} m apart; is that in metres? (unit=cm, unit=mm)"
     speed = float(np.median(speeds[:, 1]))
     if speed <= _FASTEST[driving] and depth >= _NEAREST[driving]:
         return asked if rig.baseline > _WIDEST[driving] else ""
     carrier = "no vehicle does" if driving else "no camera in a hand does (is it a vehicle's: --kind driving?)"
-    return (
-        f"the camera moved at {_rounded(speed)} m/s and saw things {_rounded(depth)} m away in the median, which "
-        f"{carrier}: {asked}"
-    )
+    said = f"the camera moved at {_rounded(speed)} m/s and saw things {_rounded(depth)} m away in the median"
+    return f"{said}, which {carrier}: {asked}"
 
 
 def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) -> str:
@@ -184,10 +171,9 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     ratio = float(np.median(np.sqrt((counted**2).reshape(-1, 2, 3).mean(2)).max(1)))
     if not ratio >= _JERKY:  # also where it is no number
         return ""
-    kind = "" if driving else ", and whether this is a vehicle (--kind driving)"
     return (
         f"from frame to frame the velocity changes {ratio:.0f} times as much as expected: check the times of the "
-        f"images (fps=…, or seconds in times=…){kind}"
+        f"images (fps=…, or seconds in times=…){'' if driving else ', and whether this is a vehicle (--kind driving)'}"
     )
 
 
@@ -219,10 +205,10 @@ def _speeds(record: RunRecord) -> Array:
     return np.linalg.norm(velocities[both].reshape(-1, 2, 3), axis=2)
 
 
-def _depth(record: RunRecord) -> float | None:
-    """Median distance of what the frames see [m]; None where none is known."""
+def _depth(record: RunRecord) -> float:
+    """Median distance of what the frames see [m]; NaN where none is known."""
     depths = np.array(record.depths)[np.isfinite(record.depths)]
-    return float(np.median(depths)) if len(depths) else None
+    return float(np.median(depths)) if len(depths) else float("nan")
 
 
 def _rounded(value: float) -> str:

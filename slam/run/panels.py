@@ -12,7 +12,7 @@ import numpy as np
 from slam.evaluation.metrics import associate
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.run.run_data import RunData, place_of_truth, pose_errors, reach, well_known
+from slam.run.run_data import RunData, place_of_truth, pose_errors, well_known
 from slam.run.schema import STAGE_NAMES
 
 if TYPE_CHECKING:
@@ -57,16 +57,23 @@ def widths(count: int) -> Array:
 
 
 def path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
-    """The paths from above, in the world of the first run, and the true one."""
-    paths, truth = _in_one_world(runs)
-    if truth is not None:
+    """The paths from above, in the world of the first run that has a truth, and the true one."""
+    paths, truth = [run.online for run in runs], None
+    first = next((run for run in runs if run.truth is not None), None)
+    if first is not None and first.truth is not None:
+        to_first = place_of_truth(first, first.truth)
+        truth = Trajectory(first.truth.stamps, to_first @ first.truth.poses)
+        for i, run in enumerate(runs):
+            if run is not first and run.truth is not None:
+                there = to_first @ inverse(place_of_truth(run, run.truth)) @ run.online.poses
+                paths[i] = Trajectory(run.online.stamps, there)
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
-    for colour, width, run, path in zip(_colours(runs), 2.0 * widths(len(runs)), runs, paths):
+    for colour, width, run, path in zip(_colours(runs), 1.5 * widths(len(runs)), runs, paths):
         _draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
         if _is_revised(run):
             final = path.poses[0] @ inverse(run.online.poses[0]) @ run.final.poses
-            axis.plot(*final[:, [0, 2], 3].T, ":", color=colour, lw=0.7 * width, label=f"{run.name}, final")
+            axis.plot(*final[:, [0, 2], 3].T, ":", color=colour, lw=1.5, label=f"{run.name}, final")
     set_title(axis, "Path from above, online (dot: start)")
     axis.set(xlabel="right [m]", ylabel="forward [m]")
     shown = paths if truth is None else [*paths, truth]
@@ -82,21 +89,22 @@ def map_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     for axis, run, colour in zip(axes, runs, _colours(runs)):
         _draw_map(axis, run, colour)
         known, every = len(well_known(run)), len(run.positions)
-        shown = "2σ ellipses" if known == every else f"2σ ellipses of {known}"  # the others would cover these
-        set_title(axis, f"Map of {run.name}: {every} landmarks, {shown}")
+        of = "" if known == every else f" of {known}"  # the others would cover these
+        set_title(axis, f"{run.name}: {every} landmarks, 2σ ellipses{of}")
     _legend_below(axes)
 
 
 def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
+    """One map, in limits that hold the path and the well-known landmarks with their ellipses."""
     from matplotlib.collections import EllipseCollection
 
     plane = run.covariances[:, [0, 2]][:, :, [0, 2]]
     values, vectors = np.linalg.eigh(plane) if len(plane) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
     width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    known = np.isin(np.arange(len(run.positions)), well_known(run))
+    known = well_known(run)
     for rows, (label, (shade, mark, size)) in zip((~run.seen_last, run.seen_last), _LANDMARKS.items()):
-        sure = rows & known
+        sure = known[rows[known]]
         ellipses = EllipseCollection(
             width[sure, 1], width[sure, 0], angle[sure], units="xy", offsets=run.positions[sure][:, [0, 2]],
             offset_transform=axis.transData, facecolors="none", edgecolors=shade, linewidths=0.8,
@@ -121,22 +129,15 @@ def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
         T = place_of_truth(run, run.truth)
         points = true.positions @ T[:3, :3].T + T[:3, 3]
         axis.plot(*points[:, [0, 2]].T, "--", color=_TRUTH, lw=1.2, label="true path")
-    axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
-    _limit_map(axis, run)
-
-
-def _limit_map(axis: Axes, run: RunData) -> None:
-    """Limits that hold the path and the well-known landmarks with their ellipses, in the ratio of a panel."""
-    known = well_known(run)
-    near = np.linalg.norm(run.old - run.online.positions.mean(axis=0), axis=1) < reach(run)
+    near = np.linalg.norm(run.old - run.centre, axis=1) < run.reach
     points = np.concatenate([run.positions[known], run.online.positions, run.final.positions, run.old[near]])[:, [0, 2]]
     around = np.zeros_like(points)
     around[: len(known)] = _SIGMAS * np.sqrt(np.diagonal(run.covariances[known], axis1=1, axis2=2)[:, [0, 2]])
     low, high = (points - around).min(axis=0), (points + around).max(axis=0)
-    width, height = high - low + 0.1 * float((high - low).max()) + 0.2
-    half = 0.5 * np.array([max(width, _MAP_RATIO * height), max(height, width / _MAP_RATIO)])
+    across, up = high - low + 0.1 * float((high - low).max()) + 0.2
+    half = 0.5 * np.array([max(across, _MAP_RATIO * up), max(up, across / _MAP_RATIO)])
     (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
-    axis.set(xlim=(left, right), ylim=(bottom, top))
+    axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal", xlim=(left, right), ylim=(bottom, top))
 
 
 def _draw_path(axis: Axes, run: RunData, path: Trajectory, label: str, **style: Any) -> None:
@@ -166,41 +167,26 @@ def _stretch(axis: Axes, points: np.ndarray) -> bool:
     return True
 
 
-def _in_one_world(runs: Sequence[RunData]) -> tuple[list[Trajectory], Trajectory | None]:
-    """The online paths in the world of the first run that has a truth, and that truth; as they are where none has."""
-    first = next((run for run in runs if run.truth is not None), None)
-    if first is None or first.truth is None:
-        return [run.online for run in runs], None
-    to_first = place_of_truth(first, first.truth)
-    paths = []
-    for run in runs:
-        path = run.online
-        if run is not first and run.truth is not None:
-            in_truth = inverse(place_of_truth(run, run.truth)) @ path.poses
-            path = Trajectory(path.stamps, to_first @ in_truth)
-        paths.append(path)
-    return paths, Trajectory(first.truth.stamps, to_first @ first.truth.poses)
-
-
 # --------------------------------------------------------------------------------------------- errors and times
 
 
 def error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
-    """Errors of position and rotation with the claimed ±3σ; where no truth is known the claimed σ alone."""
+    """Errors of position and rotation with ±3σ, that of a truth included; where none is known the claimed σ alone."""
     known = any(run.truth is not None for run in runs)
     series = [pose_errors(run) for run in runs]
     shown = [(error if known else sigma)[:, :3] for _, error, sigma in series]
-    factor, unit = _unit_of(max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0))
+    largest = max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0)
+    factor, unit = (1.0, "m") if largest > 1 else (100.0, "cm") if largest > 0.01 else (1000.0, "mm")
     factors = np.array([factor, factor, factor, 1.0])
     for i, (run, colour, (time, error, sigma)) in enumerate(zip(runs, _colours(runs), series)):
-        dashes, width = _DASHES[i % len(_DASHES)], 1.1 * widths(len(runs))[i]
+        dashes, width = _DASHES[i % len(_DASHES)], 0.8 * widths(len(runs))[i]
         untracked = (run.online.stamps - run.online.stamps[:1])[~run.measured]
         for k, (axis, e, s) in enumerate(zip(axes, (factors * error).T, (factors * sigma).T)):
             if known:
                 low = -3 * s if k < 3 else 0 * s  # an angle has no sign
                 axis.fill_between(time, low, 3 * s, color=colour, alpha=0.12, lw=0)
                 for side in (low, 3 * s)[k == 3 :]:
-                    axis.plot(time, side, color=colour, alpha=0.6, lw=0.6 * width, ls=dashes)
+                    axis.plot(time, side, color=colour, alpha=0.7, lw=0.9, ls=dashes)
             if run.truth is not None or not known:
                 axis.plot(time, e if known else s, color=colour, lw=width, label=run.name)
             if len(untracked):
@@ -210,8 +196,9 @@ def error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         axis.set_ylabel(f"{name} [{of}]" if known else f"σ {name} [{of}]")
         axis.axhline(0, color="0.6", lw=0.5)
         axis.margins(x=0.01)
-    turned = ", truth turned to fit" if any(run.truth is not None and not run.truth_is_exact for run in runs) else ""
-    errors = f"Error of the online pose{turned}; band: ±3σ as claimed"
+    measured = any(run.truth is not None and not run.truth_is_exact for run in runs)
+    turned, band = (", truth turned to fit", ", with the truth's own errors") if measured else ("", "")
+    errors = f"Error of the online pose{turned}; band: ±3σ as claimed{band}"
     set_title(axes[0], errors if known else "No true path is known, so no errors: claimed σ of the online pose")
     axes[-1].set_xlabel("time [s]")
     if len(axes[0].get_legend_handles_labels()[0]) > 1:  # a line alone is that of the one run
@@ -236,16 +223,11 @@ def time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     for row, end, total in zip(rows, left, totals):
         axis.text(end, row, f" {total:.0f} ms" if total >= 100 else f" {total:.3g} ms", va="center", fontsize="small")
     axis.set_yticks(rows, [run.name for run in runs])
-    axis.set(xlim=(0, 1.25 * max(float(left.max()), 1e-3)), xlabel="time per frame [ms]")
     margin = 0.7 if len(runs) > 1 else 1.2
-    axis.set(ylim=(-margin, len(runs) - 1 + margin))
-    set_title(axis, "Median time of a frame, and the shares of its stages")
+    right = 1.25 * max(float(left.max()), 1e-3)
+    axis.set(xlim=(0, right), xlabel="time per frame [ms]", ylim=(-margin, len(runs) - 1 + margin))
+    set_title(axis, "Median time of a frame, by stage")
     _legend_below([axis])
-
-
-def _unit_of(largest: float) -> tuple[float, str]:
-    """Factor and name of the unit in which a length of so many metres reads best."""
-    return (1.0, "m") if largest > 1 else (100.0, "cm") if largest > 0.01 else (1000.0, "mm")
 
 
 # -------------------------------------------------------------------------------------------- titles and legends

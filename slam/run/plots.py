@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -110,32 +110,27 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
         raise SlamError(unknown("figure", kind, KINDS))
     if width is not None and not NARROWEST <= width <= WIDEST:
         raise SlamError(f"the width of a picture is {NARROWEST:g} to {WIDEST:g} mm, got {width:g}")
-    figure, caption = _drawn(runs, kind, width, titles=suffix == ".png" and width is None)
+    figure, caption = drawn(runs, kind, width, titles=suffix == ".png" and width is None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        metadata = {"Title": _title(runs), **_METADATA[suffix]}
         with whole_file(path) as file, _style(width):
-            figure.savefig(file, format=path.suffix[1:], dpi=110 if width is None else 300, metadata=metadata)
+            metadata = {"Title": _title(runs), **_METADATA[suffix]}
+            figure.savefig(file, format=suffix[1:], dpi=110 if width is None else 300, metadata=metadata)
     except OSError as error:
         raise SlamError(f"cannot write to {path}: {error.strerror or error}") from error
     return caption
 
 
-def drawn(runs: Sequence[RunData], kind: str, width: float) -> Figure:
-    """A picture without titles, as for a paper, so wide [mm]."""
-    return _drawn(runs, kind, width, titles=False)[0]
-
-
-def _drawn(runs: Sequence[RunData], kind: str, width: float | None, titles: bool) -> tuple[Figure, str]:
-    """A picture, and its titles in one text; maps side by side keep the names of their runs in any case."""
+def drawn(runs: Sequence[RunData], kind: str, width: float | None, titles: bool = False) -> tuple[Figure, str]:
+    """A picture, so wide [mm], and its titles in one text; maps side by side keep the names of their runs anyway."""
     with _style(width):
         figure = KINDS[kind](runs, None if width is None else width / 25.4)
         texts = [" ".join(axis.get_title().split()) for axis in figure.axes]
         if not titles:
             figure.suptitle("")
-        for axis, run in zip(figure.axes, (*runs, *[None] * len(figure.axes))):
-            if not titles and kind != "summary":
-                axis.set_title(run.name if kind == "map" and len(runs) > 1 and run is not None else "")
+            names = [run.name for run in runs] if kind == "map" and len(runs) > 1 else [""] * len(figure.axes)
+            for axis, name in zip(figure.axes, names if kind != "summary" else ()):
+                axis.set_title(name)
     return figure, ". ".join([_title(runs), *filter(None, texts)]) + "."
 
 
@@ -149,27 +144,27 @@ def _style(width: float | None) -> AbstractContextManager[None]:
 def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
     """All at a glance: path and maps above, errors and times below; in a column one below the other."""
     maps = runs[:_MOST_MAPS]
+    column = width is not None and width < _COLUMN
+    width = width or max(10.0, 4.4 * (1 + len(maps)))
     lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
-    heads = [wrapped(line, width or max(10.0, 4.4 * (1 + len(maps)))) for line in lines]
-    head = 0.17 * len("\n".join(heads).splitlines())
-    if _is_column(width):
+    text = "\n".join(wrapped(line, 1.1 * width) for line in lines)
+    head = 0.18 * (1 + text.count("\n"))
+    if column:
         heights = [0.9 * width, 0.95 * width * len(maps), max(width, 4.8), 1.9 + 0.4 * len(runs)]
         figure = _figure(width, sum(heights) + head)
         first, second, left, right = np.asarray(figure.subfigures(4, 1, height_ratios=heights))
         path_axis, map_axes = first.subplots(), list(second.subplots(len(maps), 1, squeeze=False).ravel())
     else:
-        parts = 1 + len(maps)
-        width = width or max(10.0, 4.4 * parts)
-        side = width / parts
+        side = width / (1 + len(maps))
         figure = _figure(width, 0.95 * side + 5.4 + head)
         above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(0.95 * side + 0.4, 5.0)))
-        left, right = np.asarray(below.subfigures(1, 2))
-        path_axis, *map_axes = above.subplots(1, parts)
+        left, right = np.asarray(below.subfigures(1, 2, width_ratios=(3, 2)))
+        path_axis, *map_axes = above.subplots(1, 1 + len(maps))
     path_panel(path_axis, runs)
     map_panels(map_axes, maps)
     error_panels(left.subplots(4, 1, sharex=True), runs)
     time_panel(right.subplots(), runs)
-    figure.suptitle("\n".join(heads))
+    figure.suptitle(text, x=0.01, ha="left")
     return figure
 
 
@@ -180,7 +175,7 @@ def _path(runs: Sequence[RunData], width: float | None) -> Figure:
 
 
 def _map(runs: Sequence[RunData], width: float | None) -> Figure:
-    rows, columns = (len(runs), 1) if _is_column(width) else (1, len(runs))
+    rows, columns = (len(runs), 1) if width is not None and width < _COLUMN else (1, len(runs))
     width = width or 5.0 * columns
     figure = _figure(width, width / columns * rows + 0.3)
     map_panels(list(figure.subplots(rows, columns, squeeze=False).ravel()), runs)
@@ -203,11 +198,6 @@ def _time(runs: Sequence[RunData], width: float | None) -> Figure:
 KINDS: dict[str, Callable[[Sequence[RunData], float | None], Figure]] = {
     "summary": _summary, "path": _path, "map": _map, "errors": _errors, "time": _time,
 }  # fmt: skip
-
-
-def _is_column(width: float | None) -> TypeGuard[float]:
-    """Whether a width [in] is that of a column, in which panels stand one below the other."""
-    return width is not None and width < _COLUMN
 
 
 def _title(runs: Sequence[RunData]) -> str:

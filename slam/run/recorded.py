@@ -90,9 +90,7 @@ class Recording:
             raise MeasurementError(f"recording: a stamp is beyond {LATEST_STAMP:g} s")
         known: set[int] = set()
         for frame in self.frames:
-            _require_rows("observed", frame.observed)
-            _require_rows("added", frame.added)
-            known = _require_lives(frame, known)
+            known = _require_fits(frame, known)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -129,20 +127,15 @@ class Recording:
         return LandmarkTable(ids, descriptors, none.astype(np.int8), counts, counts, none, latest)
 
 
-def _require_rows(what: str, rows: Observations) -> None:
-    """Raise where pixels or ids of observations are none."""
-    if not len(rows):
-        return
-    if not np.isfinite(rows.uv_left).all():
-        raise MeasurementError(f"recording: a left pixel of {what} is not finite")
-    if (np.abs(rows.uv_left) > FARTHEST_PIXEL).any() or (np.abs(rows.uv_right) > FARTHEST_PIXEL).any():
-        raise MeasurementError(f"recording: a pixel of {what} is far outside of any image")
-    if rows.ids.min() < 0 or rows.ids.max() > MOST_ID:
-        raise MeasurementError(f"recording: ids of landmarks must go from 0 to {MOST_ID}")
-
-
-def _require_lives(frame: RecordedFrame, known: set[int]) -> set[int]:
-    """Raise where a frame does not fit the map before it; the map after it."""
+def _require_fits(frame: RecordedFrame, known: set[int]) -> set[int]:
+    """Raise where pixels or ids are none, or a frame does not fit the map before it; the map after it."""
+    for what, rows in (("observed", frame.observed), ("added", frame.added)):
+        if not np.isfinite(rows.uv_left).all():
+            raise MeasurementError(f"recording: a left pixel of {what} is not finite")
+        if (np.abs(rows.uv_left) > FARTHEST_PIXEL).any() or (np.abs(rows.uv_right) > FARTHEST_PIXEL).any():
+            raise MeasurementError(f"recording: a pixel of {what} is far outside of any image")
+        if len(rows) and (rows.ids.min() < 0 or rows.ids.max() > MOST_ID):
+            raise MeasurementError(f"recording: ids of landmarks must go from 0 to {MOST_ID}")
     every = [ids.tolist() for ids in (frame.observed.ids, frame.added.ids, frame.removed)]
     seen, new, gone = map(set, every)
     for ids, own, what in zip(every, (seen, new, gone), ("observed", "added", "removed")):

@@ -1,18 +1,17 @@
 """Recordings as files: an .npz of plain arrays, without pickled objects, with a version.
 
-Keys: ``format``, ``version``, ``name``, ``kind``, ``rig`` and ``models`` (JSON), ``numbers``, ``stamps``,
-``observed_…`` and ``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where
-earlier frames were corrected again ``corrections``, and, where the true path is known, ``truth_stamps`` and
-``truth_poses``. ``…frame`` are rows of ``stamps``, ascending; ``corrections`` are the parameters of the correction that
-each frame's pixels have (F, n). Meanings: `slam.run.recorded.Recording`.
+Keys: ``header`` (JSON: ``format``, ``version``, ``name``, ``kind``, ``rig``, ``models``), ``numbers`` and ``stamps`` of
+the frames (F), ``rows`` (M, 3) of whole numbers: the row of ``stamps``, what it is (0 observed, 1 added, 2 removed),
+and the landmark's id, in the order in which they were given; ``pixels`` (M, 4): uL, vL, uR, vR. Where frames were
+corrected again, ``corrections``: the parameters of the correction that each frame's pixels have (F, n). Where the true
+path is known, ``truth_stamps`` and ``truth_poses``. Meanings: `slam.run.recorded.Recording`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +29,12 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels, MotionModel, ObjectModels, models_for
 from slam.run.recorded import RecordedFrame, Recording
 
-_FORMAT = "surf-stereo-slam recording"
-_VERSION = 2
+_HEADER = {"format": "surf-stereo-slam recording", "version": 3}
 _LARGEST = 2**32  # bytes of a file
 
-#: Arrays of a file with their numbers of dimensions, of whole numbers and of others; the last ones may be missing.
-_WHOLE = {"numbers": 1, "removed_frame": 1, "removed": 1, "observed_frame": 1, "observed_ids": 1, "added_frame": 1,
-          "added_ids": 1}  # fmt: skip
-_REAL = {"stamps": 1, "observed_uv_left": 2, "observed_uv_right": 2, "added_uv_left": 2, "added_uv_right": 2,
-         "corrections": 2, "truth_stamps": 1, "truth_poses": 3}  # fmt: skip
-_OPTIONAL = ("corrections", "truth_stamps", "truth_poses")
+#: Arrays of a file: kind of numbers (i whole, f others) and dimensions; the last three may be missing.
+_ARRAYS = {"numbers": "i1", "stamps": "f1", "rows": "i2", "pixels": "f2",
+           "corrections": "f2", "truth_stamps": "f1", "truth_poses": "f3"}  # fmt: skip
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
@@ -48,37 +43,29 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     Raises:
         SequenceError: the file cannot be written.
     """
-    r, frames = recording, recording.frames
+    r, rows, pixels = recording, [np.zeros((0, 3), np.int64)], [np.zeros((0, 4))]
+    for k, frame in enumerate(r.frames):
+        for what, (ids, *uv) in enumerate((_cells(frame.observed), _cells(frame.added), (frame.removed,))):
+            rows.append(np.column_stack([np.full(len(ids), k), np.full(len(ids), what), np.asarray(ids, np.int64)]))
+            pixels.append(np.column_stack(uv) if uv else np.full((len(ids), 4), np.nan))
     rig = {"left": asdict(r.rig.left), "right": asdict(r.rig.right), "R": r.rig.R.tolist(), "b": r.rig.b.tolist()}
-    arrays: dict[str, Any] = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "name": r.name,
-        "kind": r.kind,
-        "rig": json.dumps(rig),
-        "models": json.dumps(asdict(r.models)),
-        "numbers": np.array([f.number for f in frames], np.int64),
-        "stamps": r.stamps,
-        "removed_frame": np.repeat(np.arange(len(frames)), [len(f.removed) for f in frames]),
-        "removed": np.concatenate([np.zeros(0, np.int64), *(np.asarray(f.removed, np.int64) for f in frames)]),
-    }
-    for what in ("observed", "added"):
-        every = [getattr(f, what) for f in frames]
-        arrays[f"{what}_frame"] = np.repeat(np.arange(len(every)), [len(o) for o in every])
-        for key in ("ids", "uv_left", "uv_right"):
-            parts = [getattr(o, key) for o in (Observations.empty(), *every)]
-            arrays[f"{what}_{key}"] = np.concatenate(parts)
-    revisions = [f.revision for f in frames]
-    first = next((revision for revision in revisions if revision is not None), None)
-    if first is not None:  # of each frame, the correction in force
-        rows = [first.before.parameters]
+    header = _HEADER | {"name": r.name, "kind": r.kind, "rig": rig, "models": asdict(r.models)}
+    arrays: dict[str, Any] = {"header": json.dumps(header), "numbers": np.array([f.number for f in r], np.int64)}
+    arrays |= {"stamps": r.stamps, "rows": np.concatenate(rows), "pixels": np.concatenate(pixels)}
+    revisions = [frame.revision for frame in r]
+    if first := next(filter(None, revisions), None):  # of each frame, the correction in force
+        parameters = [first.before.parameters]
         for revision in revisions:
-            rows.append(rows[-1] if revision is None else revision.after.parameters)
-        arrays["corrections"] = np.array(rows[1:])
+            parameters.append(parameters[-1] if revision is None else revision.after.parameters)
+        arrays["corrections"] = np.array(parameters[1:])
     if r.ground_truth is not None:
         arrays.update(truth_stamps=r.ground_truth.stamps, truth_poses=r.ground_truth.poses)
     with whole_file(path, SequenceError) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def _cells(observations: Observations) -> tuple[np.ndarray, ...]:
+    return observations.ids, observations.uv_left, observations.uv_right
 
 
 def load_recording(path: str | Path) -> Recording:
@@ -98,63 +85,48 @@ def load_recording(path: str | Path) -> Recording:
 
 
 def _recording(arrays: dict[str, np.ndarray]) -> Recording:
-    if str(arrays.get("format", "")) != _FORMAT:
-        raise SequenceError("is no recording")
-    version = arrays["version"]
-    if version.ndim or version.dtype.kind not in "iu" or version != _VERSION:
-        raise SequenceError(f"is a recording of version {version}; this program reads version {_VERSION}")
-    for key, dimensions in (_WHOLE | _REAL).items():
-        if key in _OPTIONAL and key not in arrays:
-            continue
-        found, whole = arrays[key], key in _WHOLE
-        if found.ndim != dimensions or found.dtype.kind not in ("iu" if whole else "f"):
-            raise SequenceError(f"{key} is of type {found.dtype} with {found.ndim} dimensions")
-        arrays[key] = found.astype(np.int64 if whole else float)
-    texts = {"name": arrays["name"], "rig": arrays["rig"], "models": arrays["models"], "kind": arrays.get("kind")}
-    for key, text in texts.items():
-        if text is not None and (text.ndim or text.dtype.kind != "U"):
-            raise SequenceError(f"{key} is no text")
-    tree = json_text(str(texts["rig"]), "rig", SequenceError)
-    left, right = (
-        PinholeCamera(**{**tree[side], "distortion": tuple(tree[side]["distortion"])}) for side in ("left", "right")
-    )
+    header = json_text(str(arrays.get("header", "{}")), "header", SequenceError)
+    if header.get("format") != _HEADER["format"]:
+        raise SequenceError("is no recording of this version")
+    if header["version"] != _HEADER["version"]:
+        raise SequenceError(f"is a recording of version {header['version']}; this one reads {_HEADER['version']}")
+    for key, kind in _ARRAYS.items():
+        if key in arrays or key in ("numbers", "stamps", "rows", "pixels"):
+            found = arrays[key]
+            if found.ndim != int(kind[1]) or found.dtype.kind not in ("iu" if kind[0] == "i" else "f"):
+                raise SequenceError(f"{key} is of type {found.dtype} with {found.ndim} dimensions")
+            arrays[key] = found.astype(np.int64 if kind[0] == "i" else float)
+    tree, models = header["rig"], header["models"]
+    left, right = (PinholeCamera(**{**tree[s], "distortion": tuple(tree[s]["distortion"])}) for s in ("left", "right"))
     rig = StereoRig(left, right, np.array(tree["R"], float), np.array(tree["b"], float))
-    tree = json_text(str(texts["models"]), "models", SequenceError)
-    nested = {"motion": MotionModel(**tree["motion"]), "objects": ObjectModels(**tree.get("objects", {}))}
-    kind = "handheld" if texts["kind"] is None else str(texts["kind"])
-    models_for(kind)
+    models |= {"motion": MotionModel(**models["motion"]), "objects": ObjectModels(**models["objects"])}
+    models_for(header["kind"])
     truth = Trajectory(arrays["truth_stamps"], arrays["truth_poses"]) if "truth_stamps" in arrays else None
     frames = _frames(arrays, rig)
-    return Recording(str(texts["name"]), rig, EstimatorModels(**{**tree, **nested}), frames, truth, kind=kind)
+    return Recording(str(header["name"]), rig, EstimatorModels(**models), frames, truth, kind=header["kind"])
 
 
 def _frames(arrays: Mapping[str, np.ndarray], rig: StereoRig) -> tuple[RecordedFrame, ...]:
     """What was given in each frame."""
-    numbers, stamps = arrays["numbers"], arrays["stamps"]
+    numbers, stamps, rows, pixels = (arrays[key] for key in ("numbers", "stamps", "rows", "pixels"))
     if len(numbers) != len(stamps):
         raise SequenceError("stamps must be finite and increase, with a number each")
-    none = Observations.empty()
-    observed, added = (
-        [
-            Observations(*cells) if len(cells[0]) else none
-            for cells in _by_frame(arrays, what, (f"{what}_ids", f"{what}_uv_left", f"{what}_uv_right"))
-        ]
-        for what in ("observed", "added")
-    )
-    removed = [cells[0] for cells in _by_frame(arrays, "removed", ("removed",))]
+    if rows.shape[1:] != (3,) or pixels.shape != (len(rows), 4):
+        raise SequenceError("rows and pixels differ in length")
+    place = 3 * rows[:, 0] + rows[:, 1]
+    inside = (rows[:, :2] >= 0).all() and (rows[:, 1] <= 2).all() and (place < 3 * len(stamps)).all()
+    if not inside or (np.diff(place) < 0).any():
+        raise SequenceError(f"frames of rows must ascend from 0 to {len(stamps) - 1}")
     revisions = _revisions(arrays, len(stamps), rig)
-    return tuple(map(RecordedFrame, numbers.tolist(), stamps.tolist(), observed, added, removed, revisions))
-
-
-def _by_frame(arrays: Mapping[str, np.ndarray], what: str, keys: tuple[str, ...]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Arrays of rows of all frames, taken apart by frame."""
-    count, frame = len(arrays["stamps"]), arrays[f"{what}_frame"]
-    if len(frame) and (frame[0] < 0 or frame[-1] >= count or (np.diff(frame) < 0).any()):
-        raise SequenceError(f"frames of {what} must ascend from 0 to {count - 1}")
-    if any(arrays[key].shape not in ((len(frame),), (len(frame), 2)) for key in keys):
-        raise SequenceError(f"arrays of {what} differ in length")
-    for a, b in pairwise(np.searchsorted(frame, np.arange(count + 1)).tolist()):
-        yield tuple(arrays[key][a:b] for key in keys)
+    ends = np.searchsorted(place, np.arange(3 * len(stamps) + 1)).tolist()
+    ids, none, frames = rows[:, 2], Observations.empty(), []
+    for k, (a, b, c, d) in enumerate(zip(ends[:-1:3], ends[1::3], ends[2::3], ends[3::3])):
+        given = [
+            Observations(ids[i:j], pixels[i:j, :2], pixels[i:j, 2:]) if j > i else none for i, j in ((a, b), (b, c))
+        ]
+        seen, new = given
+        frames.append(RecordedFrame(int(numbers[k]), float(stamps[k]), seen, new, ids[c:d], revisions[k]))
+    return tuple(frames)
 
 
 def _revisions(arrays: Mapping[str, np.ndarray], count: int, rig: StereoRig) -> list[Revision | None]:

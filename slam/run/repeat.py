@@ -7,7 +7,6 @@ import math
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -17,55 +16,35 @@ from typing import Any
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.files import read_object
+from slam.run.options import RunOptions
 
 CONFIG = "config.json"
 _NO_FILES = ("synthetic:", "camera:")
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
 
-@dataclass(frozen=True)
-class Origin:
-    """What a command line says of a run besides names and settings."""
-
-    command: str  # the command line
-    sequence: str  # as `slam.open_sequence` takes it
-    format: str | None  # of the sequence; None for found out
-    kind: str  # of motion that the defaults are for
-    prior_map: Path | None = None  # file of the map that it starts in
-    mono: bool = False  # whether the left images are used alone
-    calibration: Path | None = None  # file with what is known of the rig's error
-
-    def to_json(self, folder: Path) -> dict[str, Any]:
-        """The tree for the ``config.json`` of a run in `folder`: files by absolute and by relative path."""
-        return {
-            "command": self.command,
-            "source": {"format": self.format, **_places(self.sequence, folder, self.format in ("synthetic", "camera"))},
-            "kind": self.kind,
-            "mono": self.mono,
-            "prior_map": None if self.prior_map is None else _places(str(self.prior_map), folder),
-            "calibration": None if self.calibration is None else _places(str(self.calibration), folder),
-        }
-
-
-@dataclass(frozen=True)
-class Repeat:
-    """A run as its ``config.json`` describes it."""
-
-    origin: Origin  # the sequence is where it is found now; empty where it is not known
-    frontend: str
-    backend: str
-    config: SystemConfig
-    start: int
-    stop: int | None
-    versions: Mapping[str, str]  # of the packages that it was made with
+def origin(options: RunOptions) -> dict[str, Any]:
+    """What ``config.json`` says besides names and settings: the command, and files by absolute and by relative path."""
+    if not options.source:  # of a recording, or a sequence made in Python
+        return {"command": options.command}
+    no_file = options.format in ("synthetic", "camera")
+    files = {"prior_map": options.prior_map, "calibration": options.calibration}
+    return {
+        "command": options.command,
+        "source": {"format": options.format, **_places(options.source, options.out, no_file)},
+        "kind": options.kind,
+        "mono": options.mono,
+        **{key: file and _places(str(file), options.out) for key, file in files.items()},
+    }
 
 
 def load(
-    path: Path, sequence: str | None = None, prior_map: Path | None = None, calibration: Path | None = None
-) -> Repeat:
-    """Read the ``config.json`` of a run.
+    path: Path, source: str | None = None, prior_map: Path | None = None, calibration: Path | None = None
+) -> tuple[RunOptions, dict[str, str]]:
+    """Read the ``config.json`` of a run: its options, and the versions that it was made with.
 
-    `path` is the file, or the run's folder; the others are taken in place of the run's own.
+    `path` is the file, or the run's folder; the others are taken in place of the run's own. The sequence is where it
+    is found now; empty where it is not known.
 
     Raises:
         SlamError: it cannot be read, is none of a run of a sequence, or a file of its is not found any more.
@@ -76,16 +55,18 @@ def load(
         tree = _restored(read_object(file))
         if str(tree.get("command", "")).startswith("slam replay"):
             raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
-        source, (start, stop) = tree.get("source") or {}, tree["frames"]
-        given = {"prior_map": prior_map, "calibration": calibration}
-        files = {key: own or (Path(_found(tree[key], file)) if tree.get(key) else None) for key, own in given.items()}
-        origin = Origin(
-            str(tree.get("command", "")), sequence or (_found(source, file) if source else ""), source.get("format"),
-            str(tree.get("kind", "handheld")), mono=bool(tree.get("mono", False)), **files,
+        before, (start, stop) = tree.get("source") or {}, tree["frames"]
+
+        def own(key: str) -> Path | None:
+            return Path(_found(tree[key], file)) if tree.get(key) else None
+
+        options = RunOptions(
+            str(tree["backend"]), str(tree["frontend"]), SystemConfig.from_json(tree["settings"]), Path(), int(start),
+            None if stop is None else int(stop), mono=bool(tree.get("mono", False)), format=before.get("format"),
+            source=source or (_found(before, file) if before else ""), kind=str(tree.get("kind", "handheld")),
+            prior_map=prior_map or own("prior_map"), calibration=calibration or own("calibration"),
         )  # fmt: skip
-        names = str(tree["frontend"]), str(tree["backend"])
-        config, made_with = SystemConfig.from_json(tree["settings"]), dict(tree.get("versions", {}))
-        return Repeat(origin, *names, config, int(start), None if stop is None else int(stop), made_with)
+        return options, dict(tree.get("versions", {}))
     except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise SlamError(f"{file}: not the config.json of a run: {error!r}") from error
 

@@ -1,7 +1,7 @@
-"""What the figures of a run are: the one table that terminal, pictures and comparisons read its ``summary.json`` by.
+"""What the figures of a run are: the one table by which terminal, pictures and comparisons read its ``summary.json``.
 
 A row has the figure's name, unit, place in the summary, and which way is better. What is computed, and how, is in
-`slam.evaluation` and `slam.evaluation.objects`. Whether covariances hold is judged here, for one run and for several.
+`slam.evaluation`. Whether covariances hold is judged here, for one run and for several.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ class Metric:
         unit: in which people see it.
         scale: of that unit, by the unit of the key.
         place: keys of a run's summary one below the other; empty where the summary does not have it.
-        share_of: what its number there is divided by: a number, or the name of another one beside it.
     """
 
     key: str
@@ -39,7 +38,6 @@ class Metric:
     unit: str = ""
     scale: float = 1.0
     place: tuple[str, ...] = ()
-    share_of: float | str = 1.0
 
     @property
     def title(self) -> str:
@@ -64,13 +62,14 @@ COMPLETED = Metric("completed", "runs completed", "higher", True, "%", 100)
 _ONLINE, _FINAL, _HONEST = ("accuracy", "online"), ("accuracy", "final"), ("consistency",)
 _MM, _PERCENT, _FRAMES = ("mm", 1e3), ("%", 100.0), ("frames", 1.0)
 
-#: NEES by key: over what, its place in the summary, and whether a summary speaks of it.
+#: NEES by key, the best to judge by first (errors from the start add up): over what, place, whether it is a main one.
 _NEES = {
-    "nees_per_dof": ("from the start", "mean NEES", True),
-    "nees_1m_per_dof": ("over 1 m", "NEES over 1 m", False),
     "nees_10m_per_dof": ("over 10 m", "NEES over 10 m", True),
+    "nees_1m_per_dof": ("over 1 m", "NEES over 1 m", False),
+    "nees_per_dof": ("from the start", "mean NEES", True),
     "nees_100m_per_dof": ("over 100 m", "NEES over 100 m", False),
 }
+_FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
 #: In the order of the tables. Times are apart: they differ from run to run.
 METRICS = (
@@ -83,15 +82,14 @@ METRICS = (
     Metric("rpe_1s_m", "RPE RMSE over 1 s", "lower", False, *_MM, (*_ONLINE, "RPE RMSE over 1 s [m]")),
     Metric("rpe_1s_deg", "RPE RMSE over 1 s, rotation", "lower", False, "deg", 1.0,
            (*_ONLINE, "RPE rotation RMSE over 1 s [deg]")),
-    Metric("segment_percent", "RPE by distance (segment error)", "lower", False, "%", 1.0,
-           (*_ONLINE, "segment error [%]")),
+    Metric("segment_percent", "RPE by distance", "lower", False, "%", 1.0, (*_ONLINE, "segment error [%]")),
     Metric("scale_error_percent", "scale error, absolute", "lower", False, "%", 1.0, (*_HONEST, "scale error [%]")),
     Metric("scale_sigma_percent", "scale sigma (claimed)", "", False, "%", 1.0, (*_HONEST, "scale sigma [%]")),
-    *(Metric(key, f"NEES / 6 {where} (expected 1)", "one", main, place=(*_HONEST, name), share_of="dof")
-      for key, (where, name, main) in _NEES.items()),
-    *(Metric(f"{key}_left_out", f"stretches {where} without covariance", "", False, *_PERCENT,
-             (*_HONEST, f"no covariance {where}")) for key, (where, _, _) in list(_NEES.items())[1:]),
-    Metric("nis_per_dof", "NIS per degree of freedom (expected 1)", "one",
+    *(Metric(key, f"NEES / 6 {over} (1 is right)", "one", main, place=(*_HONEST, name))
+      for key, (over, name, main) in _NEES.items()),
+    *(Metric(f"{key}_left_out", f"stretches {over} not judged", "", False, *_PERCENT,
+             (*_HONEST, f"no covariance {over}")) for key, (over, _, _) in _NEES.items() if over != "from the start"),
+    Metric("nis_per_dof", "NIS / dof (up to 1 is right)",
            place=(*_HONEST, "NIS per degree of freedom")),
     Metric("landmark_error_m", "landmark error, median", "lower", True, *_MM),
     Metric("landmark_error_90_m", "landmark error, 90 % below", "lower", False, *_MM),
@@ -101,8 +99,6 @@ METRICS = (
     Metric("frames_predicted", "frames predicted", "", False, *_PERCENT),
     Metric("frames_failed", "frames failed", "", False, *_PERCENT),
     Metric("map_size", "landmarks in the map, mean"),
-    Metric("lifetime_frames", "lifetime of a landmark, median", "", False, *_FRAMES),
-    Metric("lifetime_mean_frames", "lifetime of a landmark, mean", "", False, *_FRAMES),
     Metric("used_per_frame", "observations used per frame"),
 )  # fmt: skip
 
@@ -116,17 +112,16 @@ _ABOVE = (
     Metric("landmarks", "landmarks at the end", place=("landmarks",)),
     Metric("path_m", "path length", unit="m", place=("path_length_m",)),
     Metric("speed", "speed, median", unit="m/s", place=("speed_m_per_s",)),
-    Metric("sigma_m", "sigma of the last position", "", False, *_MM, ("final_sigma_m",)),
+    Metric("sigma_m", "σ of the last position", "", False, *_MM, ("final_sigma_m",)),
     Metric("bodies", "moving bodies found", place=("bodies",)),
 )
-_COMPILING = Metric("compiling", "kernels compiled, beside these times", unit="s", place=("compile_seconds",))
 _BELOW = (
     Metric("dropped", "frames dropped", place=("live", "frames dropped")),
     Metric("behind", "behind, median", unit="ms", place=("live", "milliseconds behind", "median")),
     Metric("behind_most", "behind, most", unit="ms", place=("live", "milliseconds behind", "max")),
     Metric("milliseconds", "stages of a frame, median", unit="ms", place=("milliseconds", "median_total")),
     Metric("rate", "frames per second", place=("frames_per_second",)),
-    _COMPILING,
+    Metric("compiling", "kernels compiled, apart", unit="s", place=("compile_seconds",)),
 )
 _COMPILED = 0.05  # compile times below this [s] are not worth a row
 
@@ -140,21 +135,20 @@ _BODY_NEES = "NEES / degree of freedom"
 _SHARES = ("precision", "recall", "F1", "coverage", "counted right")
 _UNITS = {"m": _MM, "deg": ("deg", 1.0), "frames": _FRAMES}
 
-#: NEES by which covariances are judged, the best first: errors from the start add up along the path.
-_JUDGED = ("nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof", "nees_100m_per_dof")
-
 
 def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str]]]:
     """The table of some runs for people: label with unit, and a text per run; what no run has is left out."""
     yield "frames tracked", list(map(_tracked, summaries))
     found = [_placed((*_ABOVE, *_BELOW), s) | figures(s) for s in summaries]
-    bodies = [key for one in found for key in one if key.startswith("object bodies") and key.endswith(_OF_BODIES)]
-    left_out = set(_NOT_OF_ONE_RUN)
-    if not any(one.get(_COMPILING.key, 0.0) > _COMPILED for one in found):
-        left_out.add(_COMPILING.key)
-    for metric in (*_ABOVE, *METRICS, *map(object_metric, dict.fromkeys(bodies)), *_BELOW):
+    for one in found:
+        if not one.get("compiling", 0.0) > _COMPILED:
+            one.pop("compiling", None)
+    bodies = dict.fromkeys(
+        key for f in found for key in f if key.startswith("object bodies") and key.endswith(_OF_BODIES)
+    )
+    for metric in (*_ABOVE, *METRICS, *map(object_metric, bodies), *_BELOW):
         values = [one.get(metric.key, float("nan")) for one in found]
-        if metric.key not in left_out and np.isfinite(values).any():
+        if metric.key not in _NOT_OF_ONE_RUN and np.isfinite(values).any():
             yield metric.title, list(map(metric.show, values))
 
 
@@ -162,7 +156,7 @@ def facts(summary: Mapping[str, Any]) -> str:
     """What a run found, also where there is no truth, and whether its covariances hold, in one line for a picture."""
     found = _placed(_ABOVE, summary) | figures(summary)
     shown = (*_ABOVE[1:], BY_KEY["loops_closed"], BY_KEY["loops_refused"])
-    words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown if m.key in found]
+    words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown if found.get(m.key)]
     return "; ".join([*words, *filter(None, [verdict_of_run(summary)])])
 
 
@@ -181,18 +175,20 @@ def _placed(metrics: Sequence[Metric], summary: Mapping[str, Any]) -> dict[str, 
     """What a summary says of some figures that have a place in it, by key."""
     found = {}
     for metric in metrics:
-        tree: Any = summary
-        for key in metric.place[:-1]:
-            tree = tree.get(key, {}) if isinstance(tree, Mapping) else {}
-        if metric.place and isinstance(tree, Mapping) and tree.get(metric.place[-1]) is not None:
-            divisor = tree[metric.share_of] if isinstance(metric.share_of, str) else metric.share_of
-            found[metric.key] = float(tree[metric.place[-1]]) / divisor
+        tree: Any = summary if metric.place else None
+        for key in metric.place:
+            tree = tree.get(key) if isinstance(tree, Mapping) else None
+        if tree is not None:
+            found[metric.key] = float(tree) / (6 if metric.key in _NEES else 1)
     return found
 
 
 def figures(summary: Mapping[str, Any]) -> dict[str, float]:
     """What a run's summary says, by key of `METRICS`, and ``object …`` figures; what it does not say is left out."""
     found = _placed(METRICS, summary)
+    for key in _NEES:
+        if found.get(f"{key}_left_out", 0.0) > _FEW:
+            found.pop(key, None)
     if "scale_error_percent" in found:
         found["scale_error_percent"] = abs(found["scale_error_percent"])
     if not found.get("loops_closed", 0) + found.get("loops_refused", 0):
@@ -208,16 +204,13 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
 def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     """Whether covariances are as large as the errors, by which figure and which band; empty where no NEES is known.
 
-    A figure of which more than half of the stretches had no covariance is not judged by.
-
     Args:
         found: `figures` of a run, or their means over several.
         runs: how many. The band is that of as many independent values: it holds even if all frames of a run are as good
             as one, which errors of the rig make them.
     """
     low, high = (bound / 6 for bound in chi_square_band(6, max(runs, 1)))
-    usable = [key for key in _JUDGED if not found.get(f"{key}_left_out", 0.0) > 0.5]
-    known = {_NEES[key][0]: found[key] for key in usable if np.isfinite(found.get(key, np.nan))}
+    known = {over: found[key] for key, (over, _, _) in _NEES.items() if np.isfinite(found.get(key, np.nan))}
     if not known:
         return ""
     said = {w: "are too small" if v > high else "are too large" if v < low else "hold" for w, v in known.items()}
@@ -226,8 +219,8 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     word = "hold in part" if others and said[judged] == "hold" else said[judged]
     of = "runs" if runs == 1 else f"means of {runs} runs"
     text = (
-        f"covariances {word}: NEES / 6 {judged} is {number(known[judged])}, expected {low:.2f} to {high:.2f} (95 % of "
-        f"{of}); errors are {np.sqrt(known[judged]):.2f} times what they claim"
+        f"covariances {word}: NEES / 6 {judged} is {number(known[judged])} ({low:.2f} to {high:.2f} in 95 % of {of}); "
+        f"errors are {np.sqrt(known[judged]):.2f} times what they claim"
     )
     return "; ".join([text, *others])
 
@@ -246,21 +239,17 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
 
 def object_metric(key: str) -> Metric:
     """A figure of moving objects by the key that `object_figures` gives it."""
-    text = re.sub(r"^bodies (\d+) (ME )?", _named_body, key.removeprefix("object "))
-    label = text if text.startswith("body") else f"objects: {text}"
+    text = key.removeprefix("object ")
+    label = f"objects: {text}"
+    if body := re.match(r"bodies (\d+) (ME (\w+))?", text):
+        label = f"body {body[1]}: {f'{body[3]} error,' if body[2] else ''}{text[body.end() :]}"
     if key.endswith(_SHARES):
         return Metric(key, label, "higher", False, *_PERCENT)
     if key.endswith(_BODY_NEES):
         return Metric(key, label, "one")
-    found = re.fullmatch(r"(.*) \[(\w+)\]", label)
-    lower = "lower" if found or "false" in key else ""
-    if found is None or found[2] not in _UNITS:
-        return Metric(key, label, lower)
-    return Metric(key, found[1], lower, False, *_UNITS[found[2]])
-
-
-def _named_body(found: re.Match[str]) -> str:
-    return f"body {found[1]}: {'motion error, ' if found[2] else ''}"
+    name, bracket, unit = label.removesuffix("]").rpartition(" [")
+    lower = "lower" if bracket or "false" in key else ""
+    return Metric(key, name, lower, False, *_UNITS[unit]) if unit in _UNITS else Metric(key, label, lower)
 
 
 def object_figures(summary: Mapping[str, Any]) -> dict[str, float]:

@@ -14,9 +14,10 @@ import numpy as np
 from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
 from slam.evaluation.summary import rotation_errors
+from slam.evaluation.truth_error import interpolated, truth_covariances
 from slam.files import read_object, read_text
-from slam.geometry.se3 import Array, hat, so3_exp
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.se3 import Array, adjoint, hat, inverse, so3_exp
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import printable
 from slam.run.schema import OLD_LANDMARKS, STAGES
 
@@ -41,6 +42,7 @@ class RunData:
     sequence: str
     backend: str
     folder: Path
+    truth_noise: TruthNoise  # how far the truth may be off
     truth_is_exact: bool  # whether the truth has no errors of its own: that of a world
     loops: np.ndarray  # rows of `final` whose places are the same (L, 2), the later one first
     refused: np.ndarray  # rows of `final` whose places only looked alike (L, 2), the later one first
@@ -66,48 +68,64 @@ class RunData:
         landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
         upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
         last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
-        truth, final = folder / "truth.txt", Trajectory.read_tum(folder / "trajectory_final.txt")
+        final = Trajectory.read_tum(folder / "trajectory_final.txt")
         located = [row for row in frames if row["sd_x"]]
-        config = read_object(folder / "config.json")
+        config, stamps = read_object(folder / "config.json"), {row["frame"]: float(row["stamp"]) for row in frames}
+
+        def rows_at(stamps: Any) -> np.ndarray:
+            return np.searchsorted(final.stamps, np.array(stamps, float) - 1e-9).clip(0, max(len(final) - 1, 0))
+
+        def pairs(column: str) -> np.ndarray:
+            found = [(stamps[row["frame"]], stamps[row[column]]) for row in frames if (row[column] or "").isdigit()]
+            return rows_at(found).reshape(-1, 2)
+
+        bodies: dict[str, list[list[float]]] = {}
+        for _, body, position in read_objects(folder):
+            bodies.setdefault(body, []).append(position)
+        truth, old, path = folder / "truth.txt", folder / OLD_LANDMARKS, folder / "summary.json"
+        summary = read_object(path) if path.exists() else {}
+        noise: dict[str, Any] = {key: float(value) for key, value in summary.get("truth", {}).items()}
         return cls(
-            printable(name),
-            Trajectory.read_tum(folder / "trajectory.txt"),
-            final,
-            _numbers(landmarks, ("x", "y", "z")),
-            upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
-            last_seen == int(frames[-1]["frame"]),
-            _numbers(located, ("sd_x", "sd_y", "sd_z", "sd_rotation")) * [1, 1, 1, np.degrees(1)],
-            np.array([row["status"] in ("started", "tracked") for row in located], bool),
-            [row["status"] for row in frames],
-            {stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},
-            Trajectory.read_tum(truth) if truth.exists() else None,
-            printable(str(config["sequence"])),
-            printable(str(config["backend"])),
-            folder,
-            config["format"] == "synthetic",
-            _pairs(frames, final, "loop"),
-            _pairs(frames, final, "refused"),
-            _rows_at(final, np.array([float(row["stamp"]) for row in frames if row.get("keyframe") == "1"])),
-            _numbers(_rows(folder / OLD_LANDMARKS) if (folder / OLD_LANDMARKS).exists() else [], ("x", "y", "z")),
-            _bodies(folder),
-            read_object(folder / "summary.json") if (folder / "summary.json").exists() else {},
+            name=printable(name),
+            online=Trajectory.read_tum(folder / "trajectory.txt"),
+            final=final,
+            positions=_numbers(landmarks, ("x", "y", "z")),
+            covariances=upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
+            seen_last=last_seen == int(frames[-1]["frame"]),
+            deviations=_numbers(located, ("sd_x", "sd_y", "sd_z", "sd_rotation")) * [1, 1, 1, np.degrees(1)],
+            measured=np.array([row["status"] in ("started", "tracked") for row in located], bool),
+            status=[row["status"] for row in frames],
+            milliseconds={stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},
+            truth=Trajectory.read_tum(truth) if truth.exists() else None,
+            sequence=printable(str(config["sequence"])),
+            backend=printable(str(config["backend"])),
+            folder=folder,
+            truth_noise=TruthNoise(**noise),
+            truth_is_exact=config["format"] == "synthetic",
+            loops=pairs("loop"),
+            refused=pairs("refused"),
+            keyframes=rows_at([float(row["stamp"]) for row in frames if row["keyframe"] == "1"]),
+            old=_numbers(_rows(old) if old.exists() else [], ("x", "y", "z")),
+            bodies={body: np.array(positions) for body, positions in bodies.items()},
+            summary=summary,
         )
 
+    @property
+    def centre(self) -> Array:
+        """The middle of the online path (3,)."""
+        return np.asarray(self.online.positions.mean(axis=0))
 
-def _pairs(frames: list[dict[str, str]], final: Trajectory, column: str) -> np.ndarray:
-    """Rows of the final path (L, 2) of the frames that a column names a place for, and of that place."""
-    stamps = {row["frame"]: float(row["stamp"]) for row in frames}
-    pairs = [(stamps[row["frame"]], stamps[row[column]]) for row in frames if (row.get(column) or "").isdigit()]
-    return _rows_at(final, np.array(pairs).reshape(-1, 2))
+    @property
+    def extent(self) -> float:
+        """How far the path reaches [m]; of the scene where the camera hardly moved, or was lost."""
+        distance = np.linalg.norm(self.positions - self.centre, axis=1)
+        scene = 0.5 * float(np.median(distance)) if len(distance) else 0.0
+        return max(float(np.ptp(self.online.positions, axis=0).max()), scene, 1.0)
 
-
-def _rows_at(final: Trajectory, stamps: Array) -> np.ndarray:
-    """Rows of the final path at stamps."""
-    return np.searchsorted(final.stamps, stamps - 1e-9).clip(0, max(len(final) - 1, 0))
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(read_text(path), newline="")))
+    @property
+    def reach(self) -> float:
+        """Distance from the middle of the path up to which landmarks are shown [m]."""
+        return 2.0 * self.extent + 3.0
 
 
 def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
@@ -119,12 +137,8 @@ def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
         raise SlamError(f"{path}: no list of objects: {error}") from error
 
 
-def _bodies(folder: Path) -> dict[str, Array]:
-    """Where each body was, by its id."""
-    found: dict[str, list[list[float]]] = {}
-    for _, name, position in read_objects(folder) if (folder / "objects.csv").exists() else ():
-        found.setdefault(name, []).append(position)
-    return {name: np.array(positions) for name, positions in found.items()}
+def _rows(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(read_text(path), newline="")))
 
 
 def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
@@ -132,68 +146,64 @@ def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
     return np.array([[float(row[c] or "nan") for c in columns] for row in rows]).reshape(-1, len(columns))
 
 
+def _paired(run: RunData, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """The online and the true path at common stamps, without poses of the truth that were not measured."""
+    own, true = associate(run.online, truth, 0.02, interpolated=True)
+    rows = np.flatnonzero(~interpolated(true, run.truth_noise))
+    return (own.select(rows), true.select(rows)) if len(rows) else (own, true)
+
+
 def place_of_truth(run: RunData, truth: Trajectory) -> Array:
     """Pose (4, 4) of the true path's world in the run's, in which both paths begin at the same position.
 
     It is turned by the first pose. A recorded one is turned a little further, so that the whole paths fit: an error of
     its first orientation by some tenths of a degree would look like an error of the path that grows with the distance.
-    Where no little turn makes them fit, the truth's orientations are in other axes, and the paths alone count.
+    What the paths do not tell, such as a turn about a straight path, stays as it was. Where no little turn makes them
+    fit, the truth's orientations are in other axes, and the paths alone count.
     """
-    own, true = associate(run.online, truth, 0.02, interpolated=True)
+    own, true = _paired(run, truth)
     T, turn = np.eye(4), own.poses[0, :3, :3] @ true.poses[0, :3, :3].T
     T[:3, :3] = turn
     if not run.truth_is_exact:
         places, true_places = (path.positions - path.positions[0] for path in (own, true))
-        T[:3, :3] = _fitted(places, true_places, turn, align(true, own).R)
+        turned = true_places @ turn.T
+        J = -hat(turned).reshape(-1, 3)
+        prior = float(np.mean((places - turned) ** 2)) / _TURNED**2
+        little = np.linalg.solve(J.T @ J + max(prior, 1e-12) * np.eye(3), J.T @ (places - turned).ravel())
+        fitted, by_paths = so3_exp(little) @ turn, align(true, own).R
+        left, least = (float(((places - true_places @ R.T) ** 2).sum()) for R in (fitted, by_paths))
+        fits = left <= 2 * least or left <= float(np.sum(places**2)) * _TURNED**2
+        T[:3, :3] = fitted if fits else by_paths
     T[:3, 3] = own.positions[0] - T[:3, :3] @ true.positions[0]
     return T
 
 
-def _fitted(own: Array, true: Array, turn: Array, by_paths: Array) -> Array:
-    """A rotation (3, 3) close to `turn` by which places since the start (N, 3) fit; `by_paths` where none does.
-
-    What the paths do not tell, such as a turn about a straight path, stays as it was.
-    """
-    turned = true @ turn.T
-    J = -hat(turned).reshape(-1, 3)
-    gaps = own - turned
-    prior = float(np.mean(gaps**2)) / _TURNED**2
-    fitted = so3_exp(np.linalg.solve(J.T @ J + max(prior, 1e-12) * np.eye(3), J.T @ gaps.ravel())) @ turn
-    left, least = (float(((own - true @ R.T) ** 2).sum()) for R in (fitted, by_paths))
-    return fitted if left <= 2 * least or left <= float(np.sum(own**2)) * _TURNED**2 else by_paths
-
-
 def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
-    """Time since the start (N,) [s], errors of the online pose and their claimed standard deviations, (N, 4) each.
+    """Time since the start (N,) [s], errors of the online pose and their standard deviations, (N, 4) each.
 
     The first three columns are the position along the axes of the run's world [m], see `place_of_truth`; the last one
-    is the angle of the rotation's error [deg]. Without a truth the errors are zero.
+    is the angle of the rotation's error [deg]. Without a truth the errors are zero. Standard deviations are those that
+    the back end claims and those of the truth together, as the NEES from the start has them.
     """
     if run.truth is None:
         stamps = run.online.stamps
         return stamps - stamps[0], np.zeros((len(stamps), 4)), run.deviations
-    own, true = associate(run.online, run.truth, 0.02, interpolated=True)
+    own, true = _paired(run, run.truth)
     T = place_of_truth(run, run.truth)
     expected = true.positions @ T[:3, :3].T + T[:3, 3]
     turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)
     errors = np.column_stack([own.positions - expected, np.degrees(turned)])
-    return own.stamps - run.online.stamps[0], errors, run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
+    first, last = np.zeros(len(own), np.intp), np.arange(len(own))
+    A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
+    P, R = truth_covariances(true, run.truth_noise, first, last, A), own.poses[:, :3, :3]
+    of_truth = np.diagonal(R @ P[:, 3:, 3:] @ np.swapaxes(R, 1, 2), axis1=1, axis2=2)
+    of_truth = np.column_stack([of_truth, np.degrees(1) ** 2 * np.trace(P[:, :3, :3], axis1=1, axis2=2)])
+    claimed = run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
+    return own.stamps - run.online.stamps[0], errors, np.sqrt(claimed**2 + np.maximum(of_truth, 0.0))
 
 
 def well_known(run: RunData) -> np.ndarray:
     """Rows of landmarks that are well known and near the path, most recent last: others spoil a picture's scale."""
     size = np.sqrt(np.trace(run.covariances, axis1=1, axis2=2)) if len(run.positions) else np.zeros(0)
-    distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
-    return np.flatnonzero((size < 0.2 * _extent(run)) & (distance < reach(run)))
-
-
-def _extent(run: RunData) -> float:
-    """How far the path reaches [m]; of the scene where the camera hardly moved, or was lost."""
-    distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
-    scene = 0.5 * float(np.median(distance)) if len(distance) else 0.0
-    return max(float(np.ptp(run.online.positions, axis=0).max()), scene, 1.0)
-
-
-def reach(run: RunData) -> float:
-    """Distance from the middle of the path up to which landmarks are shown [m]."""
-    return 2.0 * _extent(run) + 3.0
+    distance = np.linalg.norm(run.positions - run.centre, axis=1)
+    return np.flatnonzero((size < 0.2 * run.extent) & (distance < run.reach))

@@ -26,7 +26,7 @@ from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
 from slam.run.outputs import RunFiles, write_json, write_trajectory
 from slam.run.recorded import RecordedFrame, Recording
 from slam.run.recording import save_recording
-from slam.run.repeat import portable, versions
+from slam.run.repeat import origin, portable, versions
 from slam.run.replay import replay
 from slam.run.schema import schema
 from slam.run.settings_reference import in_force
@@ -178,13 +178,15 @@ class _Run:
         Raises:
             SlamError: a file cannot be written; all others are.
         """
-        record, score = self.record, score_for(self.sequence)
+        record, out, score = self.record, self.options.out, score_for(self.sequence)
         ended, stopped_by = "completed", None
-        with RunFiles(self.options.out) as files:
-            write_json(self.options.out / "config.json", self._config())
+        frontend, backend = getattr(self.system, "frontend", None), self.system.backend
+        names = {"sequence": self.sequence.name, "format": self.sequence.format}
+        names |= {"frontend": self.options.frontend, "backend": self.options.backend}
+        with RunFiles(out) as files:
+            write_json(out / "config.json", origin(self.options) | names | self._config(frontend, backend))
             with self._each():
-                frontend, backend = getattr(self.system, "frontend", None), self.system.backend
-                write_json(self.options.out / "schema.json", schema(self.options.config, frontend, backend))
+                write_json(out / "schema.json", schema(self.options.config, frontend, backend))
             try:
                 for number, result in results:
                     record.add(number, result)
@@ -196,25 +198,35 @@ class _Run:
                     if on_frame is not None:
                         on_frame(result)
             except BaseException as error:
-                ended, stopped_by = f"stopped: {one_line(text_of(error)) or type(error).__name__}", error
+                ended, stopped_by = f"stopped: {_said(error)}", error
                 raise
             finally:
                 if self.live is not None and self.live.ended_early and stopped_by is None:
                     ended = "ended by the user"
-                summary = self._head(ended)
+                summary = names | {"ended": ended} | self._tracking()
                 if record.stamps:
                     self._write_last(files, summary, score)
                 summary["seed"] = getattr(self.sequence, "values", {}).get("seed", 0)  # nothing else is random
                 summary |= {"configuration": self.options.config.to_json(), "versions": versions()}
                 with self._each():
-                    write_json(self.options.out / "summary.json", summary)
+                    write_json(out / "summary.json", summary)
                 self._write_copies()
                 if self.failures:
-                    summary["failures"] = self._said()
+                    summary["failures"] = list(map(_said, self.failures))
                     with self._each():
-                        write_json(self.options.out / "summary.json", summary)
+                        write_json(out / "summary.json", summary)
                 self._raise_failures(stopped_by)
         return summary
+
+    def _config(self, frontend: object, backend: object) -> dict[str, Any]:
+        """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
+        parts = {"frontend": in_force(frontend), "backend": in_force(backend)}
+        return {
+            "frames": [self.options.start, self.options.stop],
+            "settings": portable(self.options.config.to_json()),
+            "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
+            "versions": versions(),
+        }
 
     def _place(self, step: int | None) -> int | str:
         """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
@@ -230,10 +242,6 @@ class _Run:
         except Exception as error:  # noqa: BLE001 `_raise_failures` raises it
             self.failures.append(error)
 
-    def _said(self) -> list[str]:
-        """What failed, a line each."""
-        return [one_line(text_of(error)) or type(error).__name__ for error in self.failures]
-
     def _raise_failures(self, stopped_by: BaseException | None) -> None:
         """Raise what failed, in one line with the error that stopped the run; a signal goes on, after warnings.
 
@@ -241,19 +249,18 @@ class _Run:
             SlamError: a file could not be written.
             Exception: a defect of the program, as it is.
         """
-        lines = list(dict.fromkeys(self._said()))
+        lines = list(dict.fromkeys(map(_said, self.failures)))
         if not lines:
             return
-        if stopped_by is not None and not isinstance(stopped_by, SlamError):
-            for line in lines:
-                logger.warning("%s", line)
-            return
-        defect = next((error for error in self.failures if not isinstance(error, SlamError)), None)
-        if stopped_by is None and defect is not None:
-            raise defect
-        first = [] if stopped_by is None else [str(stopped_by)]
-        kind = SlamError if stopped_by is None else type(stopped_by)
-        raise kind("; ".join(dict.fromkeys([*first, *lines]))) from stopped_by
+        if stopped_by is None:
+            for error in self.failures:
+                if not isinstance(error, SlamError):
+                    raise error
+            raise SlamError("; ".join(lines))
+        if isinstance(stopped_by, SlamError):
+            raise type(stopped_by)("; ".join(dict.fromkeys([str(stopped_by), *lines]))) from stopped_by
+        for line in lines:
+            logger.warning("%s", line)
 
     def _write_last(self, files: RunFiles, summary: dict[str, Any], score: Any) -> None:
         """Write the files that are made at the end but the summary, and add to that how good the run was."""
@@ -298,40 +305,25 @@ class _Run:
         models, truth = options.config.models, sequence.ground_truth
         return Recording(sequence.name, sequence.rig, models, tuple(self.tape), truth, kind=sequence.kind)
 
-    def _head(self, ended: str) -> dict[str, Any]:
-        """The part of the summary that is known of every run: what was run, how it ended, and the tracking."""
-        options, record, sequence = self.options, self.record, self.sequence
+    def _tracking(self) -> dict[str, Any]:
+        """The part of the summary on the tracking, which is known of every run."""
+        options, record, rig = self.options, self.record, self.sequence.rig
         warnings = getattr(self.system, "warnings", ())
-        driving = options.origin.get("kind") == "driving"
-        doubt = scale_doubt(record, sequence.rig, driving)
-        doubt = doubt or motion_doubt(record, options.config.models.motion, driving)
+        driving = options.kind == "driving"
+        doubt = scale_doubt(record, rig, driving) or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
-        tracking = outcome(record, sequence.rig, warnings, in_map, dropped, doubt, driving)
+        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving)
         if doubt and not tracking:
             logger.warning("%s", doubt)
         return {
-            **self._names(),
-            "ended": ended,
             "frames": len(record.numbers),
             "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
             "tracking": tracking,
-            "warnings": [*sequence.warnings, *warnings, *([doubt] if doubt else [])],
+            "warnings": [*self.sequence.warnings, *warnings, *([doubt] if doubt else [])],
             **({} if self.live is None else {"live": live_frames(self.live, record)}),
         }
 
-    def _names(self) -> dict[str, Any]:
-        names = {"sequence": self.sequence.name, "format": self.sequence.format}
-        return names | {"frontend": self.options.frontend, "backend": self.options.backend}
 
-    def _config(self) -> dict[str, Any]:
-        """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
-        options = self.options
-        parts = {"frontend": in_force(getattr(self.system, "frontend", None)), "backend": in_force(self.system.backend)}
-        return {
-            **options.origin,
-            **self._names(),
-            "frames": [options.start, options.stop],
-            "settings": portable(options.config.to_json()),
-            "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
-            "versions": versions(),
-        }
+def _said(error: BaseException) -> str:
+    """An error in one line."""
+    return one_line(text_of(error)) or type(error).__name__

@@ -35,7 +35,8 @@ def settings() -> Iterator[Setting]:
     configs = {kind: SystemConfig.for_kind(kind) for kind in KINDS}
     for f in fields(SystemConfig):
         if f.name not in _PARTS:
-            yield from _of_class({kind: getattr(config, f.name) for kind, config in configs.items()}, f.name, "")
+            parts = {kind: getattr(config, f.name) for kind, config in configs.items()}
+            yield from (s for s in _of_class(parts, f.name, "") if can_be_set(s.key, ""))
     rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
@@ -45,7 +46,7 @@ def settings() -> Iterator[Setting]:
                 options = getattr(SystemConfig.for_kind(kind, **named), section)
                 parts[kind] = getattr(registry.create(f"{section}s", name, rig, **options), "config", None)
             if all(map(is_dataclass, parts.values())):
-                yield from _of_class(parts, section, name)
+                yield from (s for s in _of_class(parts, section, name) if can_be_set(s.key, name))
 
 
 def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
@@ -56,23 +57,15 @@ def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Set
         values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
         if is_dataclass(getattr(first, f.name)):
             yield from _of_class(values, key, owner)
-        elif can_be_set(key, owner):
-            yield Setting(key, owner, values, *texts.get(f.name, ("", "")))
+        else:
+            yield Setting(key.lstrip("."), owner, values, *texts.get(f.name, ("", "")))
 
 
 def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
     """Unit and meaning of each setting of a configuration below `section`, by key; nothing of another object."""
-    found: dict[str, dict[str, str]] = {}
     if not is_dataclass(config) or isinstance(config, type):
-        return found
-    texts = documented(type(config))
-    for f in fields(config):
-        value, key = getattr(config, f.name), f"{section}.{f.name}".lstrip(".")
-        if is_dataclass(value):
-            found |= descriptions(value, key)
-        elif section:
-            found[key] = dict(zip(("unit", "meaning"), texts.get(f.name, ("", ""))))
-    return found
+        return {}
+    return {s.key: {"unit": s.unit, "meaning": s.text} for s in _of_class({"": config}, section, "") if "." in s.key}
 
 
 def documented(kind: type) -> dict[str, tuple[str, str]]:

@@ -50,9 +50,8 @@ class Viewer:
             self.rr = import_module("rerun")
         except ImportError as error:
             raise SlamError("the viewer needs Rerun: pip install 'surf-stereo-slam[viewer]'") from error
-        self._target = target
+        self._target, self._rig, self._truth = target, rig, truth
         self._recording = _open(self.rr, target)
-        self._rig, self._truth = rig, truth
         self._start: float | None = None
         self._path: list[Array] = []
         self.log("", self.rr.ViewCoordinates.RDF, static=True)
@@ -79,12 +78,11 @@ class Viewer:
         image = frame.left if frame.left.ndim == 2 else frame.left[..., 2::-1]
         if image.dtype == np.uint8 and self._rig is not None:
             self.log("/camera/image", rr.Image(image).compress(jpeg_quality=80))
-        kinds = {
-            "measured": (result.matched_features, _SEEN),
-            "new": (result.added_features, _NEW),
-            "moving": (result.moving_features, _MOVING),
-        }
-        for name, (rows, colour) in kinds.items():
+        for name, rows, colour in (
+            ("measured", result.matched_features, _SEEN),
+            ("new", result.added_features, _NEW),
+            ("moving", result.moving_features, _MOVING),
+        ):
             self.log(f"/camera/image/{name}", rr.Points2D(pixels[rows], colors=colour, radii=2.0))
         for moving in result.objects:
             place, box = f"/objects/{moving.id}", moving.extent
@@ -142,9 +140,9 @@ class Viewer:
         self._recording.log(f"world{path}", what, static=static)
 
 
-def outputs(target: str, option: str) -> list[Output]:
-    """The file that a `Viewer` writes; none where it opens a window."""
-    return [] if target == LIVE else [Output(Path(target), option, makes_folder=True)]
+def outputs(target: str | None, option: str) -> list[Output]:
+    """The file that a `Viewer` writes; none where it opens a window, or there is none."""
+    return [] if target in (None, LIVE) else [Output(Path(target), option, makes_folder=True)]
 
 
 def view_run(folder: Path, target: str, overwrite: bool = False) -> None:

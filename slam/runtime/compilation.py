@@ -85,7 +85,7 @@ class _Notice(event.Listener):
         first = compile_clock.change(1)
         if not self._said:
             self._said = True
-            _LOG.info("compiling kernels, once for each back end, half a minute or more; `slam warm-up` does it before")
+            _LOG.info("compiling kernels that are not cached yet; `slam warm-up` compiles all of them beforehand")
         if first:
             self._collects = gc.isenabled()
             gc.disable()

@@ -45,6 +45,10 @@ def test_two_recordings_of_one_rig(made):
     assert any(abs(row["mean"]) > 1e-4 for row in turn)
     assert tree["agreement"].startswith("The recordings agree")
     assert all(word in printed for word in ("apart", "roll", "no uncertainty"))
+    assert tree["judgement"] in " ".join(printed.split())
+    assert (
+        tree["judgement"].startswith("By this the calibration is off by") and "a good calibration" in tree["judgement"]
+    )
     model = RigModel(slam.open_sequence(WORLD).rig)
     factors = {"left_cx": (model.focal, "px"), "right_f": (100, "%"), "left_k1": (1000, "10⁻³"), "yaw": (1000, "mrad")}
     for row in [row for row in tree["parameters"] if row["name"] in factors]:
@@ -65,7 +69,7 @@ def test_it_is_the_prior_of_a_run_and_of_its_repetition(made, tmp_path):
     found = json.loads((tmp_path / "first" / "summary.json").read_text())["self_calibration"]["parameters"]
     expected = json.loads(file.read_text())["parameters"]
     assert [row["mean"] for row in found] == [row["mean"] for row in expected]
-    assert load(tmp_path / "first").origin.calibration == file
+    assert load(tmp_path / "first")[0].calibration == file
     command("run", "--config", tmp_path / "first", "--out", tmp_path / "second", *QUIET)
     one, two = ((tmp_path / name / "trajectory.txt").read_bytes() for name in ("first", "second"))
     assert one == two

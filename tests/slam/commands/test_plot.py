@@ -8,7 +8,9 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.geometry.trajectory import Trajectory
+from slam.evaluation.truth_error import truth_covariances
+from slam.geometry.se3 import adjoint, inverse
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.options import RunOptions
 from slam.run.plots import KINDS
 from slam.run.plots import plot_folders as plot_runs
@@ -64,6 +66,22 @@ def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
     assert (error[1:, 3] < 5 * sigma[1:, 3]).all() and (sigma[1:, 3] > 0).all()
 
 
+def test_the_band_has_the_truth_s_own_errors_as_the_verdict_has_them(runs):
+    run_ = RunData.read(runs / "a", "a")
+    _, error, claimed = pose_errors(run_)
+    noise = TruthNoise(rotation=0.01, translation=0.1)
+    _, same, both = pose_errors(replace(run_, truth_noise=noise))
+    np.testing.assert_array_equal(same, error)
+    own, true = run_.online, run_.truth
+    first, last = np.zeros(len(own), np.intp), np.arange(len(own))
+    A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
+    P = truth_covariances(true, noise, first, last, A)
+    np.testing.assert_allclose(
+        both[:, 3] ** 2 - claimed[:, 3] ** 2, np.degrees(1) ** 2 * np.trace(P[:, :3, :3], 0, 1, 2)
+    )
+    assert (both[1:] > claimed[1:]).all()
+
+
 def test_a_recorded_truth_of_a_straight_path_is_not_turned_about_it(runs):
     """Places in a line do not tell a turn about that line."""
     run_ = RunData.read(runs / "a", "a")
@@ -75,3 +93,12 @@ def test_a_recorded_truth_of_a_straight_path_is_not_turned_about_it(runs):
     _, error, _ = pose_errors(replace(run_, online=next(made), truth=next(made), truth_is_exact=False))
     assert np.abs(error[:, 3]).max() < 0.01
     assert np.abs(error[:, :3]).max() < 0.01
+
+
+def test_truth_that_was_not_measured_is_no_error_in_the_picture(runs, monkeypatch):
+    """The first steps of KITTI 06 are extrapolated, which the verdict leaves out."""
+    monkeypatch.setattr("slam.run.run_data.interpolated", lambda true, noise: np.arange(len(true)) < 3)
+    run_ = RunData.read(runs / "a", "a")
+    time, error, _ = pose_errors(run_)
+    assert time[0] == pytest.approx(run_.online.stamps[3] - run_.online.stamps[0])
+    np.testing.assert_allclose(error[0], 0, atol=1e-9)

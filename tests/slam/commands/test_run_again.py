@@ -70,28 +70,40 @@ def test_a_recording_is_found_by_its_absolute_and_by_its_relative_path(here, rec
     source = json.loads((here / "out/run/config.json").read_text())["source"]
     assert source["relative"] == "../../data?kind=driving"
     assert source["absolute"] == f"{here / 'data'}?kind=driving"
-    assert load(here / "out/run/config.json").origin.sequence == f"{here / 'data'}?kind=driving"
+    assert load(here / "out/run/config.json")[0].source == f"{here / 'data'}?kind=driving"
     (here / "moved").mkdir()
     for name in ("data", "out"):
         (here / name).rename(here / "moved" / name)
-    found = load(here / "moved/out/run")
-    assert found.origin.sequence == f"{here / 'moved/data'}?kind=driving"
-    assert found.origin.kind == "driving"
+    found, _ = load(here / "moved/out/run")
+    assert found.source == f"{here / 'moved/data'}?kind=driving"
+    assert found.kind == "driving"
     (here / "moved/data").rename(here / "elsewhere")
     with pytest.raises(SlamError, match=r"data\?kind=driving is no longer at .*data.* nor .*moved/data"):
         slam("run", "--config", "moved/out/run")
     run("elsewhere", "--config", "moved/out/run", "--out", "third")
-    assert load(here / "third").config == found.config
+    assert load(here / "third")[0].config == found.config
 
 
 def test_a_prior_map_is_found_again(here):
     run(WORLD, "--save-map", "desk.map", "--out", "first")
     run(WORLD, "--map", "desk.map", "--mono", "--frames", "0:3", "--out", "second")
-    before = load(here / "second")
-    assert before.origin.mono
-    assert before.origin.prior_map == here / "desk.map"
+    before, _ = load(here / "second")
+    assert before.mono
+    assert before.prior_map == here / "desk.map"
+    assert before.config.map.monocular
     run("--config", "second", "--out", "third")
     assert (here / "second/trajectory.txt").read_bytes() == (here / "third/trajectory.txt").read_bytes()
+
+
+def test_all_that_a_run_writes_is_named(here):
+    words = ["--record", "a.npz", "--save-map", "a.map", "--draw", "drawn", "--out", "first", "--no-picture"]
+    assert "Files: first, a.npz, a.map, drawn" in slam("run", WORLD, "--frames", "0:2", *words)
+    assert all((here / name).exists() for name in ("first", "a.npz", "a.map", "drawn"))
+
+
+def test_the_list_says_what_each_back_end_is():
+    printed = " ".join(slam("list").split())
+    assert "ekf Extended Kalman filter" in printed and "batch Levenberg-Marquardt" in printed
 
 
 GOOD = {"frames": [0, None], "settings": {}, "frontend": "surf", "backend": "ekf"}
@@ -103,7 +115,7 @@ GOOD = {"frames": [0, None], "settings": {}, "frontend": "surf", "backend": "ekf
         (None, r"config\.json: No such file"),
         ("", r"config\.json: no valid JSON"),
         ("{}", r"not the config\.json"),
-        ("[]", r"config\.json: must hold an object, not a list"),
+        ("[]", r"config\.json: must hold an object, not list"),
         ("[" * 50_000, r"config\.json: no valid JSON"),
         (json.dumps(GOOD).replace("0", "1e999"), r"not the config\.json"),
         (json.dumps(GOOD | {"settings": {"colour": 1}}), "colour"),
@@ -116,9 +128,6 @@ def test_a_bad_config_is_one_line(tmp_path, text, words):
         (tmp_path / "config.json").write_text(text)
     with pytest.raises(SlamError, match=words):
         slam("run", WORLD, "--config", tmp_path, "--kind", "driving")
-
-
-def test_no_config_and_no_sequence():
     with pytest.raises(SlamError, match="name a sequence"):
         slam("run")
 

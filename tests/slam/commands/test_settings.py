@@ -38,6 +38,7 @@ def test_what_can_be_set_is_there_with_its_defaults(every):
             value = reduce(getitem, key.split("."), tree)
             assert shown[key].defaults[kind] == value, key
     assert len(every) <= 40
+    assert [s.key for s in every if not s.text] == []  # each has a meaning
     named = {(s.owner or s.key.partition(".")[0], s.key.partition(".")[2]) for s in every}
     assert {(owner, name) for owner, names in SETTABLE.items() for name in names} <= named
 

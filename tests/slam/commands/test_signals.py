@@ -3,7 +3,7 @@ import signal
 import pytest
 
 from slam.commands import cli
-from slam.commands.signals import Stopped, whole_frames
+from slam.commands.ending import Stopped, whole_frames
 
 WORLD = "synthetic:desk?frames=3"
 

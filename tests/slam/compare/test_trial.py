@@ -54,7 +54,7 @@ def test_the_figures_are_those_of_the_summary():
     found, _ = measured({})
     expected = consistency(path, covariances, SEQUENCE)
     assert found["nees_per_dof"] == pytest.approx(expected["mean NEES"] / 6)
-    assert found["nees_10m_per_dof"] == pytest.approx(expected["NEES over 10 m"] / 6)
+    assert "nees_10m_per_dof" not in found and found["nees_10m_per_dof_left_out"] > 0.5  # independent errors
     assert "nees_100m_per_dof" not in found  # the path is too short
     assert found["scale_error_percent"] == pytest.approx(abs(expected["scale error [%]"]))
     assert found["rpe_1s_m"] == evaluate(path, SEQUENCE)["RPE RMSE over 1 s [m]"]

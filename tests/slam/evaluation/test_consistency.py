@@ -12,6 +12,7 @@ from slam.evaluation.summary import evaluate
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
+from slam.run.results import verdict
 
 STEP = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 1.0])  # a turn of 0.02 rad and 1 m forward
 SIGMA = np.array([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.02])
@@ -43,6 +44,8 @@ def test_relative_nees_of_honest_odometry_is_six():
     for key in ("mean NEES", "NEES over 1 m", "NEES over 10 m"):
         assert 5.0 < figures[key] < 7.0, key
     assert "NEES over 100 m" not in figures
+    band = f"{figures['band low'] / 6:.2f} to {figures['band high'] / 6:.2f}"
+    assert band in verdict({"nees_per_dof": 1.0})  # one band in a summary and in what is said of it
 
 
 def test_relative_nees_tells_covariances_that_are_too_small():

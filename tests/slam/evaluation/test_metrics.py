@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -12,13 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from slam.evaluation.metrics import (
-    Statistics,
-    absolute_errors,
-    associate,
-    relative_errors,
-    segment_errors,
-)
+from slam.evaluation.metrics import PathErrors, absolute_errors, associate, relative_errors, segment_errors
 from slam.geometry.alignment import align_positions
 from slam.geometry.se3 import exp, inverse
 from slam.geometry.trajectory import Trajectory
@@ -48,58 +42,31 @@ def to_evo(trajectory: Trajectory) -> PoseTrajectory3D:
     return PoseTrajectory3D(poses_se3=list(trajectory.poses), timestamps=trajectory.stamps)
 
 
-def assert_equal_to_evo(ours: Statistics, theirs: dict[str, float]) -> None:
-    for name in ("rmse", "mean", "median", "std", "min", "max"):
-        assert getattr(ours, name) == pytest.approx(theirs[name], abs=1e-9, rel=1e-9), name
+def require_equal_to_evo(ours: PathErrors, truth: Trajectory, theirs: PoseTrajectory3D, metric, *arguments) -> None:
+    """To 1e-9. evo has rotations by SciPy's logarithm, so ours must agree there, too."""
+    for part, statistics in (
+        ("translation_part", ours.translation_statistics), ("rotation_angle_deg", ours.rotation_statistics)
+    ):  # fmt: skip
+        process = metric(evo_metrics.PoseRelation[part], *arguments)
+        process.process_data((to_evo(truth), theirs))
+        for name in ("rmse", "mean", "median", "std", "min", "max"):
+            expected = process.get_all_statistics()[name]
+            assert getattr(statistics, name) == pytest.approx(expected, abs=1e-9, rel=1e-9), name
 
 
-CASES = [(200, 0), (50, 1), (4, 2)]
-
-
-@pytest.mark.parametrize(("count", "seed"), CASES)
-class TestEvo:
-    """Equal to evo's to 1e-9. evo has rotations by SciPy's logarithm, so ours must agree there, too."""
-
-    @pytest.mark.parametrize("mode", ["none", "se3", "sim3"])
-    def test_ate(self, count: int, seed: int, mode: str) -> None:
-        truth = wander(count, seed)
-        estimate = disturb(truth, seed)
-        ours = absolute_errors(estimate, truth, aligned=mode != "none", with_scale=mode == "sim3")
-        theirs = to_evo(estimate)
+@pytest.mark.parametrize(("count", "seed"), [(200, 0), (50, 1), (4, 2)])
+def test_errors_are_equal_to_evo_s(count, seed):
+    truth = wander(count, seed)
+    estimate = disturb(truth, seed)
+    for mode in ("none", "se3", "sim3"):
+        ours, theirs = absolute_errors(estimate, truth, mode != "none", mode == "sim3"), to_evo(estimate)
         if mode != "none":
             theirs.align(to_evo(truth), correct_scale=mode == "sim3")
-        for relation, statistics in (
-            (evo_metrics.PoseRelation.translation_part, ours.translation_statistics),
-            (evo_metrics.PoseRelation.rotation_angle_deg, ours.rotation_statistics),
-        ):
-            ape = evo_metrics.APE(relation)
-            ape.process_data((to_evo(truth), theirs))
-            assert_equal_to_evo(statistics, ape.get_all_statistics())
-
-    @pytest.mark.parametrize("delta", [1, 3])
-    @pytest.mark.parametrize("overlapping", [True, False])
-    def test_rpe(self, count: int, seed: int, delta: int, overlapping: bool) -> None:
-        truth = wander(count, seed)
-        estimate = disturb(truth, seed)
+        require_equal_to_evo(ours, truth, theirs, evo_metrics.APE)
+    for delta, overlapping in product((1, 3), (True, False)):
         ours = relative_errors(estimate, truth, delta, overlapping)
-        for relation, statistics in (
-            (evo_metrics.PoseRelation.translation_part, ours.translation_statistics),
-            (evo_metrics.PoseRelation.rotation_angle_deg, ours.rotation_statistics),
-        ):
-            rpe = evo_metrics.RPE(relation, delta, evo_metrics.Unit.frames, all_pairs=overlapping)
-            rpe.process_data((to_evo(truth), to_evo(estimate)))
-            assert_equal_to_evo(statistics, rpe.get_all_statistics())
-
-
-def test_ate_of_a_nearly_straight_path_equals_evo_s() -> None:
-    truth = wander(60, 5, step=1.2, turn=0.0005)
-    estimate = disturb(truth, 5, drift=0.001)
-    ours = absolute_errors(estimate, truth)
-    theirs = to_evo(estimate)
-    theirs.align(to_evo(truth))
-    ape = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
-    ape.process_data((to_evo(truth), theirs))
-    assert_equal_to_evo(ours.translation_statistics, ape.get_all_statistics())
+        unit = evo_metrics.Unit.frames
+        require_equal_to_evo(ours, truth, to_evo(estimate), evo_metrics.RPE, delta, unit, 0.1, overlapping)
 
 
 def assert_proper(R: np.ndarray) -> None:
@@ -144,27 +111,23 @@ def test_a_straight_path_is_turned_as_its_orientations_say(count: int, seed: int
     assert errors.rotation.max() < 1e-5  # [deg]
 
 
-def test_association_by_nearest_stamp() -> None:
-    truth = straight(10)
+@pytest.mark.parametrize(
+    ("tolerance", "interpolated", "expected"),
+    [
+        (0.01, False, [0.995, 2.004, 8.0]),
+        (0.6, False, [-0.5, 0.995, 2.004, 3.5, 8.0, 9.3]),  # of two stamps near 2 the nearer has it
+        (0.5, True, [0.995, 2.004, 2.02, 3.5, 8.0]),  # inside the truth's span
+        (0.3, True, [0.995, 2.004, 2.02, 8.0]),
+    ],
+)
+def test_association(tolerance, interpolated, expected):
     stamps = np.array([-0.5, 0.995, 2.004, 2.02, 3.5, 8.0, 9.3])
     estimate = Trajectory(stamps, np.tile(np.eye(4), (7, 1, 1)))
-    ours, true = associate(estimate, truth, tolerance=0.01)
-    assert ours.stamps.tolist() == [0.995, 2.004, 8.0]
-    assert true.stamps.tolist() == [1, 2, 8]
-    assert true.positions[:, 2].tolist() == [1, 2, 8]
-    ours, true = associate(estimate, truth, tolerance=0.6)
-    assert len(ours) == 6  # two stamps near 2: the nearer has it; -0.5 is paired with 0
-    assert len(np.unique(true.stamps)) == 6
-
-
-def test_association_with_interpolated_truth() -> None:
-    truth = straight(10)
-    estimate = Trajectory(np.array([-0.1, 0.25, 2.004, 3.5, 9.0, 9.1]), np.tile(np.eye(4), (6, 1, 1)))
-    ours, true = associate(estimate, truth, tolerance=0.5, interpolated=True)
-    assert ours.stamps.tolist() == true.stamps.tolist() == [0.25, 2.004, 3.5, 9.0]
-    assert true.positions[:, 2] == pytest.approx([0.25, 2.004, 3.5, 9.0])
-    ours, _ = associate(estimate, truth, tolerance=0.3, interpolated=True)
-    assert ours.stamps.tolist() == [0.25, 2.004, 9.0]
+    ours, true = associate(estimate, straight(10), tolerance, interpolated)
+    assert ours.stamps.tolist() == expected
+    assert len(np.unique(true.stamps)) == len(expected)
+    assert true.positions[:, 2] == pytest.approx(true.stamps)
+    assert not interpolated or true.stamps.tolist() == expected
 
 
 def kitti_development_kit(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -111,20 +112,36 @@ def test_a_file_holds_it_all(recording, tmp_path):
     np.testing.assert_array_equal(again.ground_truth.poses, recording.ground_truth.poses)
 
 
+def headed(**more):
+    return lambda a: {**a, "header": json.dumps(json.loads(str(a["header"])) | more)}
+
+
+def rows(column, change):
+    """The rows with a column changed."""
+
+    def spoil(a):
+        changed = a["rows"].copy()
+        changed[:, column] = change(changed[:, column])
+        return {**a, "rows": changed}
+
+    return spoil
+
+
 FAULTS = {
-    "another format": (lambda a: {**a, "format": "something"}, "is no recording"),
-    "a later version": (lambda a: {**a, "version": 3}, "version 3"),
+    "another format": (headed(format="something"), "is no recording"),
+    "a later version": (headed(version=4), "version 4"),
     "a missing array": (lambda a: {k: v for k, v in a.items() if k != "stamps"}, "lacks 'stamps'"),
     "time runs back": (lambda a: {**a, "stamps": a["stamps"][::-1]}, "stamps must be finite and increase"),
-    "pixels of another length": (lambda a: {**a, "observed_uv_left": a["observed_uv_left"][1:]}, "differ in length"),
-    "a pixel that is none": (lambda a: {**a, "added_uv_left": a["added_uv_left"] * np.nan}, "not finite"),
-    "frames that are not there": (lambda a: {**a, "added_frame": a["added_frame"] + 99}, "frames of added"),
-    "ids of another type": (lambda a: {**a, "observed_ids": a["observed_ids"] + 0.5}, "observed_ids is of type"),
-    "an unknown landmark": (lambda a: {**a, "observed_ids": a["observed_ids"] + 100_000}, "not in the map"),
-    "a landmark twice": (lambda a: {**a, "added_ids": a["added_ids"] * 0}, "stands twice"),
-    "a rig that is none": (lambda a: {**a, "rig": '{"left": {}}'}, "lacks 'distortion'"),
-    "JSON that is none": (lambda a: {**a, "models": "{"}, "Expecting"),
-    "an unknown setting": (lambda a: {**a, "models": '{"motion": {}, "haste": 1}'}, "haste"),
+    "pixels of another length": (lambda a: {**a, "pixels": a["pixels"][1:]}, "differ in length"),
+    "a pixel that is none": (lambda a: {**a, "pixels": a["pixels"] * np.nan}, "not finite"),
+    "frames that are not there": (rows(0, lambda k: k + 99), "frames of rows"),
+    "rows of another kind": (rows(1, lambda what: what + 2), "frames of rows"),
+    "ids of another type": (lambda a: {**a, "rows": a["rows"] + 0.5}, "rows is of type"),
+    "an unknown landmark": (rows(2, lambda ids: ids + np.arange(len(ids))), "not in the map"),
+    "a landmark twice": (rows(2, lambda ids: ids * 0), "stands twice"),
+    "a rig that is none": (headed(rig={"left": {}}), "lacks 'distortion'"),
+    "JSON that is none": (lambda a: {**a, "header": "{"}, "Expecting"),
+    "an unknown setting": (headed(models={"motion": {}, "objects": {}, "haste": 1}), "haste"),
 }
 
 

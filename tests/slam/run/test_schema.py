@@ -13,7 +13,6 @@ from slam.geometry.se3 import pose
 from slam.object_data import MovingObject, ObjectEstimate
 from slam.run.options import RunOptions
 from slam.run.outputs import RunFiles
-from slam.run.repeat import Origin
 from slam.run.runner import run
 from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, header
 from slam.sequences import open_sequence
@@ -45,8 +44,7 @@ def out(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RunFiles, "write_frame", write_frame)
-        origin = Origin("slam run", WORLD, None, "handheld").to_json(folder)
-        options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), folder, origin=origin)
+        options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), folder, source=WORLD)
         run(open_sequence(WORLD), options)
     return folder
 
