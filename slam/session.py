@@ -37,6 +37,7 @@ from slam.mapping.known_landmarks import definite
 from slam.mapping.map_io import SavedMap
 from slam.mapping.mapper import Mapper
 from slam.mapping.step import Step
+from slam.rig_error import CommonError
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
@@ -131,7 +132,7 @@ class Session:
         self._backend: str | None = backend
         self._options: Mapping[str, Any] = c.backend
         self.calibration = calibration
-        self.rig_error = RemainingRigError(self.calibration, c.models)
+        self.rig_error = RemainingRigError(self.calibration)
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self.mapper = Mapper(rig, c.map, self.localizer, first)
         self.loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
@@ -143,6 +144,7 @@ class Session:
             ConfigurationError: there is a prior map, but the back end was not given by name, or cannot start in one.
             SlamError: the map is empty, or too large for the back end.
         """
+        self.rig_error.follow(first)
         if prior_map is None:
             return State(first)
         if self._backend is None:
@@ -223,15 +225,15 @@ class Session:
         old, T, stamp = state.backend, elsewhere.T_world_left, features.stamp
         landmarks: LandmarkTable | None = None
         if T is None:
-            before = self.rig_error.added_to(old.estimate(landmarks=False))
-            T, standing = before.T_world_left, Standing()
-            new = self._new(T_world_left=T.tolist())
+            before = self.rig_error.added_to(old, old.estimate(landmarks=False))
+            T, standing, common = before.T_world_left, Standing(), self.rig_error.common(old, as_reported=False)
+            new = self._new(common, T_world_left=T.tolist())
             prediction = new.predict(stamp)
-            after, common = new.estimate(landmarks=False), self.rig_error.common(as_reported=False)
+            after = new.estimate(landmarks=False)
             atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
         else:
             new, place, landmarks = self._start(T), None, state.landmarks
-            _give_landmarks(old, new)
+            self._give_landmarks(old, new)
             if elsewhere.found is not None:
                 assert landmarks is not None
                 landmarks, place = self.mapper.insert(new, landmarks, elsewhere.found.place), elsewhere.found.stamp
@@ -251,31 +253,30 @@ class Session:
         """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began.
 
         `before` is the state after the last frame; `begun` that in which the step began, without landmarks where a new
-        map did. What the rig's uncertainty does to those that left is forgotten.
+        map did.
         """
         if before.landmarks is None or begun.landmarks is not None:
             return step.erased
-        self.rig_error.uncertainty.keep(step.landmarks.ids)
         return np.concatenate([np.setdiff1d(before.landmarks.ids, step.landmarks.ids), step.erased])
 
     def _start(self, T_world_left: Array) -> Backend:
         """A back end without landmarks at a pose (4, 4) that is only roughly known."""
         sigmas = {"initial_position_sigma": POSITION_SIGMA, "initial_rotation_sigma": ROTATION_SIGMA}
-        return self._new(T_world_left=T_world_left.tolist(), **sigmas)
+        return self._new(CommonError(), T_world_left=T_world_left.tolist(), **sigmas)
 
-    def _new(self, **models: Any) -> Backend:
-        """Another back end of the same kind."""
+    def _new(self, common: CommonError, **models: Any) -> Backend:
+        """Another back end of the same kind; `common` is the error by the rig that its first pose has."""
         assert self._backend is not None
         changed = replace(self._models, **models)
         backend: Backend = registry.create("backends", self._backend, self.rig, models=changed, **self._options)
+        self.rig_error.follow(backend, common.jacobian if common.jacobian.size else None)
         return backend
 
-
-def _give_landmarks(old: Backend, new: Backend) -> None:
-    """Give all landmarks of a back end to another one."""
-    assert isinstance(new, MapBackend)
-    whole = old.estimate()
-    new.insert(whole.ids, whole.positions, definite(whole.covariances))
+    def _give_landmarks(self, old: Backend, new: Backend) -> None:
+        """Give all landmarks of a back end to another one."""
+        assert isinstance(new, MapBackend)
+        whole = self.rig_error.added_to(old, old.estimate())
+        new.insert(whole.ids, whole.positions, definite(whole.covariances))
 
 
 def _fill(backend: Backend, known: SavedMap) -> None:

@@ -25,7 +25,7 @@ from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
-from slam.window.stereo import RectifiedStereo
+from slam.window.stereo import Field, RectifiedStereo, no_field
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
@@ -126,6 +126,7 @@ class Update:
     iterations: int  # most linearisations
     gate_probability: float  # quantile of χ² beyond which a landmark's measurement is rejected
     guess: Array | None = None  # a pose (4, 4) worth trying where the prior is far off
+    field: Field = no_field  # derivatives of measurements by errors of the rig
 
     def wider(self, noise: Array) -> Update:
         """With more noise (12, 12) of the camera."""
