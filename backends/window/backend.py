@@ -22,6 +22,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
+from slam.window.stereo import Field
 
 
 class WindowBackend:
@@ -48,11 +49,11 @@ class WindowBackend:
         self.rig = rig
         self.models = models
         self.config = from_options(WindowConfig, "window", options)
-        self._steps = Steps(rig, models, self.config)
+        self._steps = Steps(rig, models, self.config, np.zeros((6, 0)))
         self._state = WindowState.empty()
         self._stamps: list[float] = []
         self._final: list[Array] = []  # poses by frame; those of the window and of its past are in the state
-        self._history = History()
+        self._history = History.of(self._state)
         self._revised = -1  # number of the newest frame when measurements were revised last, −1 for never
         self._path: tuple[WindowState, Trajectory] | None = None  # the last answer, and the state that it is of
 
@@ -159,6 +160,20 @@ class WindowBackend:
         if len(ids):
             self._done(self._steps.placed(s, *arguments), "placed", *arguments)
 
+    # --- errors of the rig (documented in slam.interfaces.ConsideringBackend) ---
+
+    def consider(self, field: Field, pose: Array | None = None) -> None:
+        """See `slam.interfaces.ConsideringBackend.consider`."""
+        m = field(np.zeros((0, 3))).shape[2]
+        self._steps = replace(self._steps, field=field, first_by_rig=np.zeros((6, m)) if pose is None else pose)
+        self._state = WindowState.empty(m)
+        self._history = History.of(self._state)
+
+    def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
+        """See `slam.interfaces.ConsideringBackend.sensitivities`."""
+        s = self._started("sensitivities")
+        return s.by_rig[-6:].copy(), s.landmarks.by_rig[s.landmarks.rows_of(ids)]
+
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
     @property
@@ -174,7 +189,7 @@ class WindowBackend:
         path is found anew when it is asked for.
         """
         if len(self._state.frames):
-            s = state_corrected(self._state, self._steps.stereo, correct)
+            s = state_corrected(self._state, self._steps.stereo, correct, self.revises_path)
             self._history = self._history.corrected(self._steps.stereo, correct)
             self._state, self._revised = replace(s, measured=True), int(s.frames[-1])
 

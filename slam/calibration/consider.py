@@ -5,8 +5,8 @@ With δ the error of the applied correction and ``Σ`` its covariance, poses and
 (`slam.interfaces.ConsideringBackend`); what is known of δ is the self-calibration's.
 
 Measurements of a path have been corrected by different corrections c_k. With θ the true parameters, the error that
-they leave is ``Σ_k G_k F_k (θ − c_k) = J θ − Σ_k G_k F_k c_k``, with gains G_k and fields F_k. So δ is θ, the baseline's
-length, and 1, whose column has the field ``−F_k c_k``.
+they leave is ``Σ_k G_k F_k (θ − c_k) = J θ − Σ_k G_k F_k c_k``, with gains G_k and fields F_k. So δ is θ, the
+baseline's length, and 1, whose column has the field ``−F_k c_k``.
 """
 
 from __future__ import annotations

@@ -21,7 +21,6 @@ from slam.models import EstimatorModels
 from slam.window.agreement import landmarks_pose
 from slam.window.gating import with_noise
 
-
 #: Derivatives (N, 3, m) of measurements (N, 3) by m errors of the rig: see `slam.interfaces.ConsideringBackend`.
 Field = Callable[[Array], Array]
 

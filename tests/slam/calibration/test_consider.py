@@ -7,17 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import backends
 from slam.calibration import RigModel, SelfCalibrationConfig
 from slam.config import SystemConfig
-from slam.data import Observations, StereoFeatures
-from slam.geometry.se3 import inverse, log, transform
+from slam.data import StereoFeatures
+from slam.geometry.se3 import inverse, log
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "iekf")
+BACKENDS = ("ekf", "iekf", "window")
 NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
 CONFIG = SystemConfig(
     models=EstimatorModels(pixel_sigma=0.3),
@@ -126,5 +125,3 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
     np.testing.assert_array_equal(result.common.root[:-2, -1], mean)
     in_path = system._session.rig_error.common(system.backend, as_reported=False).root[:-2, -1]
     np.testing.assert_array_equal(in_path, 0 * mean if revises else mean)
-
-
