@@ -49,8 +49,8 @@ class WindowBackend:
         self.rig = rig
         self.models = models
         self.config = from_options(WindowConfig, "window", options)
-        self._steps = Steps(rig, models, self.config, np.zeros((6, 0)))
-        self._state = WindowState.empty()
+        self._steps = Steps(rig, models, self.config)
+        self._state = WindowState.empty(np.zeros((6, 0)))
         self._stamps: list[float] = []
         self._final: list[Array] = []  # poses by frame; those of the window and of its past are in the state
         self._history = History.of(self._state)
@@ -164,9 +164,8 @@ class WindowBackend:
 
     def consider(self, field: Field, pose: Array | None = None) -> None:
         """See `slam.interfaces.ConsideringBackend.consider`."""
-        m = field(np.zeros((0, 3))).shape[2]
-        self._steps = replace(self._steps, field=field, first_by_rig=np.zeros((6, m)) if pose is None else pose)
-        self._state = WindowState.empty(m)
+        first = np.zeros((6, field(np.zeros((0, 3))).shape[2])) if pose is None else pose
+        self._steps, self._state = replace(self._steps, field=field), WindowState.empty(first)
         self._history = History.of(self._state)
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:

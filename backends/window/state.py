@@ -42,7 +42,7 @@ class WindowState:
     stamps: Array  # their times (K,) [s]
     poses: Array  # T_world_left (K, 4, 4)
     covariance: Array  # of the poses together (6 K, 6 K)
-    by_rig: Array  # derivatives of the poses by errors of the rig (6 K, m)
+    by_rig: Array  # derivatives of the poses by errors of the rig (6 K, m); of the first one, before it is there
     solved: int  # place in the window of the newest pose that was solved for
     begun: int  # number of the frame in which the present problem begins: the first, or that of a restart
     rows: Rows  # measurements, by place in the window and row of the landmark
@@ -56,12 +56,12 @@ class WindowState:
     contradicted: int = 0  # updates in succession in which most observations agreed on another pose than expected
 
     @classmethod
-    def empty(cls, m: int = 0) -> WindowState:
-        """Before the first prediction, of a rig with m errors."""
+    def empty(cls, by_rig: Array) -> WindowState:
+        """Before the first prediction; `by_rig` (6, m) is of the first pose."""
         none = np.zeros(0, np.int64)
         return cls(
-            none, np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 0)), np.zeros((0, m)), 0, 0, Rows.none(),
-            Places.none(), RelativePrior.none(), 0.0, WindowLandmarks.none(m),
+            none, np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 0)), by_rig, 0, 0, Rows.none(),
+            Places.none(), RelativePrior.none(), 0.0, WindowLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
 
     def revised_poses(self) -> dict[int, Array]:

@@ -33,7 +33,6 @@ class Steps(RectifiedMeasurement):
     """What the steps need besides the state."""
 
     config: WindowConfig  # limits
-    first_by_rig: Array  # derivative of the first pose by errors of the rig (6, m)
 
     def predicted(self, s: WindowState, stamp: float) -> WindowState:
         """With a pose at `stamp` [s], by the motion model. Where the window is full, a pose leaves it first."""
@@ -41,11 +40,8 @@ class Steps(RectifiedMeasurement):
             T = self.models.initial_pose
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
             P, one = np.diag(sigmas**2), np.array([stamp])
-            prior = RelativePrior.of_pose(T, P, self.first_by_rig)
-            return replace(
-                s, frames=np.zeros(1, np.int64), stamps=one, poses=T[None], covariance=P, prior=prior,
-                by_rig=self.first_by_rig,
-            )  # fmt: skip
+            prior = RelativePrior.of_pose(T, P, s.by_rig)
+            return replace(s, frames=np.zeros(1, np.int64), stamps=one, poses=T[None], covariance=P, prior=prior)
         if len(s.frames) >= self.config.poses:
             try:
                 s = slid(s, self.stereo, self.models, self.config, self.field)

@@ -1,0 +1,49 @@
+"""How errors of the rig move the newest pose and the landmarks (consider parameters; Schmidt, 1966).
+
+The pose follows from the landmarks as they stand, and each landmark from its measurements given the poses: the gains
+are those of the estimate, and move the derivatives by the errors as they move the estimate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.geometry.se3 import Array, points_by_pose
+from slam.window import pose_only
+
+
+def by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field: Array) -> tuple[Array, Array]:
+    """Derivatives of whitened residuals by the pose T (3 M, 6), and by errors of the rig where it is known (3 M, m).
+
+    Args:
+        one: landmarks and measurements (M).
+        T: the pose (4, 4).
+        by_rig: derivatives of the landmarks in the world by the errors (M, 3, m).
+        field: derivatives of the measurements (M, 3, m).
+    """
+    H = one.stereo.project((one.points - T[:3, 3]) @ T[:3, :3])[1] @ T[:3, :3].T
+    W, _, J = pose_only.whitened(one, T)
+    return (W @ J).reshape(-1, 6), (W @ np.nan_to_num(field - H @ by_rig)).reshape(-1, by_rig.shape[2])
+
+
+def landmarks_by_rig(
+    one: pose_only.PoseProblem, T: Array, pose: Array, by_rig: Array, field: Array, own: Array, sigma: float
+) -> Array:
+    """Derivatives (M, 3, m) of landmarks in the world by errors of the rig after their measurement.
+
+    Args:
+        one: landmarks and measurements (M).
+        T: the pose (4, 4).
+        pose: its derivatives (6, m).
+        by_rig: the landmarks' before (M, 3, m).
+        field: those of the measurements (M, 3, m).
+        own: the landmarks' covariances (M, 3, 3) before, where the pose is known.
+        sigma: noise of a pixel.
+    """
+    local = (one.points - T[:3, 3]) @ T[:3, :3]
+    D = one.stereo.project(local)[1]
+    D[np.isnan(one.z[:, 2]), 2] = 0.0
+    H = D @ T[:3, :3].T
+    rest = np.nan_to_num(field) - (D @ points_by_pose(local)) @ pose - H @ by_rig
+    gain = own @ np.swapaxes(H, 1, 2) @ np.linalg.inv(H @ own @ np.swapaxes(H, 1, 2) + sigma**2 * np.eye(3))
+    return np.asarray(by_rig + gain @ rest)
