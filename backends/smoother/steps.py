@@ -60,7 +60,7 @@ class Steps(RectifiedMeasurement):
             tie = replace(tie, times=np.array([np.nan if first or before is None else -before, 0.0, dt]))
         return replace(
             s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
-            pair=np.block([[s.own, cross.T], [cross, own]]), 
+            pair=np.block([[s.own, cross.T], [cross, own]]),
             by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]), since=s.since + 1, inside=False, measured=False,
             tie=tie,
         )  # fmt: skip
