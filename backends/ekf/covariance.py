@@ -84,7 +84,7 @@ class Covariance:
         camera, marks = np.split(self.cross[:, first:], [CAMERA])
         apart = np.zeros((3 * len(self.known), self.rig))
         landmarks = np.concatenate([marks, self.left[POSE * self.poses : first, first:], apart])
-        return camera, landmarks.reshape(-1, 3, self.rig)
+        return camera, landmarks.reshape(len(landmarks) // 3, 3, self.rig)
 
     def displaced(self, rows: IndexArray, change: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error: the last of the rig's."""

@@ -23,7 +23,8 @@ def by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field: 
     """
     H = one.stereo.project((one.points - T[:3, 3]) @ T[:3, :3])[1] @ T[:3, :3].T
     W, _, J = pose_only.whitened(one, T)
-    return (W @ J).reshape(-1, 6), (W @ np.nan_to_num(field - H @ by_rig)).reshape(-1, by_rig.shape[2])
+    F = W @ np.nan_to_num(field - H @ by_rig)
+    return (W @ J).reshape(-1, 6), F.reshape(3 * len(F), F.shape[2])
 
 
 def landmarks_by_rig(

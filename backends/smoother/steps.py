@@ -19,8 +19,6 @@ from slam.window.gating import squared_distances
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
-_STANDS = 1e-5  # numerics: step [rad], [m] of a camera that stands; none at all would leave no information matrix
-
 
 @dataclass(frozen=True, eq=False)
 class Steps(RectifiedMeasurement):
@@ -49,9 +47,7 @@ class Steps(RectifiedMeasurement):
             return _begun(s, T, np.diag(sigmas**2), Sight.none())
         dt = min(stamp - s.stamps[1], motion.LONGEST)
         before = None if s.since == 0 else min(s.stamps[1] - s.stamps[0], motion.LONGEST)
-        T, J, noise, first = motion.predicted(self.models, s.last, before, dt)
-        if rests:
-            T, J, noise = s.last[1], np.eye(6, 12, 6), _STANDS**2 * np.eye(6)
+        T, J, noise, first = motion.predicted(self.models, s.last, before, dt, rests)
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
         own = 0.5 * (own + own.T)

@@ -62,16 +62,24 @@ class WindowBackend:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
+        return self._predict(stamp, rests=False)
+
+    @one_blas_thread
+    def predict_at_rest(self, stamp: float) -> Prediction:
+        """See `slam.interfaces.RestingBackend.predict_at_rest`."""
+        return self._predict(stamp, rests=len(self._state.frames) > 0)
+
+    def _predict(self, stamp: float, rests: bool) -> Prediction:
         s = self._state
         require_stamp("window", stamp, float(s.stamps[-1]) if len(s.stamps) else None)
-        before, s = s, self._steps.predicted(s, float(stamp))
+        before, s = s, self._steps.predicted(s, float(stamp), rests)
         s, settled = settle(before, s, self.config.lag)
         rows, left, right, S = self._steps.in_view(s)
         frame = int(s.frames[-1])
         self._stamps[frame:], self._final[frame:] = [float(stamp)], [s.poses[-1].copy()]
         for earlier, T in settled.items():
             self._final[earlier] = T
-        self._done(s, "predicted", float(stamp))
+        self._done(s, "predicted", float(stamp), rests)
         return Prediction(
             float(stamp), s.poses[-1].copy(), s.covariance[-6:, -6:].copy(), s.landmarks.ids[rows], left, right, S
         )

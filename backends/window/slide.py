@@ -68,6 +68,7 @@ def slid(
     free[joins | ends] = 0.0
     s = replace(
         s, frames=np.delete(s.frames, leaving), stamps=np.delete(s.stamps, leaving),
+        rests=np.delete(s.rests, leaving),
         poses=np.delete(s.poses, leaving, axis=0), covariance=_without(s.covariance, leaving),
         by_rig=np.delete(s.by_rig, 6 * leaving + np.arange(6), axis=0),
         rows=_earlier(rows.select(stays), leaving), places=_earlier(places.select(~absorbed_place), leaving),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from backends.window.past import Past
-from slam.data import IdArray, IndexArray
+from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.table import LandmarkRows
 from slam.window.problem import Places, RelativePrior, Rows
@@ -40,6 +40,7 @@ class WindowState:
 
     frames: IndexArray  # numbers of its frames (K,), ascending; the last one is the newest
     stamps: Array  # their times (K,) [s]
+    rests: BoolArray  # whether the camera stood since the frame before each (K,)
     poses: Array  # T_world_left (K, 4, 4)
     covariance: Array  # of the poses together (6 K, 6 K)
     by_rig: Array  # derivatives of the poses by errors of the rig (6 K, m); of the first one, before it is there
@@ -60,7 +61,7 @@ class WindowState:
         """Before the first prediction; `by_rig` (6, m) is of the first pose."""
         none = np.zeros(0, np.int64)
         return cls(
-            none, np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 0)), by_rig, 0, 0, Rows.none(),
+            none, np.zeros(0), np.zeros(0, bool), np.zeros((0, 4, 4)), np.zeros((0, 0)), by_rig, 0, 0, Rows.none(),
             Places.none(), RelativePrior.none(), 0.0, WindowLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
 

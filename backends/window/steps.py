@@ -34,14 +34,20 @@ class Steps(RectifiedMeasurement):
 
     config: WindowConfig  # limits
 
-    def predicted(self, s: WindowState, stamp: float) -> WindowState:
-        """With a pose at `stamp` [s], by the motion model. Where the window is full, a pose leaves it first."""
+    def predicted(self, s: WindowState, stamp: float, rests: bool) -> WindowState:
+        """With a pose at `stamp` [s], by the motion model, or that before if the camera rests.
+
+        Where the window is full, a pose leaves it first.
+        """
         if not len(s.frames):
             T = self.models.initial_pose
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
             P, one = np.diag(sigmas**2), np.array([stamp])
             prior = RelativePrior.of_pose(T, P, s.by_rig)
-            return replace(s, frames=np.zeros(1, np.int64), stamps=one, poses=T[None], covariance=P, prior=prior)
+            return replace(
+                s, frames=np.zeros(1, np.int64), stamps=one, rests=np.zeros(1, bool), poses=T[None],
+                covariance=P, prior=prior,
+            )  # fmt: skip
         if len(s.frames) >= self.config.poses:
             try:
                 s = slid(s, self.stereo, self.models, self.config, self.field)
@@ -49,7 +55,8 @@ class Steps(RectifiedMeasurement):
                 s = _begun_anew(s, s.poses[-1], s.covariance[-6:, -6:])
         K, t = len(s.frames), s.stamps
         before = None if s.frames[-1] == s.begun else min(t[-1] - t[-2], motion.LONGEST)
-        T, by_last, noise, _ = motion.predicted(self.models, s.poses[-2:], before, min(stamp - t[-1], motion.LONGEST))
+        dt = min(stamp - t[-1], motion.LONGEST)
+        T, by_last, noise, _ = motion.predicted(self.models, s.poses[-2:], before, dt, rests)
         J = np.zeros((6, 6 * K))
         J[:, -12:] = by_last[:, -6 * K :]
         cross = J @ s.covariance
@@ -57,6 +64,7 @@ class Steps(RectifiedMeasurement):
         P = np.block([[s.covariance, cross.T], [cross, 0.5 * (own + own.T)]])
         return replace(
             s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp),
+            rests=np.append(s.rests, rests),
             poses=np.concatenate([s.poses, T[None]]), covariance=P, measured=False,
             by_rig=np.concatenate([s.by_rig, J @ s.by_rig]),
         )  # fmt: skip
@@ -232,9 +240,11 @@ def _begun_anew(s: WindowState, T: Array, P: Array) -> WindowState:
     """A window of the newest pose alone, which is T (4, 4) with covariance P (6, 6); landmarks stay as they are."""
     turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
     return replace(
-        s, frames=s.frames[-1:], stamps=s.stamps[-1:], poses=T[None], covariance=P, solved=0, begun=int(s.frames[-1]),
+        s, frames=s.frames[-1:], stamps=s.stamps[-1:], rests=s.rests[-1:], poses=T[None], covariance=P, solved=0,
+        begun=int(s.frames[-1]),
         by_rig=s.by_rig[-6:],
-        rows=Rows.none(), places=Places.none(), prior=RelativePrior.of_pose(T, P, s.by_rig[-6:]), cost=0.0, past=Past(),
+        rows=Rows.none(), places=Places.none(), cost=0.0, past=Past(),
+        prior=RelativePrior.of_pose(T, P, s.by_rig[-6:]),
         landmarks=replace(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
     )  # fmt: skip
 
