@@ -131,9 +131,8 @@ class Steps(RectifiedMeasurement):
         x = log(inverse(one.predicted) @ found.T)
         nis = float(squared_distances(pose_only.residuals(one, found.T)[0], one.noise).sum() + x @ one.information @ x)
         by_rig = np.linalg.solve(one.information + G.T @ G, one.information @ s.by_rig[6:] + G.T @ F)
-        hung = _hung(s, found.T, G.T @ G, by_rig)
         if not (s.inside or self._is_chosen(s, found.T, seen)):
-            return hung, nis, ""
+            return _hung(s, found.T, G.T @ G, by_rig), nis, ""
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
         marks.by_rig[seen] = landmarks_by_rig(one, found.T, by_rig, before, field, own, self.sigma)
@@ -145,7 +144,7 @@ class Steps(RectifiedMeasurement):
                 last=np.stack([s.last[0], found.T]), landmarks=marks, by_rig=np.concatenate([s.by_rig[:6], by_rig]),
             )  # fmt: skip
             return self.settled(after, graph.rebuilt(after)), nis, ""
-        after = hung
+        after = _hung(s, found.T, G.T @ G, by_rig)
         after = replace(
             after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, s.tie),
             spread=np.concatenate([s.spread, after.covariance[None]]), inside=True, landmarks=marks,

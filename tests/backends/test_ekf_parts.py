@@ -191,7 +191,7 @@ def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
     for i, block in enumerate([*noise, *known]):
         rows = slice(12 + 3 * i, 15 + 3 * i)
         P[rows, rows] += block
-    covariance = replace(Covariance.of_camera(camera).appended(J, noise), known=known)
+    covariance = replace(Covariance.of_camera(camera).appended(J, noise, np.zeros((11, 3, 0))), known=known)
     return covariance.rearranged(np.arange(7), np.arange(7, 11), np.arange(11, 14)), P
 
 

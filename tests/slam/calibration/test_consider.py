@@ -16,7 +16,8 @@ from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "iekf", "smoother", "window")
+#: By which share of an error's effect each may be off: the smoother's landmarks are followed one by one.
+BACKENDS = {"ekf": 0.05, "iekf": 0.05, "smoother": 0.2, "window": 0.05}
 NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
 CONFIG = SystemConfig(
     models=EstimatorModels(pixel_sigma=0.3),
@@ -57,8 +58,7 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size):
     actual = log(inverse(T) @ T_true)
     predicted = system.backend.sensitivities([])[0][:, : len(delta)] @ delta
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
-    # what the landmarks' errors have in common is left out: up to a fifth, most of it across the way
-    assert np.linalg.norm(predicted - actual) < 0.25 * np.linalg.norm(actual)
+    assert np.linalg.norm(predicted - actual) < BACKENDS[backend] * np.linalg.norm(actual)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
