@@ -16,7 +16,7 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key, to_pose3, velocity_change
-from backends.smoother.graph import FAILURES, GraphProblem, Tracks, minimised
+from backends.smoother.graph import FAILURES, GraphProblem, SolverError, Tracks, line_of
 from backends.smoother.state import SmootherState
 from slam.bounds import from_options, require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
@@ -26,7 +26,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.window.motion import LONGEST, is_first, velocity_sigmas
-from slam.window.stereo import RectifiedStereo
+from slam.window.stereo import Field, RectifiedStereo
 
 _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
 _DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determines a landmark well enough for Cholesky
@@ -94,6 +94,14 @@ class BatchBackend:
         """See `slam.interfaces.MapBackend.place`."""
         self._smoother.place(ids, local, covariances)
         self._solution = None
+
+    def consider(self, field: Field, pose: Array | None = None) -> None:
+        """See `slam.interfaces.ConsideringBackend.consider`: the smoother follows the errors."""
+        self._smoother.consider(field, pose)
+
+    def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
+        """See `slam.interfaces.ConsideringBackend.sensitivities`: the smoother's."""
+        return self._smoother.sensitivities(ids)
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
@@ -193,7 +201,7 @@ class _BatchSolution:
                 if serial in self.landmarks:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
         self._factors, self.newest = problem.factors, keys[-1]
-        self.values = minimised(problem, _ITERATIONS)
+        self.values = _minimised(problem)
         self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])
         self.once = self._moved(numbers)
 
@@ -224,6 +232,27 @@ class _BatchSolution:
             return np.asarray(self._marginals.marginalCovariance(key))
         except FAILURES:
             return otherwise
+
+
+def _minimised(problem: GraphProblem) -> gtsam.Values:
+    """The values that fit all factors best, by Levenberg-Marquardt.
+
+    Raises:
+        SolverError: gtsam failed, or found nothing better.
+    """
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(_ITERATIONS)
+    parameters.setRelativeErrorTol(1e-9)
+    parameters.setAbsoluteErrorTol(1e-9)
+    try:
+        before = problem.factors.error(problem.values)
+        values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
+        after = problem.factors.error(values)
+    except FAILURES as error:
+        raise SolverError(line_of(error)) from error
+    if not np.isfinite(after) or after > before:
+        raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
+    return values
 
 
 def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[int, Array]:

@@ -78,13 +78,12 @@ class Covariance:
         apart = np.zeros((len(self.known), 3, POSE))
         return np.concatenate([*blocks, self.known]), np.concatenate([cross.T.reshape(-1, 3, POSE), apart])
 
-    def by_rig(self) -> tuple[Array, Array]:
-        """Derivatives of the camera's error (12, m), and of all landmarks (N, 3, m), by errors of the rig."""
-        first = len(self.left) - self.rig
-        camera, marks = np.split(self.cross[:, first:], [CAMERA])
-        apart = np.zeros((3 * len(self.known), self.rig))
-        landmarks = np.concatenate([marks, self.left[POSE * self.poses : first, first:], apart])
-        return camera, landmarks.reshape(len(landmarks) // 3, 3, self.rig)
+    def by_rig(self, rows: IndexArray) -> tuple[Array, Array]:
+        """Derivatives of the camera's error (12, m), and of some landmarks (M, 3, m), by errors of the rig."""
+        first, numbers = len(self.left) - self.rig, self._numbers(rows)
+        columns = len(self.cross) + np.arange(first, first + self.rig)
+        landmarks = kernels.gather(self.camera, self.marks, self.cross, self.left, numbers, columns)
+        return self.cross[:CAMERA, first:], landmarks.reshape(len(rows), 3, self.rig)
 
     def displaced(self, rows: IndexArray, change: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error: the last of the rig's."""

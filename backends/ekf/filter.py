@@ -204,9 +204,10 @@ class EkfBackend:
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
         s = self._started("sensitivities")
-        rows, (camera, marks) = s.landmarks.rows_of(ids), s.covariance.by_rig()
+        rows = s.landmarks.rows_of(ids)
+        camera, marks = s.covariance.by_rig(rows)
         D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
-        return s.camera.by_error() @ camera[:POSE], D @ marks[rows]
+        return s.camera.by_error() @ camera[:POSE], D @ marks
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 

@@ -163,8 +163,8 @@ class FilterState:
         if P.rig:
             field = np.where(system.linear.rows[:, :, None], update.field(update.z), 0.0)
             with_left[:, -P.rig :] -= field.reshape(-1, P.rig)
-        lost = system.whitened(with_camera), system.whitened(with_marks), system.whitened(with_left)
-        covariance = P.corrected(lost, J, K)
+        narrow = system.whitened(np.concatenate([with_camera, with_left], axis=1))
+        covariance = P.corrected((narrow[:CAMERA], system.whitened(with_marks), narrow[CAMERA:]), J, K)
         settled = camera.settled()
         if settled.camera is not camera:
             covariance = covariance.camera_moved(settled.J, settled.noise)
