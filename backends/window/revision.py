@@ -9,7 +9,7 @@ import numpy as np
 
 from backends.window.state import WindowState
 from slam.geometry.se3 import Array
-from slam.window import charts
+from slam.window import chart_kernels
 from slam.window.stereo import RectifiedStereo
 
 
@@ -31,7 +31,8 @@ def revised(s: WindowState, stereo: RectifiedStereo, correct: Callable[[Array], 
     if len(members):
         axes = np.ascontiguousarray(np.broadcast_to(np.eye(3), (len(members), 3, 3)))
         before, after = (
-            charts.chart_changes(s.poses[0], p[members], prior.basis, axes)[0] for p in (marks.position, position)
+            chart_kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0]
+            for p in (marks.position, position)
         )
         change = np.nan_to_num(after - before)  # NaN: behind its chart
         by_rig = prior.by_rig.copy()

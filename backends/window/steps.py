@@ -14,7 +14,7 @@ from backends.window.state import WindowLandmarks, WindowState, between
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, points_by_pose
-from slam.window import charts, kernels, motion, pose_only
+from slam.window import chart_kernels, kernels, motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS
 from slam.window.problem import Places, RelativePrior, Rows, Window
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
@@ -229,9 +229,9 @@ def _places(s: WindowState, points: IndexArray, local: Array, covariances: Array
     """Landmarks `points` at `local` (M, 3) in the newest camera, with covariances (M, 3, 3)."""
     T = s.poses[-1]
     world = local @ T[:3, :3].T + T[:3, 3]
-    basis, _ = charts.relative_charts(T, world)
+    basis, _ = chart_kernels.relative_charts(T, world)
     axes = np.tile(T[:3, :3], (len(local), 1, 1))
-    origin, D, _ = charts.chart_changes(T, world, basis, axes)
+    origin, D, _ = chart_kernels.chart_changes(T, world, basis, axes)
     root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(D @ covariances @ np.swapaxes(D, 1, 2))), 1, 2)
     return Places(np.full(len(points), len(s.frames) - 1), points, basis, origin, np.ascontiguousarray(root))
 

@@ -32,7 +32,7 @@ from slam.objects.points import (
     shape_of,
     with_shape,
 )
-from slam.window import charts, kernels, pose_only
+from slam.window import chart_kernels, kernels, pose_only
 from slam.window.agreement import INFLATION
 from slam.window.problem import Places, Rows
 from slam.window.solver import Solution, linearised, solve
@@ -362,8 +362,8 @@ def _places(frame: int, points: IndexArray, h: Array, shape: Shape) -> Places:
     those of the chart at h.
     """
     eye = np.eye(4)
-    basis, origin = charts.relative_charts(eye, h)
-    _, D, _ = charts.chart_changes(eye, h, basis, np.tile(np.eye(3), (len(h), 1, 1)))
+    basis, origin = chart_kernels.relative_charts(eye, h)
+    _, D, _ = chart_kernels.chart_changes(eye, h, basis, np.tile(np.eye(3), (len(h), 1, 1)))
     back = np.linalg.inv(D)
     information = np.swapaxes(back, 1, 2) @ np.linalg.inv(shape.covariance) @ back
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)

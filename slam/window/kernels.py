@@ -1,7 +1,7 @@
 """Compiled loops of the window: normal equations with landmarks eliminated, steps back to poses and points.
 
 Poses are ``T_world_left`` with perturbations on the right, [rotation, translation]. A point's perturbation is in a
-chart of inverse distance (`slam.window.charts`). Unknowns stand in the order: points of the prior, free poses.
+chart of inverse distance (`slam.window.chart_kernels`). Unknowns stand in the order: points of the prior, free poses.
 
 Arrays that many loops take: `poses` (K, 4, 4) and `column`, their first unknowns (K,), −1 for a fixed one; `points`
 (N, 3) and `place`, what each is to the solver (N,), see `KNOWN`; `E`, their derivatives by their charts' coordinates
@@ -19,7 +19,7 @@ from slam.kernels.se3 import adjoint, between, log, move, transform_back
 from slam.kernels.stereo import by_pose, residual
 from slam.kernels.velocities import add_velocity_rows, velocity_change
 from slam.runtime.compilation import helper, kernel
-from slam.window.charts import chart, displace
+from slam.window.chart_kernels import chart, displace
 
 #: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
 KNOWN, ELIMINATED = -2, -1

@@ -8,7 +8,7 @@ import numpy as np
 
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.se3 import adjoint, inverse
-from slam.window import charts, covariance_kernels
+from slam.window import chart_kernels, covariance_kernels
 from slam.window.problem import RelativePrior, Window
 from slam.window.solver import linearised
 
@@ -77,10 +77,10 @@ def marginalised(
     members, poses = w.members[~points], np.delete(w.poses, pose, axis=0)
     D, n = len(members), len(information)
     if reference:
-        basis, _ = charts.relative_charts(poses[0], w.points[members])
+        basis, _ = chart_kernels.relative_charts(poses[0], w.points[members])
     else:
         basis = w.basis[~points]
-    origin, change, by = charts.chart_changes(poses[0], w.points[members], basis, conditional.stayed)
+    origin, change, by = chart_kernels.chart_changes(poses[0], w.points[members], basis, conditional.stayed)
     if not np.isfinite(origin).all():
         raise np.linalg.LinAlgError("a point of the prior is behind its chart")
     if reference:  # coordinates from another pose

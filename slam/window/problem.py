@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.geometry.arrays import Array, IndexArray
 from slam.table import Table
-from slam.window import charts, kernels
+from slam.window import chart_kernels, kernels
 from slam.window.stereo import RectifiedStereo
 
 KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
@@ -201,7 +201,9 @@ class Window:
         """Charts of `members` in the first pose's axes (D + J, 3, 3)."""
         if not len(self.joining):
             return self.prior.basis
-        return np.concatenate([self.prior.basis, charts.relative_charts(self.poses[0], self.points[self.joining])[0]])
+        return np.concatenate(
+            [self.prior.basis, chart_kernels.relative_charts(self.poses[0], self.points[self.joining])[0]]
+        )
 
     @cached_property
     def place(self) -> IndexArray:

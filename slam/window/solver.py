@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from slam.geometry.arrays import Array, IndexArray
-from slam.window import charts, covariance_kernels, kernels
+from slam.window import chart_kernels, covariance_kernels, kernels
 from slam.window.carried import carried_rows
 from slam.window.problem import Window
 
@@ -109,7 +109,7 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
     n, rows = w.unknowns, w.rows
     H, b = np.zeros((n, n)) if whole else np.empty((n, n)), np.zeros(n)
     cost = _begin_with_prior(w, H, b, whole)
-    E = charts.charts(w.poses, centre, w.points, w.place, w.basis, 0)
+    E = chart_kernels.charts(w.poses, centre, w.points, w.place, w.basis, 0)
     squares, information, gradient, cross = kernels.linearise(
         w.stereo.intrinsics,
         w.stereo.R_left,

@@ -7,7 +7,7 @@ import pytest
 
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.window import charts, solver
+from slam.window import chart_kernels, solver
 from slam.window.marginal import marginalised
 from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.solver import linearised
@@ -98,7 +98,7 @@ def test_nees_of_poses_is_in_its_band():
 def with_everything():
     """A window with each kind of knowledge."""
     path, points = truth()
-    basis, origin = charts.relative_charts(path[1], points[:3] * 1.01)
+    basis, origin = chart_kernels.relative_charts(path[1], points[:3] * 1.01)
     root = np.tile(np.diag([50.0, 50.0, 80.0]), (3, 1, 1))
     information = np.zeros((POINTS, 3, 3))
     information[5:8] = np.diag([9.0, 4.0, 1.0])
