@@ -194,7 +194,7 @@ class BodyEstimator:
     def _predicted(self, b: BodyBelief, cameras: RecentPoses) -> BodyBelief:
         """With the covariances of a frame in which nothing was measured."""
         e = linearised(window(b, self.stereo, carried(b, cameras, self.models)))
-        solution = Solution(e.window, e, e.cost, 0)
+        solution = Solution(e.window, e, e.cost)
         local, _ = solution.point_covariances(len(b) - 1)
         return replace(b, covariance=solution.pose_covariance, points=replace(b.points, local=local))
 

@@ -17,9 +17,8 @@ _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
 #: numerics: Decrease of the cost by a step with the last factor below which that step is the last; it leaves far less.
 CLOSE = 1e-2
-_NEAR = (
-    50.0  # numerics: the same for a step with a factor of its own, in units of `close`; it leaves the square of that
-)
+#: numerics: The same for a step with a factor of its own, in units of `close`; it leaves the square of that.
+_NEAR = 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +30,6 @@ class NormalEquations:
         H: information of the unknowns (n, n), lower triangle.
         b: (n,).
         cost: sum of squares of everything, with the prior's ``δᵀ Λ δ − 2 ηᵀ δ``.
-        squares: squared whitened residual of each row (M,).
         E: derivatives of points by their charts' coordinates (N, 3, 3).
         inverse: inverse information of each eliminated point (N, 3, 3).
         gradient: of each point by its own rows (N, 3).
@@ -42,7 +40,6 @@ class NormalEquations:
     H: Array
     b: Array
     cost: float
-    squares: Array
     E: Array
     inverse: Array
     gradient: Array
@@ -111,21 +108,9 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
     cost = _begin_with_prior(w, H, b, whole)
     E = chart_kernels.charts(w.poses, centre, w.points, w.place, w.basis, 0)
     squares, information, gradient, cross = kernels.linearise(
-        w.stereo.intrinsics,
-        w.stereo.R_left,
-        w.poses,
-        w.column,
-        w.points,
-        w.place,
-        E,
-        rows.pose,
-        rows.point,
-        rows.z,
-        rows.weight,
-        whole,
-        H,
-        b,
-    )
+        w.stereo.intrinsics, w.stereo.R_left, w.poses, w.column, w.points, w.place, E, rows.pose, rows.point, rows.z,
+        rows.weight, whole, H, b,
+    )  # fmt: skip
     cost += float(squares.sum())
     if len(w.places):
         p = w.places
@@ -147,7 +132,7 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
     inverse = kernels.eliminate(
         w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, whole, H, b
     )  # fmt: skip
-    return NormalEquations(w, H, b, cost, squares, E, inverse, gradient, cross)
+    return NormalEquations(w, H, b, cost, E, inverse, gradient, cross)
 
 
 def _from_prior(w: Window) -> tuple[Array, Array] | None:
@@ -199,13 +184,11 @@ class Solution:
         window: poses and points as found.
         equations: linearised next to the solution.
         cost: at the solution.
-        steps: number of factors that it took.
     """
 
     window: Window
     equations: NormalEquations
     cost: float
-    steps: int
 
     @cached_property
     def inverse_factor(self) -> Array:
@@ -262,20 +245,20 @@ def solve(window: Window, close: float = CLOSE) -> Solution:
         numpy.linalg.LinAlgError: something is not determined, or a value is not finite.
     """
     now = linearised(window)
-    for taken in range(1, _STEPS + 1):
+    for _ in range(_STEPS):
         x, rest = now.step(now.factor)
         if rest < _NEAR * close:
-            return Solution(now.after(x), now, now.cost - rest, taken)
+            return Solution(now.after(x), now, now.cost - rest)
         following = _descended(now, x)
         if following is None:
-            return Solution(now.window, now, now.cost, taken)
+            return Solution(now.window, now, now.cost)
         x, rest = following.step(now.factor)
         if not np.isfinite(rest):
             raise np.linalg.LinAlgError("a window's step is not finite")
         if rest < close:  # so near the end the last factor serves once more
-            return Solution(following.after(x), now, following.cost - rest, taken)
+            return Solution(following.after(x), now, following.cost - rest)
         now = linearised(following.window)
-    return Solution(now.window, now, now.cost, _STEPS)
+    return Solution(now.window, now, now.cost)
 
 
 def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:

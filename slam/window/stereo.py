@@ -64,15 +64,8 @@ class RectifiedStereo:
         """For a rig as calibrated."""
         rectified_rig = rig.rectified
         left, right = rectified_rig.rig.left, rectified_rig.rig.right
-        return cls(
-            rectified_rig,
-            left.fu,
-            left.u0,
-            left.v0,
-            rectified_rig.rig.baseline,
-            right.u0 - left.u0,
-            rectified_rig.scale,
-        )
+        b, doffs = rectified_rig.rig.baseline, right.u0 - left.u0
+        return cls(rectified_rig, left.fu, left.u0, left.v0, b, doffs, rectified_rig.scale)
 
     def measure(self, observations: Observations) -> Array:
         """Measurements (M, 3) = (uL, vL, uR) of observations in the rig's own pixels."""
