@@ -16,7 +16,7 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import landmark_key, pose_key, to_pose3, velocity_change
-from backends.smoother.graph import FAILURES, GraphProblem, SolverError, Tracks, line_of
+from backends.smoother.graph import FAILURES, GraphProblem, Tracks, minimised
 from backends.smoother.state import SmootherState
 from slam.bounds import from_options, require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
@@ -201,7 +201,7 @@ class _BatchSolution:
                 if serial in self.landmarks:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
         self._factors, self.newest = problem.factors, keys[-1]
-        self.values = _minimised(problem)
+        self.values = minimised(problem, _ITERATIONS)
         self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])
         self.once = self._moved(numbers)
 
@@ -232,27 +232,6 @@ class _BatchSolution:
             return np.asarray(self._marginals.marginalCovariance(key))
         except FAILURES:
             return otherwise
-
-
-def _minimised(problem: GraphProblem) -> gtsam.Values:
-    """The values that fit all factors best, by Levenberg-Marquardt.
-
-    Raises:
-        SolverError: gtsam failed, or found nothing better.
-    """
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(_ITERATIONS)
-    parameters.setRelativeErrorTol(1e-9)
-    parameters.setAbsoluteErrorTol(1e-9)
-    try:
-        before = problem.factors.error(problem.values)
-        values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
-        after = problem.factors.error(values)
-    except FAILURES as error:
-        raise SolverError(line_of(error)) from error
-    if not np.isfinite(after) or after > before:
-        raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
-    return values
 
 
 def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[int, Array]:

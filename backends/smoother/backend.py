@@ -11,7 +11,7 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factors import FactorMaker
 from backends.smoother.graph import Graph
-from backends.smoother.mending import corrected, rebuilt
+from backends.smoother.mending import corrected, path_solved, rebuilt
 from backends.smoother.path import Path
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
@@ -60,6 +60,8 @@ class SmootherBackend:
         self._graph = Graph(self.factor_maker, self.config.lag)
         self.state = SmootherState.empty(np.zeros((6, 0)))
         self.path = Path()
+        self._mended = False  # whether measurements were revised while poses were kept
+        self._answer: tuple[SmootherState, Trajectory] | None = None  # the last path, and the state that it is of
 
     @property
     def rebuilds(self) -> int:
@@ -134,8 +136,16 @@ class SmootherBackend:
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final."""
-        return self.path.trajectory(self.state)
+        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final.
+
+        After a revision of the measurements, all poses whose measurements are kept are solved for together. The newest
+        pose stays where it is and the path before it moves, but where landmarks are known in the world.
+        """
+        s = self.state
+        if self._answer is None or self._answer[0] is not s:
+            graph = path_solved(s, self.factor_maker, self.path.graph(s.first)) if self._mended else None
+            self._answer = s, self.path.trajectory(s, graph)
+        return Trajectory(self._answer[1].stamps.copy(), self._answer[1].poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -170,15 +180,15 @@ class SmootherBackend:
 
     @property
     def revises_path(self) -> bool:
-        """See `slam.interfaces.RevisingBackend`: True while the first pose is in the graph."""
-        return self._graph.oldest(self.state) == self.state.begun == 0
+        """See `slam.interfaces.RevisingBackend`: True while the first frame's measurements are still known."""
+        return self.state.first == self.state.begun == 0
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays where it is.
 
-        The graph is built anew from corrected measurements, and landmarks move to where they put them. Poses before it
-        move with it as one.
+        The graph is built anew from corrected measurements, and landmarks move to where they put them. The path is
+        found anew when it is asked for.
         """
         s = self.state
         if s.started:
@@ -188,7 +198,7 @@ class SmootherBackend:
                 by_rig[:, :, -1:] -= (s.landmarks.position - before.landmarks.position)[:, :, None]
                 s = replace(s, landmarks=replace(s.landmarks, by_rig=by_rig))
             path = self.path.moved(s, s.poses[0] @ inverse(before.poses[0]))
-            self.path, self.state = path, replace(s, measured=True)
+            self.path, self.state, self._mended = path, replace(s, measured=True), True
 
     # --- copies ---
 

@@ -19,6 +19,7 @@ class SmootherConfig:
             a lag, a factor ends before its first pose leaves.
         lag: number of poses that are smoothed; older ones are marginalised, so that neither time nor memory grows
             with the run. Null (in Python None) keeps all poses and revises the whole path.
+        past: number of poses, at least, whose measurements are kept, to revise the path when measurements are mended.
 
     Raises:
         ConfigurationError: a value is out of its range.
@@ -28,7 +29,8 @@ class SmootherConfig:
     overlap: float = 0.9
     track: int = 20
     lag: int | None = 16
+    past: int = 50
 
     def __post_init__(self) -> None:
-        ranges = {"motion": (0, 10), "overlap": (0, 1), "track": (2, 10**6), "lag": (2, 10**6)}
+        ranges = {"motion": (0, 10), "overlap": (0, 1), "track": (2, 10**6), "lag": (2, 10**6), "past": (0, 10**6)}
         require_not_negative(self, ranges, "smoother")

@@ -198,7 +198,7 @@ class Graph:
             try:
                 return self._stepped(s, number), ""
             except FAILURES as error:
-                why, self.rebuilds = line_of(error), self.rebuilds + 1
+                why, self.rebuilds = _line(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
         return self.rebuilt(s), why
 
@@ -217,7 +217,7 @@ class Graph:
             begin.factors.add(self._make.prior(oldest, self._first, prior))
             return self._update(s, range(oldest, s.number + 1), oldest, begin, again)
         except FAILURES as error:
-            raise SolverError(line_of(error)) from error
+            raise SolverError(_line(error)) from error
 
     def oldest(self, s: SmootherState, newest: int | None = None) -> int:
         """Number of the oldest pose in the graph, where the newest one is that of the state, or has another number."""
@@ -289,6 +289,27 @@ def held(s: SmootherState, number: int) -> tuple[Array, Array]:
     return prior, (vectors * values.clip(min=0)) @ vectors.T
 
 
-def line_of(error: BaseException) -> str:
+def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
+    """The values that fit all factors best, by Levenberg-Marquardt.
+
+    Raises:
+        SolverError: gtsam failed, or found nothing better.
+    """
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(1e-9)
+    parameters.setAbsoluteErrorTol(1e-9)
+    try:
+        before = problem.factors.error(problem.values)
+        values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
+        after = problem.factors.error(values)
+    except FAILURES as error:
+        raise SolverError(_line(error)) from error
+    if not np.isfinite(after) or after > before:
+        raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
+    return values
+
+
+def _line(error: BaseException) -> str:
     """What gtsam says, in one line."""
     return f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}"

@@ -1,4 +1,4 @@
-"""Measurements that are mended: the poses of the graph are solved for again."""
+"""Measurements that are mended: the last poses, or all that are kept, are solved for again."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from backends.smoother.graph import Graph, SolverError
+from backends.smoother.factors import FactorMaker, pose_key
+from backends.smoother.graph import Graph, GraphProblem, SolverError, Tracks, held, minimised
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
 from slam.geometry.se3 import Array, inverse, transform
 from slam.window.stereo import RectifiedStereo
 
 _AGAIN = 2  # numerics: steps of Gauss and Newton after the first
+_ITERATIONS = 20  # numerics: of Levenberg-Marquardt at most
 
 
 def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherState:
@@ -57,3 +59,34 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     with suppress(SolverError):  # then the next update tries again
         graph.rebuilt(s)
     return s
+
+
+def path_solved(s: SmootherState, make: FactorMaker, before: Array) -> Array:
+    """All poses of the graph, those that are kept solved for together; as they are where that fails.
+
+    The newest pose stays where it is, and the path moves, but where landmarks are known in the world.
+    """
+    first = max(s.begun, s.first)
+    try:
+        kept = np.concatenate([s.poses[: s.of(first)], optimised(s, make, first)])
+    except SolverError:
+        kept = s.poses
+    M = np.eye(4) if s.anchored else s.poses[-1] @ inverse(kept[-1])
+    return M @ np.concatenate([before, kept])
+
+
+def optimised(s: SmootherState, make: FactorMaker, first: int) -> Array:
+    """Poses from number `first` on that fit their measurements best; the first has a prior.
+
+    Raises:
+        SolverError: gtsam failed, or found nothing better.
+    """
+    problem, tracks = GraphProblem(), Tracks(make, None)
+    problem.factors.add(make.prior(first, s.poses[s.of(first)], held(s, first)[0]))
+    numbers = range(first, s.number + 1)
+    for number in numbers:
+        tracks.add_pose(problem, s, number, first)
+        tracks.add_rows(problem, s, number, first)
+    tracks.make_smart(problem)
+    values = minimised(problem, _ITERATIONS)
+    return np.array([values.atPose3(pose_key(i)).matrix() for i in numbers])

@@ -29,7 +29,7 @@ class Steps(RectifiedMeasurement):
     @property
     def past(self) -> int | None:
         """Number of poses that are kept; None for all."""
-        return None if self.config.lag is None else self.config.lag + 1
+        return None if self.config.lag is None else self.config.lag + 1 + self.config.past
 
     @property
     def track(self) -> int:

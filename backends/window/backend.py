@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from backends.window.config import WindowConfig
-from backends.window.revision import revised
+from backends.window.history import Call, History, state_corrected
 from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
 from slam.bounds import from_options
@@ -17,7 +17,7 @@ from slam.checks import require_guess, require_not_measured, require_recent, req
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
@@ -53,6 +53,9 @@ class WindowBackend:
         self._state = WindowState.empty(np.zeros((6, 0)))
         self._stamps: list[float] = []
         self._final: list[Array] = []  # poses by frame; those of the window and of its past are in the state
+        self._history = History.of(self._state)
+        self._revised = -1  # number of the newest frame when measurements were revised last, −1 for never
+        self._path: tuple[WindowState, Trajectory] | None = None  # the last answer, and the state that it is of
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
@@ -76,7 +79,7 @@ class WindowBackend:
         self._stamps[frame:], self._final[frame:] = [float(stamp)], [s.poses[-1].copy()]
         for earlier, T in settled.items():
             self._final[earlier] = T
-        self._state = s
+        self._done(s, "predicted", float(stamp), rests)
         return Prediction(
             float(stamp), s.poses[-1].copy(), s.covariance[-6:, -6:].copy(), s.landmarks.ids[rows], left, right, S
         )
@@ -92,7 +95,7 @@ class WindowBackend:
         after, settled = settle(s, after, self.config.lag)
         for frame, T in settled.items():
             self._final[frame] = T
-        self._state = after
+        self._done(after, "updated", ids, z, None if guess is None else guess.copy())
         return report
 
     @one_blas_thread
@@ -101,12 +104,12 @@ class WindowBackend:
         s = self._started("add")
         ids, z = observations.ids.copy(), self._steps.stereo.measure(observations)
         if len(ids):
-            self._state = self._steps.added(s, ids, z)
+            self._done(self._steps.added(s, ids, z), "added", ids, z)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What its measurements said about the poses is kept."""
         ids = np.unique(np.asarray(ids, np.int64))
-        self._state = self._steps.removed(self._state, ids)
+        self._done(self._steps.removed(self._state, ids), "removed", ids)
 
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
@@ -132,11 +135,21 @@ class WindowBackend:
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: poses of the last `lag` frames are revised, others are final."""
-        poses = np.array(self._final).reshape(-1, 4, 4)
-        for frame, T in self._state.revised_poses().items():
-            poses[frame] = T
-        return Trajectory(np.array(self._stamps), poses)
+        """See `slam.interfaces.Backend.trajectory`: poses of the last `lag` frames are revised, others are final.
+
+        After a revision of the measurements, the last frames are gone through again for it. The newest pose stays where
+        it is and the path before it moves, but where landmarks are known in the world.
+        """
+        if self._path is None or self._path[0] is not self._state:
+            s, final, M = self._state, self._final, np.eye(4)
+            if self._revised >= max(self._history.begins, 0):  # states since then come from revised measurements
+                s, final = self._history.repeated(self._steps, final)
+                M = M if self._history.anchored else self._state.poses[-1] @ inverse(s.poses[-1])
+            poses = np.array(final).reshape(-1, 4, 4)
+            for frame, T in s.revised_poses().items():
+                poses[frame] = T
+            self._path = self._state, Trajectory(np.array(self._stamps), M @ poses)
+        return Trajectory(self._path[1].stamps.copy(), self._path[1].poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -145,7 +158,7 @@ class WindowBackend:
         """See `slam.interfaces.MapBackend.insert`."""
         arguments = known_landmarks("window", self._state.landmarks, ids, positions, covariances, False)
         if len(ids):
-            self._state = self._steps.inserted(self._state, *arguments)
+            self._done(self._steps.inserted(self._state, *arguments), "inserted", *arguments)
 
     @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
@@ -153,7 +166,7 @@ class WindowBackend:
         s = self._started("place")
         arguments = known_landmarks("window", s.landmarks, ids, local, covariances, True)
         if len(ids):
-            self._state = self._steps.placed(s, *arguments)
+            self._done(self._steps.placed(s, *arguments), "placed", *arguments)
 
     # --- errors of the rig (documented in slam.interfaces.ConsideringBackend) ---
 
@@ -161,6 +174,7 @@ class WindowBackend:
         """See `slam.interfaces.ConsideringBackend.consider`."""
         first = np.zeros((6, field(np.zeros((0, 3))).shape[2])) if pose is None else pose
         self._steps, self._state = replace(self._steps, field=field), WindowState.empty(first)
+        self._history = History.of(self._state)
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
@@ -169,17 +183,22 @@ class WindowBackend:
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
-    revises_path = False
+    @property
+    def revises_path(self) -> bool:
+        """See `slam.interfaces.RevisingBackend`: True while the first frame's measurements are still known."""
+        return not len(self._history.start.frames)
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays where it is.
 
-        Measurements of the window are corrected, and landmarks move to where the newest camera sees them corrected.
-        What measurements made of poses that have left the window stays.
+        Measurements of the window are corrected, and landmarks move to where the newest camera sees them corrected. The
+        path is found anew when it is asked for.
         """
         if len(self._state.frames):
-            self._state = replace(revised(self._state, self._steps.stereo, correct), measured=True)
+            s = state_corrected(self._state, self._steps.stereo, correct, self.revises_path)
+            self._history = self._history.corrected(self._steps.stereo, correct)
+            self._state, self._revised = replace(s, measured=True), int(s.frames[-1])
 
     # --- parts ---
 
@@ -187,3 +206,7 @@ class WindowBackend:
         if not len(self._state.frames):
             raise MeasurementError(f"window: {what} before the first predict")
         return self._state
+
+    def _done(self, s: WindowState, step: str, *arguments: Any) -> None:
+        """Take over the state after a step, and remember the step."""
+        self._history, self._state = self._history.then(Call(step, arguments), s, self.config.lag), s

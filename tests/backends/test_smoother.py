@@ -47,7 +47,7 @@ def tracked(data, **options):
     return backend
 
 
-OPTIONS = [{}, {"motion": 0.0}, {"motion": 0.1}, {"track": 3}, {"lag": None}, {"lag": 4}]
+OPTIONS = [{}, {"motion": 0.0}, {"motion": 0.1}, {"track": 3}, {"lag": None}, {"lag": 4, "past": 0}]
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
@@ -114,7 +114,7 @@ def test_what_removed_landmarks_have_told_stays_known():
 
 def test_the_lag_bounds_what_is_kept_and_not_what_is_known():
     data = drive(120, points=600)
-    full, lagged = (tracked(data, motion=0.0, **options) for options in ({"lag": None}, {"lag": 8}))
+    full, lagged = (tracked(data, motion=0.0, **options) for options in ({"lag": None}, {"lag": 8, "past": 10}))
     assert full.state.first == 0 and full.revises_path
     assert lagged.state.first > 60 and not lagged.revises_path
     assert sum(map(len, lagged.state.sights)) < 0.4 * sum(map(len, full.state.sights))
@@ -226,7 +226,7 @@ def test_a_revision_that_changes_nothing_leaves_the_covariances():
 
 def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
     data = drive(60, points=400)
-    backend = tracked(data, lag=6, motion=0.0)
+    backend = tracked(data, lag=6, past=0, motion=0.0)
     before, first = backend.trajectory().poses, backend.state.first
     backend.revise(lambda z: z + np.array([0.0, 0.0, 1.0]))
     after = backend.trajectory().poses
@@ -237,7 +237,7 @@ def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
 
 
 def test_whether_the_whole_path_follows_is_told_with_the_present_frame():
-    backend, known = SmootherBackend(RIG, MODELS, lag=6, motion=0.0), set()
+    backend, known = SmootherBackend(RIG, MODELS, lag=6, past=6, motion=0.0), set()
     answers = []
     for k, (stamp, _, seen) in enumerate(drive(40, points=300)):
         step(backend, stamp, seen, known)

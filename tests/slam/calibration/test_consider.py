@@ -108,7 +108,7 @@ def test_a_result_says_what_its_error_shares_with_other_frames(backend):
 
 @pytest.mark.parametrize(
     ("backend", "options", "revises"),
-    [("ekf", {}, False), ("smoother", {"lag": None}, True), ("smoother", {"lag": 5, "motion": 0.0}, False)],
+    [("ekf", {}, False), ("smoother", {"lag": None}, True), ("smoother", {"lag": 5, "past": 3, "motion": 0.0}, False)],
     ids=["ekf", "smoother", "bounded smoother"],
 )
 def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(backend, options, revises):
