@@ -168,11 +168,11 @@ class RecentBackend(Protocol):
 class ConsideringBackend(Protocol):
     """Additional methods of a back end that follows how the rig's remaining error moves its estimate.
 
-    An error of the rig acts on all frames alike, and does not average out as pixel noise does. It is considered, but
-    not estimated, by the back end (Schmidt, 1966): with δ (m,) such errors, ``T_true = T exp(J δ)`` and
-    ``y_true = y + L δ``. Covariances of `Backend.estimate` and all gains are those of an exact rig; a system adds the
-    part of δ by its present covariance. Of a back end without these methods it adds nothing: covariances of pose and
-    map are then of pixel noise alone, and too small where the calibration is not exact.
+    An error of the rig acts on all frames alike, and does not average out as pixel noise does. The back end considers,
+    but does not estimate it (Schmidt, 1966): with δ (m,) such errors, ``T_true = T exp(J δ)``, ``y_true = y + L δ``.
+    `Backend.estimate` and all gains are those of an exact rig; a system adds the part of δ by its present covariance.
+    Without these methods it adds nothing: covariances are of pixel noise alone, too small if the calibration is not
+    exact.
     """
 
     def consider(self, field: Callable[[Array], Array], pose: Array | None = None) -> None:

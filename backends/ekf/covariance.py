@@ -154,11 +154,9 @@ class Covariance:
     def corrected(self, lost: tuple[Array, Array, Array], J: Array, K: Array) -> Covariance:
         """After an update, ``P − V Vᵀ``, in the coordinates of the corrected state.
 
-        Args:
-            lost: V = ``P Hᵀ L⁻ᵀ`` of the camera (12, m), of the landmarks (3A, m), in Fortran's order, and of what has
-                left (6K + 3B + m, m).
-            J: the camera's error becomes J (12, 12) times what it was,
-            K: and then to those of the landmarks K (A, 3, 6) times that of the pose is added.
+        `lost` is V = ``P Hᵀ L⁻ᵀ`` of the camera, of the landmarks, in Fortran's order, and of what has left. The
+        camera's error becomes J (12, 12) times what it was, and then to those of the landmarks K (A, 3, 6) times that
+        of the pose is added.
         """
         V_camera, V, V_left = lost
         shift = np.asfortranarray(K.reshape(-1, POSE))

@@ -96,10 +96,7 @@ class Jacobian:
     def own_covariances(self, pose: Array, cross: Array, blocks: Array) -> Array:
         """Covariances (M, 3, 3) [px²] of each landmark's innovation by itself, without the measurement's noise.
 
-        Args:
-            pose: covariance (6, 6) of the pose's error.
-            cross: covariances (M, 3, 6) of the landmarks' own coordinates with it.
-            blocks: covariances (M, 3, 3) of these coordinates.
+        By those of the pose's error (6, 6), of the landmarks' own coordinates with it (M, 3, 6), and of these.
         """
         A, B = self.by_pose, self.own
         S = (A @ pose + 2 * (B @ cross)) @ A.transpose(0, 2, 1)

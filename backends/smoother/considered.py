@@ -13,13 +13,9 @@ from slam.window import pose_only
 
 
 def by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field: Array) -> tuple[Array, Array]:
-    """Derivatives of whitened residuals by the pose T (3 M, 6), and by errors of the rig where it is known (3 M, m).
+    """Derivatives of whitened residuals by a pose T (3 M, 6), and by errors of the rig where it is known (3 M, m).
 
-    Args:
-        one: landmarks and measurements (M).
-        T: the pose (4, 4).
-        by_rig: derivatives of the landmarks in the world by the errors (M, 3, m).
-        field: derivatives of the measurements (M, 3, m).
+    The errors move the landmarks in the world by `by_rig` (M, 3, m), and measurements by `field` (M, 3, m).
     """
     H = one.stereo.project((one.points - T[:3, 3]) @ T[:3, :3])[1] @ T[:3, :3].T
     W, _, J = pose_only.whitened(one, T)
@@ -30,16 +26,9 @@ def by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field: 
 def landmarks_by_rig(
     one: pose_only.PoseProblem, T: Array, pose: Array, by_rig: Array, field: Array, own: Array, sigma: float
 ) -> Array:
-    """Derivatives (M, 3, m) of landmarks in the world by errors of the rig after their measurement.
+    """`by_rig` (M, 3, m) after the measurements, from a pose T (4, 4) that the errors move by `pose` (6, m).
 
-    Args:
-        one: landmarks and measurements (M).
-        T: the pose (4, 4).
-        pose: its derivatives (6, m).
-        by_rig: the landmarks' before (M, 3, m).
-        field: those of the measurements (M, 3, m).
-        own: the landmarks' covariances (M, 3, 3) before, where the pose is known.
-        sigma: noise of a pixel.
+    The landmarks had covariances `own` (M, 3, 3) where the pose is known; `sigma` is the noise of a pixel.
     """
     local = (one.points - T[:3, 3]) @ T[:3, :3]
     D = one.stereo.project(local)[1]

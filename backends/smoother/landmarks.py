@@ -149,15 +149,8 @@ class SmootherLandmarks(LandmarkRows):
         With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
         fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
         information. Measurements from earlier poses count for the first one. A landmark that none of the graph's poses
-        measured is carried by the newest, with the drift since it was seen.
-
-        Args:
-            stereo: the rectified rig.
-            sigma: noise of its pixels [px].
-            chosen: rows of the landmarks (M,).
-            first: number of the first of the poses.
-            poses: (K, 4, 4).
-            joint: their covariance (6 K, 6 K).
+        measured is carried by the newest, with the drift since it was seen. The poses (K, 4, 4) from number `first` on
+        have the covariance `joint` (6 K, 6 K).
         """
         frames, z = (self.pose - first).clip(0).ravel(), self.z.reshape(-1, 3)
         rows = np.where(self.pose >= 0, np.arange(self.pose.size).reshape(self.pose.shape), -1)[chosen]
