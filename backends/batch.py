@@ -26,7 +26,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.window.motion import LONGEST, is_first, velocity_sigmas
-from slam.window.stereo import RectifiedStereo
+from slam.window.stereo import Field, RectifiedStereo
 
 _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
 _DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determines a landmark well enough for Cholesky
@@ -97,6 +97,14 @@ class BatchBackend:
         """See `slam.interfaces.MapBackend.place`."""
         self._smoother.place(ids, local, covariances)
         self._solution = None
+
+    def consider(self, field: Field, pose: Array | None = None) -> None:
+        """See `slam.interfaces.ConsideringBackend.consider`: the smoother follows the errors."""
+        self._smoother.consider(field, pose)
+
+    def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
+        """See `slam.interfaces.ConsideringBackend.sensitivities`: the smoother's."""
+        return self._smoother.sensitivities(ids)
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:

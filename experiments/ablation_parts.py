@@ -61,16 +61,12 @@ RECORDED = tuple(case for case in CASES if not case.path.startswith("synthetic:"
 CLOSINGS = ((5, 340, 0.07), (10, 345, 0.04), (5, 345, 0.52), (10, 340, 0.50))
 
 
-#: What follows landmarks to know how they depend on the rig.
-_FOLLOWING = ("observe", "change")
-
-
 def exact_rig() -> AbstractContextManager[object]:
     """The rig's uncertainty is added to nothing."""
     stack = ExitStack()
     for name, put in (
-        *((f"slam.calibration.consider.SchmidtFilter.{m}", lambda *_, **__: None) for m in _FOLLOWING),
-        ("slam.calibration.consider.RemainingRigError.added_to", lambda _, estimate: estimate),
+        ("slam.calibration.consider.RemainingRigError.follow", lambda *_, **__: None),
+        ("slam.calibration.consider.RemainingRigError.added_to", lambda _, __, estimate: estimate),
         ("slam.calibration.consider.RemainingRigError.common", lambda *_, **__: CommonError()),
     ):
         stack.enter_context(mock.patch(name, put))

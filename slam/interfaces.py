@@ -165,6 +165,36 @@ class RecentBackend(Protocol):
 
 
 @runtime_checkable
+class ConsideringBackend(Protocol):
+    """Additional methods of a back end that follows how the rig's remaining error moves its estimate.
+
+    An error of the rig acts on all frames alike, and does not average out as pixel noise does. The back end considers,
+    but does not estimate it (Schmidt, 1966): with δ (m,) such errors, ``T_true = T exp(J δ)``, ``y_true = y + L δ``.
+    `Backend.estimate` and all gains are those of an exact rig; a system adds the part of δ by its present covariance.
+    Without these methods it adds nothing: covariances are of pixel noise alone, too small if the calibration is not
+    exact.
+    """
+
+    def consider(self, field: Callable[[Array], Array], pose: Array | None = None) -> None:
+        """Follow errors δ of the rig from now on; called before the first `Backend.predict`.
+
+        Args:
+            field: derivatives (N, 3, m) of the true rectified rows (uL, vL, uR) by δ at corrected rows (N, 3) [px];
+                rows of a missing uR do not count. The last of the errors is known to be 1: a displacement.
+            pose: J (6, m) of the first pose; None for zero.
+        """
+        ...
+
+    def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
+        """J (6, m) of the newest pose, perturbed on the right, and L (N, 3, m) of landmarks, in world coordinates.
+
+        Raises:
+            MeasurementError: before the first `Backend.predict`; an id is not in the map.
+        """
+        ...
+
+
+@runtime_checkable
 class RevisingBackend(Protocol):
     """Additional methods of a back end that can correct past measurements.
 
@@ -178,7 +208,8 @@ class RevisingBackend(Protocol):
         """Correct all measurements so far: `correct` maps rectified rows (uL, vL, uR) (N, 3) [px] to corrected ones.
 
         Called before `Backend.predict` when the estimate of the rig's error has changed. A missing uR is NaN and stays
-        NaN. A back end without this method keeps its estimate from the earlier measurements.
+        NaN. A back end without this method keeps its estimate from the earlier measurements. Where the path is not
+        revised, landmarks that move by Δy have the last column of their sensitivities (`ConsideringBackend`) less Δy.
 
         Raises:
             MeasurementError: a corrected measurement is not finite.

@@ -35,6 +35,7 @@ from slam.mapping.known_landmarks import definite
 from slam.mapping.map_io import SavedMap
 from slam.mapping.mapper import Mapper
 from slam.mapping.step import Step
+from slam.rig_error import CommonError
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
@@ -120,7 +121,7 @@ class Session:
         c = config
         self.rig, self.config, self.calibration = rig, c, calibration
         self._models, self._backend = c.models, backend
-        self.rig_error = RemainingRigError(self.calibration, c.models)
+        self.rig_error = RemainingRigError(self.calibration)
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self.mapper = Mapper(rig, c.map, self.localizer, first)
         self.loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
@@ -132,6 +133,7 @@ class Session:
             ConfigurationError: there is a prior map, but the back end was not given by name, or cannot start in one.
             SlamError: the map is empty, or too large for the back end.
         """
+        self.rig_error.follow(first)
         if prior_map is None:
             return State(first)
         if self._backend is None:
@@ -214,15 +216,15 @@ class Session:
         old, T, stamp = state.backend, elsewhere.T_world_left, features.stamp
         landmarks: LandmarkTable | None = None
         if T is None:
-            before = self.rig_error.added_to(old.estimate(landmarks=False))
-            T, standing = before.T_world_left, Standing()
-            new = self._new(T_world_left=T.tolist())
+            before = self.rig_error.added_to(old, old.estimate(landmarks=False))
+            T, standing, common = before.T_world_left, Standing(), self.rig_error.common(old, as_reported=False)
+            new = self._new(common, T_world_left=T.tolist())
             prediction = new.predict(stamp)
-            after, common = new.estimate(landmarks=False), self.rig_error.common(as_reported=False)
+            after = new.estimate(landmarks=False)
             atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
         else:
             new, seen_at, landmarks = self._start(T), None, state.landmarks
-            whole = old.estimate()
+            whole = self.rig_error.added_to(old, old.estimate())
             new.insert(whole.ids, whole.positions, definite(whole.covariances))  # type: ignore[attr-defined]
             if elsewhere.place is not None:
                 assert landmarks is not None
@@ -244,12 +246,11 @@ class Session:
         """The step, with the landmarks that left and joined the map where another back end took over.
 
         `before` is the state after the last frame; `begun` that in which the step began, without landmarks where a new
-        map did. What the rig's uncertainty does to those that left is forgotten.
+        map did.
         """
         if before.landmarks is None or begun is before:
             return step
         if begun.landmarks is None:
-            self.rig_error.uncertainty.keep(step.landmarks.ids)
             gone = np.setdiff1d(before.landmarks.ids, step.landmarks.ids)
             return replace(step, erased=np.concatenate([gone, step.erased]))
         joined = np.setdiff1d(begun.landmarks.ids, before.landmarks.ids)
@@ -258,13 +259,14 @@ class Session:
     def _start(self, T_world_left: Array) -> Backend:
         """A back end without landmarks at a pose (4, 4) that is only roughly known."""
         sigmas = {"initial_position_sigma": POSITION_SIGMA, "initial_rotation_sigma": ROTATION_SIGMA}
-        return self._new(T_world_left=T_world_left.tolist(), **sigmas)
+        return self._new(CommonError(), T_world_left=T_world_left.tolist(), **sigmas)
 
-    def _new(self, **models: Any) -> Backend:
-        """Another back end of the same kind."""
+    def _new(self, common: CommonError, **models: Any) -> Backend:
+        """Another back end of the same kind; `common` is the error by the rig that its first pose has."""
         assert self._backend is not None
         changed = replace(self._models, **models)
         backend: Backend = registry.create("backends", self._backend, self.rig, models=changed, **self.config.backend)
+        self.rig_error.follow(backend, common.jacobian if common.jacobian.size else None)
         return backend
 
 

@@ -233,7 +233,7 @@ class StereoSlam:
             step = t.update(state, step)
             if isinstance(step, Elsewhere):  # the place is unknown: a new map begins
                 return step
-        with stage("estimate"):  # the pose; how it depends on the rig's error; the calibration learns from it
+        with stage("estimate"):  # the pose; the calibration learns from it
             step = t.estimate(state, step)
         with stage("objects"):  # still, moving or undecided; moving bodies (paper B, 3): `slam.objects.detector`
             step = t.sort(state, step)
@@ -269,7 +269,7 @@ class StereoSlam:
             step = self._step(state, features, begun)
             assert not isinstance(step, Elsewhere)  # a back end that takes over is believed
         step = replace(session.with_takeover(self._state, state, step), repeated=repeated)
-        common = session.rig_error.common(as_reported=True)
+        common = session.rig_error.common(state.backend, as_reported=True)
         result = frame_result(step, state.mapped, revision, self._stages.milliseconds, common)
         self._state, self._stages = state.after(step, checksum), Stages()
         return out(result)
@@ -296,7 +296,8 @@ class StereoSlam:
         self._roll_back()
         if self._state.prior_map is not None:
             return self._session.map_estimate(self._state, float("nan"))
-        estimate, common = self._tracker.whole_estimate(self._state), self._session.rig_error.common(as_reported=False)
+        estimate = self._tracker.whole_estimate(self._state)
+        common = self._session.rig_error.common(self.backend, as_reported=False)
         return self.atlas.estimate(estimate, common, not of_map)
 
     @one_blas_thread

@@ -131,12 +131,9 @@ class Tracker:
         return replace(step, report=report, tracking=tracking)
 
     def estimate(self, state: State, step: Step) -> Step:
-        """The camera's pose after an update; the rig's uncertainty is propagated to it, and its calibration learns."""
+        """The camera's pose after an update; the rig's calibration learns from the frame."""
         self._session.calibration.observe(replace(step.measured, images=None), step.pose)
         estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
-        used = step.report.used
-        rig_error, positions = self._session.rig_error, _positions(state, used)
-        rig_error.uncertainty.observe(estimate.T_world_left, estimate.stamp, used, positions)
         return replace(step, estimate=estimate)
 
     def sort(self, state: State, step: Step) -> Step:
@@ -153,8 +150,6 @@ class Tracker:
         landmarks = step.landmarks
         if self._aligning is not None:
             landmarks = with_new_patches(self._aligning, step.measured, seen, landmarks, T)
-        new = step.added.ids[~isin(step.added.ids, step.erased)]
-        self._session.rig_error.uncertainty.change(new, _positions(state, new), step.erased)
         return replace(step, landmarks=landmarks)
 
     def close_loops(self, state: State, step: Step) -> Step:
@@ -162,8 +157,8 @@ class Tracker:
 
         The rig's uncertainty is added to the pose.
         """
-        session, rig_error = self._session, self._session.rig_error
-        estimate, common = rig_error.added_to(step.estimate), rig_error.common(as_reported=False)
+        session, rig_error, backend = self._session, self._session.rig_error, state.backend
+        estimate, common = rig_error.added_to(backend, step.estimate), rig_error.common(backend, as_reported=False)
         step = replace(step, estimate=estimate, common=common, correction=session.calibration.applied)
         return replace(step, atlas=session.loop_closer.update(state.atlas, step, state.path))
 
@@ -172,13 +167,12 @@ class Tracker:
         self.objects.restart()
         if state.prior_map is not None or not np.isfinite(self.advanced):  # that back end has not begun
             return state
-        landmarks = self._session.mapper.reconcile(state.backend, state.landmarks)
-        self._session.rig_error.uncertainty.keep(np.zeros(0, np.int64) if landmarks is None else landmarks.ids)
-        return replace(state, landmarks=landmarks)
+        return replace(state, landmarks=self._session.mapper.reconcile(state.backend, state.landmarks))
 
     def whole_estimate(self, state: State) -> Estimate:
         """Pose and map of the back end, with the rig's uncertainty."""
-        return self._session.rig_error.added_to(checked(state.backend, "estimate", state.backend.estimate()))
+        estimate = checked(state.backend, "estimate", state.backend.estimate())
+        return self._session.rig_error.added_to(state.backend, estimate)
 
 
 def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:

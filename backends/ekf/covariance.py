@@ -5,6 +5,10 @@ Schmidt, whose covariance is exact for what it does. With the gain of such a lan
 ``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with its covariances.
 The camera's last poses, as they were believed in their time, are kept in the same way (stochastic clones).
 What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
+
+Errors of the rig (`slam.interfaces.ConsideringBackend`) are such states, too: they are considered, but not estimated.
+Their columns of the cross-covariance hold the derivatives of the state by them, which the same gain moves: a landmark's
+measurement is off by ``H x − F δ``, with a field F. Their own covariance is not needed here.
 """
 
 from __future__ import annotations
@@ -28,15 +32,22 @@ class Covariance:
 
     camera: Array  # (12, 12 + 3A), of the camera with itself and all landmarks of the state: a motion changes no more
     marks: Array  # (3A, 3A), of these landmarks
-    cross: Array  # (12 + 3A, 6K + 3B), with what has left: K poses, by their right perturbations, and B landmarks
-    left: Array  # (6K + 3B, 6K + 3B), of these
+    cross: Array  # (12 + 3A, 6K + 3B + m), with K poses, by right perturbations, B landmarks that left, m rig errors
+    left: Array  # (6K + 3B + m, 6K + 3B + m), of these
     known: Array  # (C, 3, 3), of each landmark that is independent of all else
     poses: int = 0  # K, the newest first
+    rig: int = 0  # m
 
     @classmethod
     def of_camera(cls, P: Array) -> Covariance:
         """Of the camera alone (12, 12)."""
         return cls(P, np.zeros((0, 0)), np.zeros((CAMERA, 0)), np.zeros((0, 0)), np.zeros((0, 3, 3)))
+
+    def considering(self, by_rig: Array) -> Covariance:
+        """With errors of the rig, by derivatives (12, m) of the camera's error; nothing else has left the state yet."""
+        m = by_rig.shape[1]
+        cross = np.concatenate([by_rig, np.zeros((len(self.marks), m))])
+        return replace(self, cross=cross, left=np.zeros((m, m)), rig=m)
 
     @property
     def count(self) -> int:
@@ -46,7 +57,7 @@ class Covariance:
     @property
     def correlated(self) -> int:
         """Number of landmarks that are in it or have left it: those after them are known from elsewhere."""
-        return self.count + (len(self.left) - POSE * self.poses) // 3
+        return self.count + (len(self.left) - POSE * self.poses - self.rig) // 3
 
     @property
     def pose(self) -> Array:
@@ -60,12 +71,29 @@ class Covariance:
 
     def marginals(self) -> tuple[Array, Array]:
         """Covariances (N, 3, 3) of all landmarks, and theirs (N, 3, 6) with the camera's [r, φ]."""
-        k, blocks = POSE * self.poses, []
-        for P in (self.marks, self.left[k:, k:]):
+        left, blocks = slice(POSE * self.poses, len(self.left) - self.rig), []
+        for P in (self.marks, self.left[left, left]):
             blocks.append(np.einsum("iaib->iab", P.reshape(len(P) // 3, 3, len(P) // 3, 3)))
-        cross = np.concatenate([self.camera[:POSE, CAMERA:], self.cross[:POSE, k:]], axis=1)
+        cross = np.concatenate([self.camera[:POSE, CAMERA:], self.cross[:POSE, left]], axis=1)
         apart = np.zeros((len(self.known), 3, POSE))
         return np.concatenate([*blocks, self.known]), np.concatenate([cross.T.reshape(-1, 3, POSE), apart])
+
+    def by_rig(self, rows: IndexArray) -> tuple[Array, Array]:
+        """Derivatives of the camera's error (12, m), and of some landmarks (M, 3, m), by errors of the rig."""
+        first, numbers = len(self.left) - self.rig, self._numbers(rows)
+        columns = len(self.cross) + np.arange(first, first + self.rig)
+        landmarks = kernels.gather(self.camera, self.marks, self.cross, self.left, numbers, columns)
+        return self.cross[:CAMERA, first:], landmarks.reshape(len(rows), 3, self.rig)
+
+    def displaced(self, rows: IndexArray, change: Array) -> Covariance:
+        """After a change (M, 3) of some landmarks' coordinates that is none of their error: the last of the rig's."""
+        if not self.rig:
+            return self
+        numbers, cross, left = self._numbers(rows), self.cross.copy(), self.left.copy()
+        for table, first in ((cross, 0), (left, len(cross))):
+            here = (numbers >= first) & (numbers < first + len(table))
+            table[numbers[here] - first, -1] -= change.reshape(-1)[here]
+        return replace(self, cross=cross, left=left)
 
     def with_pose(self, J: Array, most: int) -> Covariance:
         """With the present pose among those that are kept, J (6, 6) times [r, φ]; and at most so many of them."""
@@ -84,10 +112,10 @@ class Covariance:
         camera[:, :CAMERA], cross[:CAMERA] = 0.5 * (own + own.T), J @ cross[:CAMERA]
         return replace(self, camera=camera, cross=cross)
 
-    def appended(self, J: Array, noise: Array) -> Covariance:
+    def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
 
-        They are the last ones of the state.
+        They are the last ones of the state. With the pose known, errors of the rig move them by `by_rig` (M, 3, m).
         """
         by_pose, n, each = J.reshape(-1, POSE), len(self.marks), np.arange(len(J))
         rows = by_pose @ self.camera[:POSE]
@@ -97,21 +125,24 @@ class Covariance:
         own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
         marks[n:, n:] = 0.5 * (own + own.T)
         camera = np.concatenate([self.camera, rows[:, :CAMERA].T], axis=1)
-        cross = np.concatenate([self.cross, by_pose @ self.cross[:POSE]])
+        new = by_pose @ self.cross[:POSE]
+        new[:, len(self.left) - self.rig :] += by_rig.reshape(len(rows), self.rig)
+        cross = np.concatenate([self.cross, new])
         return replace(self, camera=camera, marks=marks, cross=cross)
 
     def rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
         parts, first_known = (self.camera, self.marks, self.cross, self.left), self.correlated
-        poses, camera = CAMERA + len(self.marks) + np.arange(POSE * self.poses), np.arange(CAMERA)
-        state, outside = self._numbers(dense), np.concatenate([poses, self._numbers(left)])
+        begin, end, camera = CAMERA + len(self.marks), CAMERA + len(self.marks) + len(self.left), np.arange(CAMERA)
+        poses, rig = np.arange(begin, begin + POSE * self.poses), np.arange(end - self.rig, end)
+        state, outside = self._numbers(dense), np.concatenate([poses, self._numbers(left), rig])
         marks, new = kernels.gather(*parts, state, state), np.flatnonzero(dense >= first_known)
         rows = 3 * new[:, None] + np.arange(3)
         marks[rows[:, :, None], rows[:, None, :]] = self.known[dense[new] - first_known]
         state = np.concatenate([camera, state])
         cross, own = kernels.gather(*parts, state, outside), kernels.gather(*parts, outside, outside)
         rest = self.known[known - first_known]
-        return Covariance(kernels.gather(*parts, camera, state), marks, cross, own, rest, self.poses)
+        return Covariance(kernels.gather(*parts, camera, state), marks, cross, own, rest, self.poses, self.rig)
 
     def _numbers(self, rows: IndexArray) -> IndexArray:
         """Of landmarks' coordinates (3M,) in ``[camera, landmarks, left]``; −1 for those that are known."""
@@ -123,11 +154,9 @@ class Covariance:
     def corrected(self, lost: tuple[Array, Array, Array], J: Array, K: Array) -> Covariance:
         """After an update, ``P − V Vᵀ``, in the coordinates of the corrected state.
 
-        Args:
-            lost: V = ``P Hᵀ L⁻ᵀ`` of the camera (12, m), of the landmarks (3A, m), in Fortran's order, and of what has
-                left (6K + 3B, m).
-            J: the camera's error becomes J (12, 12) times what it was,
-            K: and then to those of the landmarks K (A, 3, 6) times that of the pose is added.
+        `lost` is V = ``P Hᵀ L⁻ᵀ`` of the camera, of the landmarks, in Fortran's order, and of what has left. The
+        camera's error becomes J (12, 12) times what it was, and then to those of the landmarks K (A, 3, 6) times that
+        of the pose is added.
         """
         V_camera, V, V_left = lost
         shift = np.asfortranarray(K.reshape(-1, POSE))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from backends.ekf.config import EkfConfig
-from backends.ekf.covariance import CAMERA
+from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.landmarks import COORDINATES, Coordinates, FilterLandmarks, distant_anchors
 from backends.ekf.motion import Camera, EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
@@ -27,7 +27,7 @@ from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION
-from slam.window.stereo import RectifiedMeasurement
+from slam.window.stereo import Field, RectifiedMeasurement
 
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
@@ -134,8 +134,8 @@ class EkfBackend:
         s = self._started("add")
         s.landmarks.require_new(observations.ids)
         z = self._measure.stereo.measure(observations)
-        h, covariances = self._measure.first_sight(observations.ids, z, self._farthest)
-        self.state = s.placed(self._coordinates, observations.ids, h, covariances)
+        new = self._measure.first_sight(observations.ids, z, self._farthest)
+        self.state = s.placed(self._coordinates, observations.ids, *new)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`."""
@@ -190,6 +190,25 @@ class EkfBackend:
         known = known_landmarks(self._form.name, s.landmarks, ids, local, covariances, True)
         self.state = s.placed(self._coordinates, *known)
 
+    # --- errors of the rig (documented in slam.interfaces.ConsideringBackend) ---
+
+    def consider(self, field: Field, pose: Array | None = None) -> None:
+        """See `slam.interfaces.ConsideringBackend.consider`."""
+        s, m = self.state, field(np.zeros((0, 3))).shape[2]
+        by_rig = np.zeros((CAMERA, m))
+        if pose is not None:
+            by_rig[:POSE] = np.linalg.solve(s.camera.by_error(), pose)
+        self._measure = replace(self._measure, field=field)
+        self.state = replace(s, covariance=s.covariance.considering(by_rig))
+
+    def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
+        """See `slam.interfaces.ConsideringBackend.sensitivities`."""
+        s = self._started("sensitivities")
+        rows = s.landmarks.rows_of(ids)
+        camera, marks = s.covariance.by_rig(rows)
+        D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
+        return s.camera.by_error() @ camera[:POSE], D @ marks
+
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
     revises_path = False
@@ -210,7 +229,8 @@ class EkfBackend:
             rows, points = rows[good], points[good]
             change = self._coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
             if np.isfinite(change).all():
-                s = replace(s, landmarks=s.landmarks.moved(self._coordinates, rows, change))
+                marks = s.landmarks.moved(self._coordinates, rows, change)
+                s = replace(s, landmarks=marks, covariance=s.covariance.displaced(rows, change))
         self.state = s
 
     # --- the filter's parts ---
@@ -254,6 +274,7 @@ class EkfBackend:
         update = Update(
             s.camera, s.covariance, s.landmarks.select(rows), rows, z, self.models.pixel_sigma, self._measure.stereo,
             self._coordinates, self._form.iterations, self.models.gate_probability, guess,
+            self._measure.field,
         )  # fmt: skip
         noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)
 

@@ -12,16 +12,10 @@ _BLOCK = 64  # cost: rows and columns that are copied at a time
 
 @kernel
 def times(by_pose, own, marks, camera, P, with_camera, with_marks):
-    """``H`` times the covariance of camera and landmarks.
+    """``H`` times the covariance of camera and landmarks, into `with_camera` (3M, 12) and `with_marks` (3M, 3A).
 
-    Args:
-        by_pose: derivatives (M, 3, 6) of landmarks' measurements by [r, φ].
-        own: derivatives (M, 3, 3) by the landmarks' own coordinates.
-        marks: which landmarks these are (M,).
-        camera: the camera's rows of the covariance (12, 12 + 3A).
-        P: the landmarks' (3A, 3A).
-        with_camera: filled in (3M, 12).
-        with_marks: filled in (3M, 3A).
+    The landmarks `marks` (M,) are measured, with derivatives (M, 3, 6) by [r, φ] and (M, 3, 3) by their own
+    coordinates; the covariance has the camera's rows (12, 12 + 3A) and P (3A, 3A).
     """
     size, n = len(camera), len(P)
     p, q, r = camera[0][size:], camera[1][size:], camera[2][size:]
@@ -75,10 +69,7 @@ def own_distances(nu, S):
 def conditional_distances(inverse, lost, y):
     """``y_jᵀ Q_j⁻¹ y_j`` (M,) with the landmarks' blocks ``Q_j = (L⁻ᵀ L⁻¹ − lostᵀ lost)_jj``.
 
-    Args:
-        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
-        lost: (K, 3M).
-        y: (3M,).
+    ``L⁻¹`` is `inverse` (3M, 3M), lower triangular; `lost` (K, 3M), y (3M,).
     """
     m = len(y) // 3
     out, Q = np.empty(m), np.zeros((m, 3, 3))

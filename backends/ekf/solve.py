@@ -25,7 +25,7 @@ from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
-from slam.window.stereo import RectifiedStereo
+from slam.window.stereo import Field, RectifiedStereo, no_field
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
@@ -96,10 +96,7 @@ class Jacobian:
     def own_covariances(self, pose: Array, cross: Array, blocks: Array) -> Array:
         """Covariances (M, 3, 3) [px²] of each landmark's innovation by itself, without the measurement's noise.
 
-        Args:
-            pose: covariance (6, 6) of the pose's error.
-            cross: covariances (M, 3, 6) of the landmarks' own coordinates with it.
-            blocks: covariances (M, 3, 3) of these coordinates.
+        By those of the pose's error (6, 6), of the landmarks' own coordinates with it (M, 3, 6), and of these.
         """
         A, B = self.by_pose, self.own
         S = (A @ pose + 2 * (B @ cross)) @ A.transpose(0, 2, 1)
@@ -126,6 +123,7 @@ class Update:
     iterations: int  # most linearisations
     gate_probability: float  # quantile of χ² beyond which a landmark's measurement is rejected
     guess: Array | None = None  # a pose (4, 4) worth trying where the prior is far off
+    field: Field = no_field  # derivatives of measurements by errors of the rig
 
     def wider(self, noise: Array) -> Update:
         """With more noise (12, 12) of the camera."""

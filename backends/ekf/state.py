@@ -72,10 +72,13 @@ class FilterState:
 
     # --- landmarks join and leave ---
 
-    def placed(self, coordinates: Coordinates, ids: IdArray, h: Array, covariances: Array) -> FilterState:
+    def placed(
+        self, coordinates: Coordinates, ids: IdArray, h: Array, covariances: Array, by_rig: Array | None = None
+    ) -> FilterState:
         """With landmarks at h (M, 3) in the camera's coordinates with covariances (M, 3, 3) (paper A, Eq. 10).
 
-        An error of the pose takes them along: they stay where they are as seen from the camera.
+        An error of the pose takes them along: they stay where they are as seen from the camera, but for what errors of
+        the rig do to that, by derivatives (M, 3, m).
         """
         if not len(ids):
             return self
@@ -83,7 +86,8 @@ class FilterState:
         new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T, self.frame)
         D = coordinates.inverse_jacobian(anchors, new.c) @ R
         noise = D @ covariances @ D.transpose(0, 2, 1)
-        covariance = self.covariance.appended(new.gauge @ self.camera.world(), noise)
+        by_rig = np.zeros((len(h), 3, self.covariance.rig)) if by_rig is None else D @ by_rig
+        covariance = self.covariance.appended(new.gauge @ self.camera.world(), noise, by_rig)
         landmarks = self.landmarks.with_rows(self.covariance.count, new)
         placed = replace(self, measured=True, landmarks=landmarks, covariance=covariance)
         return placed._relieved(np.zeros(0, np.intp), np.flatnonzero(landmarks.seen == self.frame))
@@ -156,8 +160,11 @@ class FilterState:
         J, system, P = self.camera.transport(camera), found.system, update.covariance
         K = (marks.gauge - before.gauge)[:count] @ camera.world() * camera.transports
         with_camera, with_marks, with_left = *system.linear.HP, system.linear.H.times_rows(P.cross)
-        lost = system.whitened(with_camera), system.whitened(with_marks), system.whitened(with_left)
-        covariance = P.corrected(lost, J, K)
+        if P.rig:
+            field = np.where(system.linear.rows[:, :, None], update.field(update.z), 0.0)
+            with_left[:, -P.rig :] -= field.reshape(-1, P.rig)
+        narrow = system.whitened(np.concatenate([with_camera, with_left], axis=1))
+        covariance = P.corrected((narrow[:CAMERA], system.whitened(with_marks), narrow[CAMERA:]), J, K)
         settled = camera.settled()
         if settled.camera is not camera:
             covariance = covariance.camera_moved(settled.J, settled.noise)

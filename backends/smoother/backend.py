@@ -25,6 +25,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
+from slam.window.stereo import Field
 
 
 class SmootherBackend:
@@ -57,7 +58,7 @@ class SmootherBackend:
         self._steps = Steps(rig, models, self.config)
         self.factor_maker = FactorMaker(self._steps.stereo, models)
         self._graph = Graph(self.factor_maker, self.config.lag)
-        self.state = SmootherState.empty()
+        self.state = SmootherState.empty(np.zeros((6, 0)))
         self.path = Path()
         self._mended = False  # whether measurements were revised while poses were kept
         self._answer: tuple[SmootherState, Trajectory] | None = None  # the last path, and the state that it is of
@@ -163,6 +164,18 @@ class SmootherBackend:
         if len(ids):
             self.state = self._steps.placed(s, *arguments)
 
+    # --- errors of the rig (documented in slam.interfaces.ConsideringBackend) ---
+
+    def consider(self, field: Field, pose: Array | None = None) -> None:
+        """See `slam.interfaces.ConsideringBackend.consider`."""
+        first = np.zeros((6, field(np.zeros((0, 3))).shape[2])) if pose is None else pose
+        self._steps, self.state = replace(self._steps, field=field), SmootherState.empty(first)
+
+    def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
+        """See `slam.interfaces.ConsideringBackend.sensitivities`."""
+        s = self._started("sensitivities")
+        return s.by_rig[6:].copy(), s.landmarks.by_rig[s.landmarks.rows_of(ids)]
+
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
     @property
@@ -180,6 +193,10 @@ class SmootherBackend:
         s = self.state
         if s.started:
             before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph)
+            if not self.revises_path:  # what the landmarks move by is none of their error: the last of the rig's
+                by_rig = s.landmarks.by_rig.copy()
+                by_rig[:, :, -1:] -= (s.landmarks.position - before.landmarks.position)[:, :, None]
+                s = replace(s, landmarks=replace(s.landmarks, by_rig=by_rig))
             path = self.path.moved(s, s.poses[0] @ inverse(before.poses[0]))
             self.path, self.state, self._mended = path, replace(s, measured=True), True
 

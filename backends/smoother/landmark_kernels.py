@@ -12,21 +12,12 @@ from slam.runtime.compilation import kernel
 
 @kernel
 def information_of(camera, poses, frames, z, points, rows, sigma):
-    """What measurements say of landmarks, linearised at their positions.
+    """What measurements z (n, 3) [px], made in `frames` (n,), say of landmarks, linearised at their `points` (M, 3).
 
-    Args:
-        camera: of the rectified rig (7,), see `slam.kernels.stereo`.
-        poses: T_world_left (F, 4, 4).
-        frames: in which each measurement was made (n,).
-        z: measurements (n, 3), NaN where missing.
-        points: landmarks in world coordinates (M, 3).
-        rows: measurements of each landmark (M, K), −1 for none.
-        sigma: pixel noise [px].
-
-    Returns:
-        the information of each measurement on the landmark (M, K, 3, 3) [1/m²], the gradient (M, 3) of all together
-        towards their optimum, half the negative derivative of the sum of squares, which is the third (M,), and the
-        number of measurements whose landmark lies behind the camera (M,): they count for nothing in the others.
+    `camera` (7,) is as in `slam.kernels.stereo`, `poses` T_world_left (F, 4, 4); `rows` (M, K) are
+    the measurements of each landmark, −1 for none. Returns the information of each measurement (M, K, 3, 3) [1/m²], the
+    gradient (M, 3) towards the optimum, half the negative derivative of the sum of squares, which is the third (M,),
+    and the number of measurements whose landmark lies behind the camera (M,): they count for nothing in the others.
     """
     count, most = rows.shape
     information, gradient = np.zeros((count, most, 3, 3)), np.zeros((count, 3))
@@ -57,17 +48,11 @@ def information_of(camera, poses, frames, z, points, rows, sigma):
 
 @kernel
 def carried_by(known, poses, frames, points, rows, information, older, covariance):
-    """How poses carry landmarks along: Jacobians (M, 3, 6 W) of the positions by the poses.
+    """How poses (W, 4, 4) of the frames `known`, ascending, carry landmarks along: Jacobians (M, 3, 6 W) by the poses.
 
-    Args:
-        known: frames of the poses (W,), ascending.
-        poses: T_world_left (W, 4, 4).
-        frames: in which each measurement was made (n,).
-        points: landmarks in world coordinates (M, 3).
-        rows: measurements of each landmark (M, K), −1 for none.
-        information: of each measurement on the landmark (M, K, 3, 3).
-        older: of measurements before these (M, 3, 3); it counts for the pose of the oldest of these.
-        covariance: of the landmarks where all poses are known (M, 3, 3).
+    `frames`, `points` and `rows` are as in `information_of`, `information` (M, K, 3, 3) is by it. That of measurements
+    before these, `older` (M, 3, 3), counts for the pose of the oldest of these. The landmarks have `covariance`
+    (M, 3, 3) where all poses are known.
     """
     count, most, width = len(points), rows.shape[1], len(known)
     out = np.zeros((count, 3, 6 * width))

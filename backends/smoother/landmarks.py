@@ -33,21 +33,24 @@ class SmootherLandmarks(LandmarkRows):
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
     begun: IndexArray  # number of the pose from which its present smart factor counts (S,); it may begin later
+    by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
     @classmethod
-    def of(cls, ids: IdArray, first: int, position: Array, own: Array, information: Array, world: bool) -> Self:
+    def of(
+        cls, ids: IdArray, first: int, position: Array, own: Array, information: Array, world: bool, by_rig: Array
+    ) -> Self:
         """Landmarks that are known, but not measured yet; `first` is the first one's serial number."""
         n = len(ids)
         return cls(
             ids, first + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
-            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp),
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), by_rig,
         )  # fmt: skip
 
     @classmethod
-    def none(cls) -> Self:
+    def none(cls, m: int = 0) -> Self:
         """No landmark."""
         nine = np.zeros((0, 3, 3))
-        return cls.of(np.zeros(0, np.int64), 0, np.zeros((0, 3)), nine, nine, False)
+        return cls.of(np.zeros(0, np.int64), 0, np.zeros((0, 3)), nine, nine, False, np.zeros((0, 3, m)))
 
     @property
     def from_newest(self) -> Array:
@@ -146,15 +149,8 @@ class SmootherLandmarks(LandmarkRows):
         With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
         fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
         information. Measurements from earlier poses count for the first one. A landmark that none of the graph's poses
-        measured is carried by the newest, with the drift since it was seen.
-
-        Args:
-            stereo: the rectified rig.
-            sigma: noise of its pixels [px].
-            chosen: rows of the landmarks (M,).
-            first: number of the first of the poses.
-            poses: (K, 4, 4).
-            joint: their covariance (6 K, 6 K).
+        measured is carried by the newest, with the drift since it was seen. The poses (K, 4, 4) from number `first` on
+        have the covariance `joint` (6 K, 6 K).
         """
         frames, z = (self.pose - first).clip(0).ravel(), self.z.reshape(-1, 3)
         rows = np.where(self.pose >= 0, np.arange(self.pose.size).reshape(self.pose.shape), -1)[chosen]

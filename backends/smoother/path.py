@@ -24,12 +24,8 @@ class Path:
     def extend(self, s: SmootherState) -> None:
         """Take in a new frame. An earlier try at the same frame is overwritten."""
         f = s.frame
-        self._stamps[f:], self._number[f:], self._relative[f:], self._own[f:] = (
-            [float(s.stamps[1])],
-            [0],
-            [np.eye(4)],
-            [s.own],
-        )
+        self._stamps[f:], self._number[f:] = [float(s.stamps[1])], [0]
+        self._relative[f:], self._own[f:] = [np.eye(4)], [s.own]
         self.follow(s)
 
     def follow(self, s: SmootherState) -> None:

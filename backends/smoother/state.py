@@ -71,6 +71,7 @@ class SmootherState:
     stamps: Array  # times of the last frame but one and the last (2,) [s]; NaN where there is none
     last: Array  # their poses (2, 4, 4)
     pair: Array  # their joint covariance (12, 12), where the newest pose of the graph is known
+    by_rig: Array  # their derivatives by errors of the rig (12, m)
     tie: Tie | None = None  # of the newest frame to the newest pose of the graph that is before it
     frame: int = -1  # number of the newest frame
     since: int = 0  # frames since the problem has begun, 0 for its first one
@@ -83,12 +84,12 @@ class SmootherState:
     contradicted: int = 0  # updates in succession in which most observations agreed on another pose than expected
 
     @classmethod
-    def empty(cls) -> SmootherState:
-        """Before the first prediction."""
+    def empty(cls, by_rig: Array) -> SmootherState:
+        """Before the first prediction; `by_rig` (6, m) is of the first pose."""
         none = np.zeros((0, 4, 4))
         return cls(
             0, 0, none, (), (), np.zeros((0, 6, 6)), np.full(2, np.nan), np.tile(np.eye(4), (2, 1, 1)),
-            np.zeros((12, 12)),
+            np.zeros((12, 12)), np.tile(by_rig, (2, 1)), landmarks=SmootherLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
 
     @property

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from backends.smoother.config import SmootherConfig
+from backends.smoother.considered import by_pose_and_rig, landmarks_by_rig
 from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import SmootherLandmarks, inverses
 from backends.smoother.state import Known, Sight, SmootherState, Tie
@@ -17,8 +18,6 @@ from slam.window.agreement import MIN_CONSENSUS
 from slam.window.gating import squared_distances
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
-
-_STANDS = 1e-5  # numerics: step [rad], [m] of a camera that stands; none at all would leave no information matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +47,7 @@ class Steps(RectifiedMeasurement):
             return _begun(s, T, np.diag(sigmas**2), Sight.none())
         dt = min(stamp - s.stamps[1], motion.LONGEST)
         before = None if s.since == 0 else min(s.stamps[1] - s.stamps[0], motion.LONGEST)
-        T, J, noise, first = motion.predicted(self.models, s.last, before, dt)
-        if rests:
-            T, J, noise = s.last[1], np.eye(6, 12, 6), _STANDS**2 * np.eye(6)
+        T, J, noise, first = motion.predicted(self.models, s.last, before, dt, rests)
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
         own = 0.5 * (own + own.T)
@@ -59,7 +56,9 @@ class Steps(RectifiedMeasurement):
             tie = replace(tie, times=np.array([np.nan if first or before is None else -before, 0.0, dt]))
         return replace(
             s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
-            pair=np.block([[s.own, cross.T], [cross, own]]), since=s.since + 1, inside=False, measured=False, tie=tie,
+            pair=np.block([[s.own, cross.T], [cross, own]]),
+            by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]), since=s.since + 1, inside=False, measured=False,
+            tie=tie,
         )  # fmt: skip
 
     def in_view(self, s: SmootherState) -> tuple[IndexArray, Array, Array, Array]:
@@ -126,21 +125,26 @@ class Steps(RectifiedMeasurement):
             known = {serial: one for serial, one in s.known.items() if one.pose < 0}
             after = replace(after, known=known, landmarks=marks)
             return self.settled(after, graph.rebuilt(after)), float("nan"), ""
-        residuals, J = pose_only.residuals(one, found.T)
-        information = _information(J[used], one.noise[used], z[used])
+        one = replace(one, points=one.points[used], z=z[used], noise=one.noise[used])
+        field, before = self.field(one.z), marks.by_rig[seen]
+        G, F = by_pose_and_rig(one, found.T, before, field)
         x = log(inverse(one.predicted) @ found.T)
-        nis = float(squared_distances(residuals[used], one.noise[used]).sum() + x @ one.information @ x)
+        nis = float(squared_distances(pose_only.residuals(one, found.T)[0], one.noise).sum() + x @ one.information @ x)
+        by_rig = np.linalg.solve(one.information + G.T @ G, one.information @ s.by_rig[6:] + G.T @ F)
         if not (s.inside or self._is_chosen(s, found.T, seen)):
-            return _hung(s, found.T, information), nis, ""
+            return _hung(s, found.T, G.T @ G, by_rig), nis, ""
+        marks = replace(marks, by_rig=marks.by_rig.copy())
+        own = marks.from_newest[seen]
+        marks.by_rig[seen] = landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
         marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number))
         sight = Sight.of(marks, seen, z[used])
         if s.inside:
             after = replace(
                 s, sights=(*s.sights[:-1], sight), poses=np.concatenate([s.poses[:-1], found.T[None]]),
-                last=np.stack([s.last[0], found.T]), landmarks=marks,
+                last=np.stack([s.last[0], found.T]), landmarks=marks, by_rig=np.concatenate([s.by_rig[:6], by_rig]),
             )  # fmt: skip
             return self.settled(after, graph.rebuilt(after)), nis, ""
-        after = _hung(s, found.T, information)
+        after = _hung(s, found.T, G.T @ G, by_rig)
         after = replace(
             after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, s.tie),
             spread=np.concatenate([s.spread, after.covariance[None]]), inside=True, landmarks=marks,
@@ -199,13 +203,14 @@ class Steps(RectifiedMeasurement):
 
     def inserted(self, s: SmootherState, ids: IdArray, positions: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
-        marks = SmootherLandmarks.of(ids, s.serials, positions, covariances, inverses(covariances), True)
+        none = np.zeros((len(ids), 3, s.by_rig.shape[1]))
+        marks = SmootherLandmarks.of(ids, s.serials, positions, covariances, inverses(covariances), True, none)
         known = {serial: Known(x, P, -1) for serial, x, P in zip(marks.serial.tolist(), positions, covariances)}
         return replace(_with(s, marks), known={**s.known, **known}, measured=s.measured)
 
     def placed(self, s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
-        marks = _seen_from_newest(s, ids, local, covariances)
+        marks = _seen_from_newest(s, ids, local, covariances, np.zeros((len(ids), 3, s.by_rig.shape[1])))
         T, by_pose = inverse(s.poses[-1]) @ s.last[1], points_by_pose(local)
         there = T[:3, :3] @ (covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)) @ T[:3, :3].T
         relative = zip(marks.serial.tolist(), transform(T, local), there)
@@ -240,8 +245,11 @@ def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> Smoot
     )  # fmt: skip
 
 
-def _hung(s: SmootherState, T: Array, information: Array) -> SmootherState:
-    """With the newest frame at T (4, 4), by measurements with an information (6, 6), but as no pose of the graph."""
+def _hung(s: SmootherState, T: Array, information: Array, by_rig: Array) -> SmootherState:
+    """With the newest frame at T (4, 4), by measurements with an information (6, 6), but as no pose of the graph.
+
+    Its derivatives by errors of the rig are `by_rig` (6, m).
+    """
     own = np.linalg.inv(information + np.linalg.inv(s.own))
     gain = s.pair[:6, 6:] @ np.linalg.inv(s.own)
     P = s.pair.copy()
@@ -249,7 +257,8 @@ def _hung(s: SmootherState, T: Array, information: Array) -> SmootherState:
     P[:6, 6:] = gain @ own
     P[6:, :6], P[6:, 6:] = P[:6, 6:].T, own
     before = s.last[0] @ exp(gain @ log(inverse(s.last[1]) @ T))
-    return replace(s, last=np.stack([before, T]), pair=0.5 * (P + P.T))
+    both = np.concatenate([s.by_rig[:6] + gain @ (by_rig - s.by_rig[6:]), by_rig])
+    return replace(s, last=np.stack([before, T]), pair=0.5 * (P + P.T), by_rig=both)
 
 
 def _drift(P: Array, before: Array, newest: Array) -> Array:
@@ -259,23 +268,17 @@ def _drift(P: Array, before: Array, newest: Array) -> Array:
     return np.asarray((vectors * values.clip(min=0)) @ vectors.T)
 
 
-def _information(J: Array, noise: Array, z: Array) -> Array:
-    """What measurements say of the pose (6, 6)."""
-    information = np.zeros((6, 6))
-    for have, columns in ((np.isfinite(z[:, 2]), 3), (np.isnan(z[:, 2]), 2)):
-        A = J[have, :columns]
-        information += np.einsum("mia,mij,mjb->ab", A, np.linalg.inv(noise[have, :columns, :columns]), A)
-    return information
-
-
 def _with(s: SmootherState, marks: SmootherLandmarks) -> SmootherState:
     return replace(s, landmarks=s.landmarks.joined(marks), serials=s.serials + len(marks), measured=True)
 
 
-def _seen_from_newest(s: SmootherState, ids: IdArray, local: Array, covariances: Array) -> SmootherLandmarks:
+def _seen_from_newest(
+    s: SmootherState, ids: IdArray, local: Array, covariances: Array, by_rig: Array
+) -> SmootherLandmarks:
     """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes.
 
-    From a frame that is no pose of the graph they are as uncertain as it is itself, given the newest pose of the graph.
+    Errors of the rig move them there by `by_rig` (M, 3, m). From a frame that is no pose of the graph they are as
+    uncertain as it is itself, given the newest pose of the graph.
     """
     T = s.last[1]
     if not s.inside:
@@ -283,7 +286,8 @@ def _seen_from_newest(s: SmootherState, ids: IdArray, local: Array, covariances:
         covariances = covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)
     own = T[:3, :3] @ covariances @ T[:3, :3].T
     own = 0.5 * (own + np.swapaxes(own, 1, 2))
-    return SmootherLandmarks.of(ids, s.serials, transform(T, local), own, inverses(own), False)
+    by_rig = T[:3, :3] @ (by_rig - points_by_pose(local) @ s.by_rig[6:])
+    return SmootherLandmarks.of(ids, s.serials, transform(T, local), own, inverses(own), False, by_rig)
 
 
 def _carried(J: Array, P: Array) -> Array:

@@ -22,6 +22,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
+from slam.window.stereo import Field
 
 
 class WindowBackend:
@@ -49,10 +50,10 @@ class WindowBackend:
         self.models = models
         self.config = from_options(WindowConfig, "window", options)
         self._steps = Steps(rig, models, self.config)
-        self._state = WindowState.empty()
+        self._state = WindowState.empty(np.zeros((6, 0)))
         self._stamps: list[float] = []
         self._final: list[Array] = []  # poses by frame; those of the window and of its past are in the state
-        self._history = History()
+        self._history = History.of(self._state)
         self._revised = -1  # number of the newest frame when measurements were revised last, −1 for never
         self._path: tuple[WindowState, Trajectory] | None = None  # the last answer, and the state that it is of
 
@@ -61,16 +62,24 @@ class WindowBackend:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
+        return self._predict(stamp, rests=False)
+
+    @one_blas_thread
+    def predict_at_rest(self, stamp: float) -> Prediction:
+        """See `slam.interfaces.RestingBackend.predict_at_rest`."""
+        return self._predict(stamp, rests=len(self._state.frames) > 0)
+
+    def _predict(self, stamp: float, rests: bool) -> Prediction:
         s = self._state
         require_stamp("window", stamp, float(s.stamps[-1]) if len(s.stamps) else None)
-        before, s = s, self._steps.predicted(s, float(stamp))
+        before, s = s, self._steps.predicted(s, float(stamp), rests)
         s, settled = settle(before, s, self.config.lag)
         rows, left, right, S = self._steps.in_view(s)
         frame = int(s.frames[-1])
         self._stamps[frame:], self._final[frame:] = [float(stamp)], [s.poses[-1].copy()]
         for earlier, T in settled.items():
             self._final[earlier] = T
-        self._done(s, "predicted", float(stamp))
+        self._done(s, "predicted", float(stamp), rests)
         return Prediction(
             float(stamp), s.poses[-1].copy(), s.covariance[-6:, -6:].copy(), s.landmarks.ids[rows], left, right, S
         )
@@ -159,6 +168,19 @@ class WindowBackend:
         if len(ids):
             self._done(self._steps.placed(s, *arguments), "placed", *arguments)
 
+    # --- errors of the rig (documented in slam.interfaces.ConsideringBackend) ---
+
+    def consider(self, field: Field, pose: Array | None = None) -> None:
+        """See `slam.interfaces.ConsideringBackend.consider`."""
+        first = np.zeros((6, field(np.zeros((0, 3))).shape[2])) if pose is None else pose
+        self._steps, self._state = replace(self._steps, field=field), WindowState.empty(first)
+        self._history = History.of(self._state)
+
+    def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
+        """See `slam.interfaces.ConsideringBackend.sensitivities`."""
+        s = self._started("sensitivities")
+        return s.by_rig[-6:].copy(), s.landmarks.by_rig[s.landmarks.rows_of(ids)]
+
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
     @property
@@ -174,7 +196,7 @@ class WindowBackend:
         path is found anew when it is asked for.
         """
         if len(self._state.frames):
-            s = state_corrected(self._state, self._steps.stereo, correct)
+            s = state_corrected(self._state, self._steps.stereo, correct, self.revises_path)
             self._history = self._history.corrected(self._steps.stereo, correct)
             self._state, self._revised = replace(s, measured=True), int(s.frames[-1])
 

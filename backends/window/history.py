@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
 from slam.geometry.se3 import Array
-from slam.window import kernels
+from slam.window import chart_kernels
 from slam.window.stereo import RectifiedStereo
 
 _EVERY = 25  # cost: frames between two states from which the calls can be repeated
@@ -51,8 +51,13 @@ class Part:
 class History:
     """The calls since a state, in parts."""
 
-    parts: tuple[Part, ...] = field(default_factory=lambda: (Part(WindowState.empty()),))  # at least one
+    parts: tuple[Part, ...]  # at least one
     anchored: bool = False  # whether landmarks were ever known in the world: then the path may not be moved in it
+
+    @classmethod
+    def of(cls, s: WindowState) -> History:
+        """From a state on."""
+        return cls((Part(s),))
 
     @property
     def start(self) -> WindowState:
@@ -102,8 +107,13 @@ class History:
         return s, final
 
 
-def state_corrected(s: WindowState, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> WindowState:
-    """A state whose measurements are corrected, and whose landmarks are where the newest camera sees them corrected."""
+def state_corrected(
+    s: WindowState, stereo: RectifiedStereo, correct: Callable[[Array], Array], whole: bool = True
+) -> WindowState:
+    """A state whose measurements are corrected, and whose landmarks are where the newest camera sees them corrected.
+
+    Where the rest of the path is not, what the landmarks move by is none of their error: the last of the rig's.
+    """
     if not len(s.frames):
         return s
     T, marks = s.poses[-1], s.landmarks
@@ -119,9 +129,17 @@ def state_corrected(s: WindowState, stereo: RectifiedStereo, correct: Callable[[
     if len(members):
         axes = np.ascontiguousarray(np.broadcast_to(np.eye(3), (len(members), 3, 3)))
         before, after = (
-            kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0] for p in (marks.position, position)
+            chart_kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0]
+            for p in (marks.position, position)
         )
-        prior = replace(prior, origin=prior.origin + np.nan_to_num(after - before))  # NaN: behind its chart
+        change = np.nan_to_num(after - before)  # NaN: behind its chart
+        by_rig = prior.by_rig.copy()
+        if not whole:
+            by_rig[:, -1:] -= (prior.information[:, : change.size] @ change.ravel())[:, None]
+        prior = replace(prior, origin=prior.origin + change, by_rig=by_rig)
     rows = replace(s.rows, z=stereo.corrected("window", s.rows.z, correct))
     past = s.past.displaced(marks.serial, position - marks.position) if len(marks) else s.past
-    return replace(s, rows=rows, landmarks=replace(marks, position=position), prior=prior, past=past)
+    by_rig = marks.by_rig.copy()
+    if not whole:
+        by_rig[:, :, -1:] -= (position - marks.position)[:, :, None]
+    return replace(s, rows=rows, landmarks=replace(marks, position=position, by_rig=by_rig), prior=prior, past=past)

@@ -9,7 +9,7 @@ import numpy as np
 from backends.window.state import WindowState
 from slam.data import IndexArray
 from slam.models import EstimatorModels
-from slam.window.motion import LONGEST, RATIO, velocity_sigmas
+from slam.window.motion import LONGEST, RATIO, STANDS, velocity_sigmas
 from slam.window.problem import Motion, Places, Rows, Window
 from slam.window.stereo import RectifiedStereo
 
@@ -20,13 +20,15 @@ def motion_between(s: WindowState, models: EstimatorModels) -> Motion:
     follows = (np.diff(f) == 1) & (f[1:] != s.begun)
     before = np.concatenate([[False], follows[:-1]]) & follows
     begins = follows & (f[1:] == s.begun + 1)
-    i = np.flatnonzero(before | begins)  # what the motion model said of others is in the prior
+    rests = follows & s.rests[1:]
+    i = np.flatnonzero(before | begins | rests)  # what the motion model said of others is in the prior
     if not len(i):
         return Motion.none()
     earlier = np.where(before[i], dt[i - 1], 1.0)
-    first = ~before[i] | (dt[i] > RATIO * earlier)
+    first = ~before[i] | (dt[i] > RATIO * earlier) | rests[i]
     poses = np.stack([np.where(first, -1, i - 1), i, i + 1], axis=1)
-    return Motion(poses, np.stack([earlier, dt[i]], axis=1), 1 / velocity_sigmas(models, dt[i], first))
+    sigmas = np.where(rests[i, None], STANDS / dt[i, None], velocity_sigmas(models, dt[i], first))
+    return Motion(poses, np.stack([earlier, dt[i]], axis=1), 1 / sigmas)
 
 
 def problem(

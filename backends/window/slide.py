@@ -14,10 +14,12 @@ from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 from slam.window.marginal import Conditional, marginalised
-from slam.window.stereo import RectifiedStereo
+from slam.window.stereo import Field, RectifiedStereo
 
 
-def slid(s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, config: WindowConfig) -> WindowState:
+def slid(
+    s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, config: WindowConfig, field: Field
+) -> WindowState:
     """The state with one pose less.
 
     The oldest pose is the one that the prior is relative to, and stays for some frames; the next one leaves. Landmarks
@@ -59,14 +61,16 @@ def slid(s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, confi
         joining=np.flatnonzero(joins[active]),
     )  # fmt: skip
     ending = ends[s.prior.points]
-    prior, conditional, cost = marginalised(w, leaving, ending)
+    prior, conditional, cost = marginalised(w, leaving, ending, field(w.rows.z))
     past = s.past.with_one(_left(s, leaving, active[prior.points], s.prior.points[ending], conditional))
     stays = ~absorbed_row & (rows.pose != leaving)
     free = marks.information.copy()
     free[joins | ends] = 0.0
     s = replace(
         s, frames=np.delete(s.frames, leaving), stamps=np.delete(s.stamps, leaving),
+        rests=np.delete(s.rests, leaving),
         poses=np.delete(s.poses, leaving, axis=0), covariance=_without(s.covariance, leaving),
+        by_rig=np.delete(s.by_rig, 6 * leaving + np.arange(6), axis=0),
         rows=_earlier(rows.select(stays), leaving), places=_earlier(places.select(~absorbed_place), leaving),
         prior=replace(prior, points=active[prior.points]), cost=s.cost - cost, past=past,
         landmarks=replace(marks, information=free), solved=s.solved - (s.solved > leaving),

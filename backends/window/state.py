@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from backends.window.past import Past
-from slam.data import IdArray, IndexArray
+from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.table import LandmarkRows
 from slam.window.problem import Places, RelativePrior, Rows
@@ -25,12 +25,13 @@ class WindowLandmarks(LandmarkRows):
     last: IndexArray  # number of the frame that measured it last (S,)
     mean: Array  # what was known beforehand, in world coordinates, and is not in the prior yet: position (S, 3)
     information: Array  # and information (S, 3, 3), zero for nothing
+    by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
     @classmethod
-    def none(cls) -> WindowLandmarks:
+    def none(cls, m: int = 0) -> WindowLandmarks:
         """No landmark."""
         none, three, nine = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
-        return cls(none, none, three, nine, nine, none, three, nine)
+        return cls(none, none, three, nine, nine, none, three, nine, np.zeros((0, 3, m)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +40,10 @@ class WindowState:
 
     frames: IndexArray  # numbers of its frames (K,), ascending; the last one is the newest
     stamps: Array  # their times (K,) [s]
+    rests: BoolArray  # whether the camera stood since the frame before each (K,)
     poses: Array  # T_world_left (K, 4, 4)
     covariance: Array  # of the poses together (6 K, 6 K)
+    by_rig: Array  # derivatives of the poses by errors of the rig (6 K, m); of the first one, before it is there
     solved: int  # place in the window of the newest pose that was solved for
     begun: int  # number of the frame in which the present problem begins: the first, or that of a restart
     rows: Rows  # measurements, by place in the window and row of the landmark
@@ -54,12 +57,12 @@ class WindowState:
     contradicted: int = 0  # updates in succession in which most observations agreed on another pose than expected
 
     @classmethod
-    def empty(cls) -> WindowState:
-        """Before the first prediction."""
+    def empty(cls, by_rig: Array) -> WindowState:
+        """Before the first prediction; `by_rig` (6, m) is of the first pose."""
         none = np.zeros(0, np.int64)
         return cls(
-            none, np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 0)), 0, 0, Rows.none(), Places.none(),
-            RelativePrior.none(), 0.0,
+            none, np.zeros(0), np.zeros(0, bool), np.zeros((0, 4, 4)), np.zeros((0, 0)), by_rig, 0, 0, Rows.none(),
+            Places.none(), RelativePrior.none(), 0.0, WindowLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
 
     def revised_poses(self) -> dict[int, Array]:

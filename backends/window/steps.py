@@ -14,7 +14,7 @@ from backends.window.state import WindowLandmarks, WindowState, between
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, points_by_pose
-from slam.window import kernels, motion, pose_only
+from slam.window import chart_kernels, kernels, motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS
 from slam.window.problem import Places, RelativePrior, Rows, Window
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
@@ -34,22 +34,29 @@ class Steps(RectifiedMeasurement):
 
     config: WindowConfig  # limits
 
-    def predicted(self, s: WindowState, stamp: float) -> WindowState:
-        """With a pose at `stamp` [s], by the motion model. Where the window is full, a pose leaves it first."""
+    def predicted(self, s: WindowState, stamp: float, rests: bool) -> WindowState:
+        """With a pose at `stamp` [s], by the motion model, or that before if the camera rests.
+
+        Where the window is full, a pose leaves it first.
+        """
         if not len(s.frames):
             T = self.models.initial_pose
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
             P, one = np.diag(sigmas**2), np.array([stamp])
-            prior = RelativePrior.of_pose(T, P)
-            return replace(s, frames=np.zeros(1, np.int64), stamps=one, poses=T[None], covariance=P, prior=prior)
+            prior = RelativePrior.of_pose(T, P, s.by_rig)
+            return replace(
+                s, frames=np.zeros(1, np.int64), stamps=one, rests=np.zeros(1, bool), poses=T[None],
+                covariance=P, prior=prior,
+            )  # fmt: skip
         if len(s.frames) >= self.config.poses:
             try:
-                s = slid(s, self.stereo, self.models, self.config)
+                s = slid(s, self.stereo, self.models, self.config, self.field)
             except np.linalg.LinAlgError:  # covariances that differ by more than their digits, as after long gaps
                 s = _begun_anew(s, s.poses[-1], s.covariance[-6:, -6:])
         K, t = len(s.frames), s.stamps
         before = None if s.frames[-1] == s.begun else min(t[-1] - t[-2], motion.LONGEST)
-        T, by_last, noise, _ = motion.predicted(self.models, s.poses[-2:], before, min(stamp - t[-1], motion.LONGEST))
+        dt = min(stamp - t[-1], motion.LONGEST)
+        T, by_last, noise, _ = motion.predicted(self.models, s.poses[-2:], before, dt, rests)
         J = np.zeros((6, 6 * K))
         J[:, -12:] = by_last[:, -6 * K :]
         cross = J @ s.covariance
@@ -57,7 +64,9 @@ class Steps(RectifiedMeasurement):
         P = np.block([[s.covariance, cross.T], [cross, 0.5 * (own + own.T)]])
         return replace(
             s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp),
+            rests=np.append(s.rests, rests),
             poses=np.concatenate([s.poses, T[None]]), covariance=P, measured=False,
+            by_rig=np.concatenate([s.by_rig, J @ s.by_rig]),
         )  # fmt: skip
 
     def in_view(self, s: WindowState) -> tuple[IndexArray, Array, Array, Array]:
@@ -114,13 +123,13 @@ class Steps(RectifiedMeasurement):
         information = 0.5 * (information + np.swapaxes(information, 1, 2))
         new = WindowLandmarks(
             ids, s.serials + np.arange(len(ids)), positions, R.T @ covariances @ R, covariances, np.full(len(ids), -1),
-            positions, information,
+            positions, information, np.zeros((len(ids), 3, s.by_rig.shape[1])),
         )  # fmt: skip
         return _with(s, new)
 
     def placed(self, s: WindowState, ids: IdArray, local: Array, covariances: Array) -> WindowState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
-        s = _with_new(s, ids, local, covariances)
+        s = _with_new(s, ids, local, covariances, np.zeros((len(ids), 3, s.by_rig.shape[1])))
         points = np.arange(len(s.landmarks) - len(ids), len(s.landmarks))
         return replace(s, places=s.places.joined(_places(s, points, local, covariances)))
 
@@ -168,9 +177,9 @@ class Steps(RectifiedMeasurement):
             if not used.any():
                 raise np.linalg.LinAlgError("no observation agrees with the others")
         s = replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used])))
-        local, world = solution.point_covariances(len(s.frames) - 1)
+        relations = *solution.point_covariances(len(s.frames) - 1), solution.by_rig(self.field(solution.window.rows.z))
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
-        return _after(s, solution, active, local, world, points[used]), used, nis
+        return _after(s, solution, active, relations, points[used]), used, nis
 
     def _tested(self, w: Window, at: IndexArray, z: Array) -> tuple[Solution, Array]:
         """The solution, and how far points `at` (M,) are from their measurements z (M, 3) in the newest pose."""
@@ -204,8 +213,8 @@ def _with(s: WindowState, new: WindowLandmarks) -> WindowState:
     return replace(s, landmarks=s.landmarks.joined(new), serials=s.serials + len(new))
 
 
-def _with_new(s: WindowState, ids: IdArray, local: Array, covariances: Array) -> WindowState:
-    """With new landmarks at `local` (M, 3) in the newest camera."""
+def _with_new(s: WindowState, ids: IdArray, local: Array, covariances: Array, by_rig: Array) -> WindowState:
+    """With new landmarks at `local` (M, 3) in the newest camera, where errors of the rig move them by (M, 3, m)."""
     T, n = s.poses[-1], len(ids)
     R = T[:3, :3]
     by_pose = R @ points_by_pose(local)
@@ -214,6 +223,7 @@ def _with_new(s: WindowState, ids: IdArray, local: Array, covariances: Array) ->
     return _with(replace(s, measured=True), WindowLandmarks(
         ids, s.serials + np.arange(n), local @ R.T + T[:3, 3], turn @ covariances @ turn.T,
         0.5 * (world + np.swapaxes(world, 1, 2)), np.full(n, int(s.frames[-1])), np.zeros((n, 3)), np.zeros((n, 3, 3)),
+        R @ by_rig - by_pose @ s.by_rig[-6:],
     ))  # fmt: skip
 
 
@@ -221,9 +231,9 @@ def _places(s: WindowState, points: IndexArray, local: Array, covariances: Array
     """Landmarks `points` at `local` (M, 3) in the newest camera, with covariances (M, 3, 3)."""
     T = s.poses[-1]
     world = local @ T[:3, :3].T + T[:3, 3]
-    basis, _ = kernels.relative_charts(T, world)
+    basis, _ = chart_kernels.relative_charts(T, world)
     axes = np.tile(T[:3, :3], (len(local), 1, 1))
-    origin, D, _ = kernels.chart_changes(T, world, basis, axes)
+    origin, D, _ = chart_kernels.chart_changes(T, world, basis, axes)
     root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(D @ covariances @ np.swapaxes(D, 1, 2))), 1, 2)
     return Places(np.full(len(points), len(s.frames) - 1), points, basis, origin, np.ascontiguousarray(root))
 
@@ -232,8 +242,11 @@ def _begun_anew(s: WindowState, T: Array, P: Array) -> WindowState:
     """A window of the newest pose alone, which is T (4, 4) with covariance P (6, 6); landmarks stay as they are."""
     turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
     return replace(
-        s, frames=s.frames[-1:], stamps=s.stamps[-1:], poses=T[None], covariance=P, solved=0, begun=int(s.frames[-1]),
-        rows=Rows.none(), places=Places.none(), prior=RelativePrior.of_pose(T, P), cost=0.0, past=Past(),
+        s, frames=s.frames[-1:], stamps=s.stamps[-1:], rests=s.rests[-1:], poses=T[None], covariance=P, solved=0,
+        begun=int(s.frames[-1]),
+        by_rig=s.by_rig[-6:],
+        rows=Rows.none(), places=Places.none(), cost=0.0, past=Past(),
+        prior=RelativePrior.of_pose(T, P, s.by_rig[-6:]),
         landmarks=replace(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
     )  # fmt: skip
 
@@ -246,11 +259,12 @@ def _restarted(s: WindowState, T: Array, points: IndexArray) -> WindowState:
 
 
 def _after(
-    s: WindowState, solution: Solution, points: IndexArray, local: Array, world: Array, seen: IndexArray
-) -> WindowState:
+    s: WindowState, solution: Solution, points: IndexArray, relations: tuple[Array, Array, tuple[Array, Array]],
+    seen: IndexArray,
+) -> WindowState:  # fmt: skip
     """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
-    marks, w = s.landmarks, solution.window
-    there = replace(s, poses=w.poses, covariance=solution.pose_covariance)
+    marks, w, (local, world, (poses_by_rig, points_by_rig)) = s.landmarks, solution.window, relations
+    there = replace(s, poses=w.poses, covariance=solution.pose_covariance, by_rig=poses_by_rig)
     definite = (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
     known = points[definite]
     others = np.delete(np.arange(len(marks)), known)
@@ -260,5 +274,7 @@ def _after(
     position[points], last[seen] = w.points, s.frames[-1]
     own[others] = rest + by_pose @ between(there, s.solved) @ np.swapaxes(by_pose, 1, 2)
     own[known], whole[known] = local[definite], world[definite]
-    marks = replace(marks, position=position, local=own, world=whole, last=last)
+    by_rig = marks.by_rig.copy()
+    by_rig[points] = points_by_rig
+    marks = replace(marks, position=position, local=own, world=whole, last=last, by_rig=by_rig)
     return replace(there, cost=solution.cost, solved=len(s.frames) - 1, landmarks=marks)

@@ -80,7 +80,8 @@ class RigModel:
         the pose rotate with each revision, the ideal rig is rotated such that the left image as a whole does not move.
         """
         field, n = _field(points, self.focal), len(self.names)
-        return np.asarray(field[:, :, :n] + field[:, :, n:] @ self._gauge)
+        turned = field[:, :, n:].reshape(-1, 3) @ self._gauge
+        return np.asarray(field[:, :, :n] + turned.reshape(-1, 3, n))
 
     def shift(self, points: Array, parameters: Array) -> Array:
         """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,): ``field(points) @ parameters``."""

@@ -32,7 +32,7 @@ from slam.objects.points import (
     shape_of,
     with_shape,
 )
-from slam.window import kernels, pose_only
+from slam.window import chart_kernels, kernels, pose_only
 from slam.window.agreement import INFLATION
 from slam.window.problem import Places, Rows
 from slam.window.solver import Solution, linearised, solve
@@ -194,7 +194,7 @@ class BodyEstimator:
     def _predicted(self, b: BodyBelief, cameras: RecentPoses) -> BodyBelief:
         """With the covariances of a frame in which nothing was measured."""
         e = linearised(window(b, self.stereo, carried(b, cameras, self.models)))
-        solution = Solution(e.window, e, e.cost, 0)
+        solution = Solution(e.window, e, e.cost)
         local, _ = solution.point_covariances(len(b) - 1)
         return replace(b, covariance=solution.pose_covariance, points=replace(b.points, local=local))
 
@@ -362,8 +362,8 @@ def _places(frame: int, points: IndexArray, h: Array, shape: Shape) -> Places:
     those of the chart at h.
     """
     eye = np.eye(4)
-    basis, origin = kernels.relative_charts(eye, h)
-    _, D, _ = kernels.chart_changes(eye, h, basis, np.tile(np.eye(3), (len(h), 1, 1)))
+    basis, origin = chart_kernels.relative_charts(eye, h)
+    _, D, _ = chart_kernels.chart_changes(eye, h, basis, np.tile(np.eye(3), (len(h), 1, 1)))
     back = np.linalg.inv(D)
     information = np.swapaxes(back, 1, 2) @ np.linalg.inv(shape.covariance) @ back
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import turn
+from slam.kernels.linear import row_times, turn
 from slam.kernels.se3 import transform_back
+from slam.kernels.stereo import by_pose, residual
 from slam.runtime.compilation import helper, kernel
-from slam.window.kernels import ELIMINATED
+from slam.window.kernels import ELIMINATED, KNOWN
 
 
 @kernel
@@ -91,6 +92,83 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
             for j in range(3):
                 camera[c, i, j] += tmp[i, j] + tmp[j, i]
     return camera, world
+
+
+@kernel
+def rig_columns(
+    camera, poses, column, points, place, E, pose, point, z, weight, field, pose_of, cross, first, order,
+    inverse, B,
+):  # fmt: skip
+    """Add to B (n, m) how ``H x = b`` depends on m errors of the rig, which displace measurements by `field` (M, 3, m).
+
+    The rows are those of `slam.window.kernels.linearise`; `pose_of` (M + Q,) are the poses of rows and places. Returns
+    ``inverse gradient`` (N, 3, m) of the points that are eliminated.
+    """
+    m = B.shape[1]
+    gradient, own = np.zeros((len(points), 3, m)), np.zeros((len(points), 3, m))
+    q, r, D, F = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, m))
+    J, Jp = np.empty((3, 6)), np.empty((3, 3))
+    for row in range(len(pose)):
+        T, p, at = poses[pose[row]], point[row], column[pose[row]]
+        transform_back(T, points[p], q)
+        if weight[row] == 0.0 or not residual(camera, q, z[row], r, D):
+            continue
+        for i in range(3):
+            w = 0.0 if np.isnan(r[i]) else weight[row] * weight[row]
+            for k in range(m):
+                F[i, k] = w * field[row, i, k] if w > 0.0 else 0.0
+            by_pose(D[i], q, J[i])
+            x, y, h = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
+            for a in range(3):
+                Jp[i, a] = x * E[p, 0, a] + y * E[p, 1, a] + h * E[p, 2, a]
+        if at >= 0:
+            add_product(J, F, 6, 1.0, B[at : at + 6])
+        if place[p] != KNOWN:
+            add_product(Jp, F, 3, 1.0, gradient[p])
+    for p in range(len(points)):
+        if place[p] >= 0:
+            B[3 * place[p] : 3 * place[p] + 3] += gradient[p]
+        elif place[p] == ELIMINATED:
+            add_product(inverse[p], gradient[p], 3, 1.0, own[p])
+            for o in range(first[p], first[p + 1]):
+                at = column[pose_of[order[o]]]
+                if at >= 0:
+                    add_product(cross[order[o]].T, own[p], 6, -1.0, B[at : at + 6])
+    return own
+
+
+@helper
+def add_product(A, X, n, sign, out):
+    """Add ``sign Aᵀ X`` to out (n, m), for A (3, n) and X (3, m)."""
+    for i in range(n):
+        a, b, c = sign * A[0, i], sign * A[1, i], sign * A[2, i]
+        for k in range(X.shape[1]):
+            out[i, k] += a * X[0, k] + b * X[1, k] + c * X[2, k]
+
+
+@kernel
+def rig_points(column, place, E, pose_of, cross, first, order, inverse, own, X):
+    """Derivatives (N, 3, m) of points in the world by errors of the rig, given those of the unknowns X (n, m).
+
+    `own` (N, 3, m) is by `rig_columns`.
+    """
+    m = X.shape[1]
+    out, v, d = np.zeros((len(place), 3, m)), np.empty((3, m)), np.empty((3, m))
+    for p in range(len(place)):
+        if place[p] >= 0:
+            d[:] = X[3 * place[p] : 3 * place[p] + 3]
+        elif place[p] == ELIMINATED:
+            v[:] = 0.0
+            for o in range(first[p], first[p + 1]):
+                at = column[pose_of[order[o]]]
+                for half in range(0, 6 if at >= 0 else 0, 3):
+                    add_product(cross[order[o], half : half + 3], X[at + half : at + half + 3], 3, 1.0, v)
+            d[:] = own[p]
+            add_product(inverse[p], v, 3, -1.0, d)
+        else:
+            continue
+        add_product(E[p].T, d, 3, 1.0, out[p])
+    return out
 
 
 @kernel

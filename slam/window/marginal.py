@@ -8,7 +8,7 @@ import numpy as np
 
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.se3 import adjoint, inverse
-from slam.window import covariance_kernels, kernels
+from slam.window import chart_kernels, covariance_kernels
 from slam.window.problem import RelativePrior, Window
 from slam.window.solver import linearised
 
@@ -38,7 +38,9 @@ class Conditional:
         return (self.left @ x[:-6].reshape(-1, 3, 1))[:, :, 0], x[-6:]
 
 
-def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrior, Conditional, float]:
+def marginalised(
+    w: Window, pose: int, leaving: BoolArray, field: Array | None = None
+) -> tuple[RelativePrior, Conditional, float]:
     """Marginalise a pose and some of the prior's points out of a window, with all that is measured of them.
 
     The window holds just that: the prior, the rows of the pose that leaves and of the points that leave, and what else
@@ -48,6 +50,7 @@ def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrio
         w: the window, all poses free.
         pose: which pose leaves. If it is the first, the next one takes its place as the reference.
         leaving: which of the prior's points leave (D,).
+        field: derivatives (M, 3, m) of the rows' true measurements by errors of the rig; None for none.
 
     Returns:
         the prior on the other poses and the points that stay, in their order, then those that joined (points as
@@ -64,6 +67,8 @@ def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrio
     information, vector, mean, gain = covariance_kernels.schur_complement(
         e.H, e.b, np.flatnonzero(gone), np.flatnonzero(~gone)
     )
+    B = e.by_rig(np.zeros((len(w.rows), 3, 0)) if field is None else field)[0]
+    vectors = np.column_stack([vector, B[~gone] - gain.T @ B[gone]])  # of η, and of its derivatives
     if not (np.isfinite(mean).all() and np.isfinite(e.cost)):
         raise np.linalg.LinAlgError("what leaves a window cannot be marginalised")
     E = e.E[w.members]
@@ -72,10 +77,10 @@ def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrio
     members, poses = w.members[~points], np.delete(w.poses, pose, axis=0)
     D, n = len(members), len(information)
     if reference:
-        basis, _ = kernels.relative_charts(poses[0], w.points[members])
+        basis, _ = chart_kernels.relative_charts(poses[0], w.points[members])
     else:
         basis = w.basis[~points]
-    origin, change, by = kernels.chart_changes(poses[0], w.points[members], basis, conditional.stayed)
+    origin, change, by = chart_kernels.chart_changes(poses[0], w.points[members], basis, conditional.stayed)
     if not np.isfinite(origin).all():
         raise np.linalg.LinAlgError("a point of the prior is behind its chart")
     if reference:  # coordinates from another pose
@@ -86,13 +91,17 @@ def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrio
             (information[:, : 3 * D].reshape(n, D, 3).transpose(1, 0, 2) @ back).transpose(1, 0, 2).reshape(n, 3 * D)
         )
         information = np.concatenate([columns, information[:, 3 * D :]], axis=1)
-        vector = np.concatenate([(np.swapaxes(back, 1, 2) @ vector[: 3 * D].reshape(D, 3, 1)).ravel(), vector[3 * D :]])
+        turned = np.swapaxes(back, 1, 2) @ vectors[: 3 * D].reshape(D, 3, -1)
+        vectors = np.concatenate([turned.reshape(3 * D, -1), vectors[3 * D :]])
     # x = δ − A δ₀ of all but the reference
     relative = inverse(poses[0]) @ poses
     A = np.concatenate([-by.reshape(3 * D, 6), np.eye(6), adjoint(inverse(relative[1:])).reshape(-1, 6)])
     at = slice(3 * D, 3 * D + 6)
     V = information @ A
     information[:, at], information[at], information[at, at] = V, V.T, A.T @ V
-    vector[at] = A.T @ vector
-    prior = RelativePrior(members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vector)
+    vectors[at] = A.T @ vectors
+    prior = RelativePrior(
+        members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vectors[:, 0].copy(),
+        vectors[:, 1:].copy(),
+    )  # fmt: skip
     return prior, conditional, e.cost

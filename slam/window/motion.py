@@ -15,6 +15,7 @@ from slam.geometry.se3 import Array, pose, so3_exp, so3_left_jacobian, so3_log
 from slam.models import EstimatorModels
 
 LONGEST = 1000.0  # guard: time [s] after which a camera can be anywhere; more would only exhaust the digits
+STANDS = 1e-5  #: numerics: step [rad], [m] of a camera that stands; none at all would leave no information matrix
 RATIO = 1e4  #: numerics: of an interval to the one before it, from which on the earlier velocity tells nothing
 
 
@@ -32,7 +33,7 @@ def is_first(before: float | None, dt: float) -> bool:
 
 
 def predicted(
-    models: EstimatorModels, poses: Array, before: float | None, dt: float
+    models: EstimatorModels, poses: Array, before: float | None, dt: float, rests: bool = False
 ) -> tuple[Array, Array, Array, bool]:
     """The next pose by the motion model.
 
@@ -41,6 +42,7 @@ def predicted(
         poses: the last two (2, 4, 4); only the last counts where the velocity is unknown.
         before: time between them [s]; None where there is no earlier one.
         dt: time to the next [s].
+        rests: whether the camera stands: the pose is the last one.
 
     Returns:
         the pose (4, 4), its Jacobian (6, 12) by the perturbations of the last two, the noise (6, 6) that is added, and
@@ -48,6 +50,8 @@ def predicted(
     """
     J: Array = np.zeros((6, 12))
     T: Array = poses[-1].copy()
+    if rests:
+        return T, np.eye(6, 12, 6), STANDS**2 * np.eye(6), True
     first, by_velocity = is_first(before, dt), np.zeros_like(J[:, :6])
     if before is None or first:
         J[:, 6:] = np.eye(6)

@@ -65,9 +65,13 @@ def least_squares(problem: PoseProblem, start: Array) -> tuple[Array, Array]:
 
 def whitened_residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
     """`residuals` and Jacobians scaled to unit variance (M, 3), (M, 3, 6); zero where a pixel is missing."""
-    r, J = residuals(problem, T)
-    whitener = _whiteners(problem.noise, problem.z)
-    return (whitener @ np.nan_to_num(r)[:, :, None])[:, :, 0], whitener @ J
+    W, r, J = whitened(problem, T)
+    return (W @ np.nan_to_num(r)[:, :, None])[:, :, 0], W @ J
+
+
+def whitened(problem: PoseProblem, T: Array) -> tuple[Array, Array, Array]:
+    """What scales to unit variance (M, 3, 3), and `residuals`."""
+    return _whiteners(problem.noise, problem.z), *residuals(problem, T)
 
 
 def residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.geometry.arrays import Array, IndexArray
 from slam.table import Table
-from slam.window import kernels
+from slam.window import chart_kernels, kernels
 from slam.window.stereo import RectifiedStereo
 
 KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
@@ -129,6 +129,7 @@ class RelativePrior:
         relative: where each pose stood before the first (P, 4, 4); the first is the identity.
         information: Λ (n, n), n = 3 D + 6 P.
         vector: η (n,).
+        by_rig: derivative of η (n, m) by m errors of the rig.
     """
 
     points: IndexArray
@@ -138,19 +139,22 @@ class RelativePrior:
     relative: Array
     information: Array
     vector: Array
+    by_rig: Array
 
     @classmethod
-    def of_pose(cls, T: Array, covariance: Array) -> RelativePrior:
-        """The first pose is T (4, 4) with a covariance (6, 6)."""
+    def of_pose(cls, T: Array, covariance: Array, by_rig: Array | None = None) -> RelativePrior:
+        """The first pose is T (4, 4) with a covariance (6, 6), and derivative (6, m) by m errors of the rig."""
         none, information = np.zeros(0, np.intp), np.linalg.inv(covariance)
         information = 0.5 * (information + information.T)
-        return cls(none, np.zeros((0, 3, 3)), np.zeros((0, 3)), T, np.eye(4)[None], information, np.zeros(6))
+        by_rig = np.zeros((6, 0)) if by_rig is None else information @ by_rig
+        one = np.eye(4)[None]
+        return cls(none, np.zeros((0, 3, 3)), np.zeros((0, 3)), T, one, information, np.zeros(6), by_rig)
 
     @classmethod
     def none(cls) -> RelativePrior:
         """Nothing is known."""
         none = np.zeros(0, np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.eye(4), np.zeros((0, 4, 4))
-        return cls(*none, np.zeros((0, 0)), np.zeros(0))
+        return cls(*none, np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +201,9 @@ class Window:
         """Charts of `members` in the first pose's axes (D + J, 3, 3)."""
         if not len(self.joining):
             return self.prior.basis
-        return np.concatenate([self.prior.basis, kernels.relative_charts(self.poses[0], self.points[self.joining])[0]])
+        return np.concatenate(
+            [self.prior.basis, chart_kernels.relative_charts(self.poses[0], self.points[self.joining])[0]]
+        )
 
     @cached_property
     def place(self) -> IndexArray:

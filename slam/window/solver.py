@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from slam.geometry.arrays import Array, IndexArray
-from slam.window import covariance_kernels, kernels
+from slam.window import chart_kernels, covariance_kernels, kernels
 from slam.window.carried import carried_rows
 from slam.window.problem import Window
 
@@ -17,9 +17,8 @@ _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
 #: numerics: Decrease of the cost by a step with the last factor below which that step is the last; it leaves far less.
 CLOSE = 1e-2
-_NEAR = (
-    50.0  # numerics: the same for a step with a factor of its own, in units of `close`; it leaves the square of that
-)
+#: numerics: The same for a step with a factor of its own, in units of `close`; it leaves the square of that.
+_NEAR = 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +30,6 @@ class NormalEquations:
         H: information of the unknowns (n, n), lower triangle.
         b: (n,).
         cost: sum of squares of everything, with the prior's ``δᵀ Λ δ − 2 ηᵀ δ``.
-        squares: squared whitened residual of each row (M,).
         E: derivatives of points by their charts' coordinates (N, 3, 3).
         inverse: inverse information of each eliminated point (N, 3, 3).
         gradient: of each point by its own rows (N, 3).
@@ -42,7 +40,6 @@ class NormalEquations:
     H: Array
     b: Array
     cost: float
-    squares: Array
     E: Array
     inverse: Array
     gradient: Array
@@ -71,6 +68,20 @@ class NormalEquations:
         points = np.einsum("ni,nij,nj->", self.gradient, self.inverse, self.gradient)
         return x, float(x @ self.b + points)
 
+    def by_rig(self, field: Array) -> tuple[Array, Array]:
+        """Derivatives by m errors of the rig: of b (n, m), and of ``inverse gradient`` of each point (N, 3, m).
+
+        `field` (M, 3, m) are those of the rows' true measurements.
+        """
+        w, rows, m = self.window, self.window.rows, field.shape[2]
+        prior = _from_prior(w)
+        B = np.zeros((w.unknowns, m)) if prior is None else _placed(w, prior[1], w.prior.by_rig)
+        own = covariance_kernels.rig_columns(
+            w.stereo.intrinsics, w.poses, w.column, w.points, w.place, self.E, rows.pose, rows.point,
+            rows.z, rows.weight, field, w.pose_of_row, self.cross, *w.by_point, self.inverse, B,
+        )  # fmt: skip
+        return B, own
+
     def after(self, x: Array) -> Window:
         """The window after a step of the unknowns."""
         w = self.window
@@ -95,22 +106,11 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
     n, rows = w.unknowns, w.rows
     H, b = np.zeros((n, n)) if whole else np.empty((n, n)), np.zeros(n)
     cost = _begin_with_prior(w, H, b, whole)
-    E = kernels.charts(w.poses, centre, w.points, w.place, w.basis, 0)
+    E = chart_kernels.charts(w.poses, centre, w.points, w.place, w.basis, 0)
     squares, information, gradient, cross = kernels.linearise(
-        w.stereo.intrinsics,
-        w.poses,
-        w.column,
-        w.points,
-        w.place,
-        E,
-        rows.pose,
-        rows.point,
-        rows.z,
-        rows.weight,
-        whole,
-        H,
-        b,
-    )
+        w.stereo.intrinsics, w.poses, w.column, w.points, w.place, E, rows.pose, rows.point, rows.z, rows.weight, whole,
+        H, b,
+    )  # fmt: skip
     cost += float(squares.sum())
     if len(w.places):
         p = w.places
@@ -132,7 +132,27 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
     inverse = kernels.eliminate(
         w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, whole, H, b
     )  # fmt: skip
-    return NormalEquations(w, H, b, cost, squares, E, inverse, gradient, cross)
+    return NormalEquations(w, H, b, cost, E, inverse, gradient, cross)
+
+
+def _from_prior(w: Window) -> tuple[Array, Array] | None:
+    """δ (n,) of the prior, and its derivative (n, 6) by the first pose; None where a point has left its chart."""
+    prior, n = w.prior, len(w.prior.vector)
+    delta, A = np.empty(n), np.empty((n, 6))
+    covered = not n or kernels.prior_rows(
+        w.poses, w.points, prior.points, prior.T, prior.relative, prior.basis, prior.origin,
+        np.arange(len(prior.relative)), delta, A,
+    )  # fmt: skip
+    return (delta, A) if covered else None
+
+
+def _placed(w: Window, A: Array, pull: Array) -> Array:
+    """What pulls at the prior's δ (n, ...), at the window's unknowns; A (n, 6) as of `_from_prior`."""
+    D, J, n = 3 * len(w.prior.points), 3 * len(w.joining), len(pull)
+    out = np.zeros((w.unknowns, *pull.shape[1:]))
+    out[:D], out[D + J : n + J] = pull[:D], pull[D:]
+    out[D + J : D + J + 6] = A.T @ pull
+    return out
 
 
 def _begin_with_prior(w: Window, H: Array, b: Array, whole: bool) -> float:
@@ -140,16 +160,13 @@ def _begin_with_prior(w: Window, H: Array, b: Array, whole: bool) -> float:
     prior, n = w.prior, len(w.prior.vector)
     if not n:
         return 0.0
-    delta, A = np.empty(n), np.empty((n, 6))
-    there = np.arange(len(prior.relative))
-    if not kernels.prior_rows(
-        w.poses, w.points, prior.points, prior.T, prior.relative, prior.basis, prior.origin, there, delta, A
-    ):
+    found = _from_prior(w)
+    if found is None:
         return np.inf
+    delta, A = found
     D, J = 3 * len(prior.points), 3 * len(w.joining)
     pull = prior.vector - prior.information @ delta
-    b[:D], b[D + J : n + J] = pull[:D], pull[D:]
-    b[D + J : D + J + 6] = A.T @ pull
+    b[:] = _placed(w, A, pull)
     if whole:
         V, poses, reference = prior.information @ A, slice(D + J, n + J), slice(D + J, D + J + 6)
         H[:D, :D], H[poses, :D] = prior.information[:D, :D], prior.information[D:, :D]
@@ -167,13 +184,11 @@ class Solution:
         window: poses and points as found.
         equations: linearised next to the solution.
         cost: at the solution.
-        steps: number of factors that it took.
     """
 
     window: Window
     equations: NormalEquations
     cost: float
-    steps: int
 
     @cached_property
     def inverse_factor(self) -> Array:
@@ -187,6 +202,22 @@ class Solution:
         first = 3 * len(self.window.members)
         X = self.inverse_factor[first:, first:]
         return np.asarray(X.T @ X)
+
+    def by_rig(self, field: Array) -> tuple[Array, Array]:
+        """Derivatives by m errors of the rig of the free poses (6 F, m), perturbed on the right, and points (N, 3, m).
+
+        The errors are considered, not estimated (Schmidt, 1966): they add ``J Σ Jᵀ`` to a covariance, with their own Σ.
+
+        Args:
+            field: derivatives (M, 3, m) of the rows' true measurements.
+        """
+        w, e = self.window, self.equations
+        B, own = e.by_rig(field)
+        X = np.ascontiguousarray(dpotrs(e.factor, B, lower=0)[0]) if B.size else B
+        points = covariance_kernels.rig_points(
+            w.column, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, e.inverse, own, X
+        )
+        return X[3 * len(w.members) :], points
 
     def point_covariances(self, pose: int, points: IndexArray | None = None) -> tuple[Array, Array]:
         """Covariances (N, 3, 3) of points in the coordinates of a pose, and in the world; zero for known ones.
@@ -214,20 +245,20 @@ def solve(window: Window, close: float = CLOSE) -> Solution:
         numpy.linalg.LinAlgError: something is not determined, or a value is not finite.
     """
     now = linearised(window)
-    for taken in range(1, _STEPS + 1):
+    for _ in range(_STEPS):
         x, rest = now.step(now.factor)
         if rest < _NEAR * close:
-            return Solution(now.after(x), now, now.cost - rest, taken)
+            return Solution(now.after(x), now, now.cost - rest)
         following = _descended(now, x)
         if following is None:
-            return Solution(now.window, now, now.cost, taken)
+            return Solution(now.window, now, now.cost)
         x, rest = following.step(now.factor)
         if not np.isfinite(rest):
             raise np.linalg.LinAlgError("a window's step is not finite")
         if rest < close:  # so near the end the last factor serves once more
-            return Solution(following.after(x), now, following.cost - rest, taken)
+            return Solution(following.after(x), now, following.cost - rest)
         now = linearised(following.window)
-    return Solution(now.window, now, now.cost, _STEPS)
+    return Solution(now.window, now, now.cost)
 
 
 def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:

@@ -7,7 +7,7 @@ where there is no right pixel.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,14 @@ from slam.geometry.se3 import Array, adjoint, inverse
 from slam.models import EstimatorModels
 from slam.window.agreement import landmarks_pose
 from slam.window.gating import with_noise
+
+#: Derivatives (N, 3, m) of measurements (N, 3) by m errors of the rig: see `slam.interfaces.ConsideringBackend`.
+Field = Callable[[Array], Array]
+
+
+def no_field(z: Array) -> Array:
+    """The field of a rig that is exact: no errors."""
+    return np.zeros((*z.shape, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +91,17 @@ class RectifiedMeasurement:
 
     rig: StereoRig
     models: EstimatorModels
+    field: Field = field(default=no_field, kw_only=True)
 
     @cached_property
     def stereo(self) -> RectifiedStereo:
         """Projection by the rig."""
         return RectifiedStereo.of(self.rig)
 
-    def first_sight(self, ids: IdArray, z: Array, farthest: float = np.inf) -> tuple[Array, Array]:
+    def first_sight(self, ids: IdArray, z: Array, farthest: float = np.inf) -> tuple[Array, Array, Array]:
         """New landmarks in the left camera's coordinates (M, 3) [m], with covariances (M, 3, 3) (paper A, Eqs. 8, 10).
+
+        And their derivatives (M, 3, m) by errors of the rig.
 
         Args:
             ids: of the landmarks (M,), for the message.
@@ -106,7 +117,7 @@ class RectifiedMeasurement:
             raise MeasurementError(f"landmark {ids[bad][0]} has no right pixel or no positive depth")
         local = local * np.minimum(1.0, farthest / np.maximum(local[:, 2:], 1e-300))
         back = np.linalg.inv(self.stereo.project(local)[1])
-        return local, self.models.pixel_sigma**2 * back @ np.swapaxes(back, 1, 2)
+        return local, self.models.pixel_sigma**2 * back @ np.swapaxes(back, 1, 2), back @ self.field(z)
 
     def visible(self, T: Array, points: Array) -> IndexArray:
         """Which points (N, 3) in the world are in the angle of view from a pose T (4, 4) (paper A, Fig. 3)."""

@@ -16,7 +16,6 @@ from experiments.simulated_recording import true_recording
 from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
-from slam.geometry.trajectory import Trajectory
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.run.replay import replay
@@ -71,16 +70,6 @@ def test_online_the_pose_is_the_solved_one():
     )  # two solutions, each to its last step
 
 
-def test_removed_landmarks_still_count():
-    data = drive()
-    kept, removed = BatchBackend(RIG, MODELS), BatchBackend(RIG, MODELS)
-    run(kept, data)
-    run(removed, data)
-    removed.remove(removed.estimate().ids)
-    np.testing.assert_allclose(removed.trajectory().poses, kept.trajectory().poses, atol=1e-9)
-    assert len(removed.estimate().ids) == 0
-
-
 def test_landmarks_seen_once_are_the_smoothers():
     data = drive(1)
     backend = BatchBackend(RIG, MODELS)
@@ -121,15 +110,6 @@ def test_a_problem_that_cannot_be_solved_is_one_line(monkeypatch):
     with pytest.raises(SolverError, match="Indeterminant") as caught:
         backend.trajectory()
     assert "\n" not in str(caught.value)
-
-
-def test_the_trajectory_is_the_callers_own():
-    backend = BatchBackend(RIG, MODELS)
-    run(backend, drive(5))
-    first = backend.trajectory()
-    assert isinstance(first, Trajectory)
-    first.poses[:] = 0
-    assert np.abs(backend.trajectory().poses).max() > 0.9
 
 
 @pytest.mark.parametrize(

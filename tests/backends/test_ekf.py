@@ -11,7 +11,6 @@ from backends.ekf import EkfBackend
 from backends.ekf.landmarks import COORDINATES, gauge_jacobian
 from backends.ekf.motion import turning
 from backends.iekf import IekfBackend
-from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -22,7 +21,6 @@ from tests.backends.ekf_runs import (
     errors,
     halfway,
     nees,
-    predicted,
     turning_drive,
 )
 from tests.backends.scenes import RIG, Scene, cloud, observe, path, random_path, run, scene, step
@@ -55,10 +53,6 @@ def test_wrong_options_are_refused(options, message):
         EkfBackend(RIG, **options)
 
 
-def test_defaults_need_nothing_but_the_rig():
-    assert EkfBackend(RIG).predict(0.0).T_world_left.shape == (4, 4)
-
-
 # --- accuracy ---
 
 
@@ -69,23 +63,6 @@ def test_without_noise_the_path_is_exact(sigma):
     backend = EkfBackend(RIG, models)
     run(backend, data)
     assert errors(backend, data.poses).max() < 1e-4
-
-
-@pytest.mark.parametrize("measurement, dof", [("stereo", 3), ("left", 2)])
-def test_both_measurements_follow_the_camera(drive, measurement, dof):
-    backend = EkfBackend(RIG, MODELS, measurement=measurement)
-    reports = run(backend, drive)
-    assert errors(backend, drive.poses).max() < 0.15  # the left pixel alone lets the depth drift
-    assert all(r.dof == dof * len(r.used) for r in reports)
-
-
-def test_the_trajectory_is_not_revised(drive):
-    backend, known = EkfBackend(RIG, MODELS), set()
-    said = []
-    for stamp, _, seen in drive:
-        step(backend, stamp, seen, known)
-        said.append(backend.estimate(landmarks=False).T_world_left)
-    np.testing.assert_array_equal(backend.trajectory().poses, said)
 
 
 # --- landmarks that have left the state ---
@@ -224,34 +201,6 @@ def test_the_result_does_not_depend_on_blas_threads(drive):
             results.append(backend.estimate())
     np.testing.assert_array_equal(results[0].T_world_left, results[1].T_world_left)
     np.testing.assert_array_equal(results[0].covariances, results[1].covariances)
-
-
-def test_the_covariance_stays_positive_definite(drive):
-    """Some hundred updates from a standing camera, where every one shrinks the same directions."""
-    backend, seen = predicted(drive, 1, models=replace(MODELS, initial_velocity_sigma=15.0))
-    rng = np.random.default_rng(0)
-    local = RIG.project(drive.points[seen.ids])
-    for k in range(300):
-        noise = 0.5 * rng.standard_normal((2, len(seen), 2))
-        report = backend.update(Observations(seen.ids, local[0] + noise[0], local[1] + noise[1]))
-        assert report.status is UpdateStatus.OK
-        backend.predict(1.0 + 0.1 * k)
-    P = backend.state.covariance.dense
-    d = np.sqrt(np.diag(P))
-    assert np.linalg.eigvalsh(P / np.outer(d, d)).min() > 0
-
-
-def test_removal_leaves_the_others_untouched(drive):
-    backend, _ = halfway(drive, 20)
-    before = backend.estimate()
-    gone = before.ids[[0, 3, 7, -1]]
-    backend.remove(gone)
-    after = backend.estimate()
-    kept = ~np.isin(before.ids, gone)
-    np.testing.assert_array_equal(after.ids, before.ids[kept])
-    np.testing.assert_array_equal(after.positions, before.positions[kept])
-    np.testing.assert_array_equal(after.covariances, before.covariances[kept])
-    np.testing.assert_array_equal(after.covariance, before.covariance)
 
 
 def test_the_last_poses_are_known_together():

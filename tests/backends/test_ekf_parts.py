@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from backends.ekf.angles import CANONICAL, anchor, attitude, body_rate_derivative, pose_jacobian, reanchor
+from backends.ekf.angles import attitude, body_rate_derivative, pose_jacobian, reanchor
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, gauge_jacobian
 from backends.ekf.motion import EulerCamera
 from backends.ekf.solve import Jacobian, Linear, Measurement, System, UnsolvableError, Update, gate, solve
 from backends.ekf.state import FilterState
-from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.euler import angles, body_rate_matrix
 from slam.models import EstimatorModels, MotionModel
@@ -26,22 +25,6 @@ ATTITUDES = [np.array(phi) for phi in ([0.0, 0, 0], [0.3, -0.7, 2.0], [1.5, 1.2,
 
 
 # --- the angles' world ---
-
-
-def test_the_camera_starts_level_in_the_angles_world():
-    R = se3.so3_exp(np.array([0.4, -0.8, 2.0]))
-    R_world_angles, phi = anchor(R)
-    np.testing.assert_allclose(attitude(R_world_angles, phi), R, atol=1e-12)
-    np.testing.assert_allclose(phi, [np.pi / 2, 0, np.pi / 2], atol=1e-12)
-
-
-@pytest.mark.parametrize("axis, changes", [(1, 2), (0, 0), (2, 1)])  # heading: φz; up and down: φx; roll: φy
-def test_turning_about_one_camera_axis_changes_one_angle(axis, changes):
-    turn = np.zeros(3)
-    turn[axis] = 0.3
-    change = angles(CANONICAL @ se3.so3_exp(turn)) - angles(CANONICAL)
-    assert abs(change[changes]) == pytest.approx(0.3)
-    assert np.abs(np.delete(change, changes)).max() < 1e-12
 
 
 @pytest.mark.parametrize("phi", ATTITUDES)
@@ -155,26 +138,6 @@ def test_coordinates_there_and_back(coordinates):
         np.testing.assert_allclose(D, numeric, rtol=1e-4, atol=1e-4)
 
 
-def test_a_pixel_error_at_first_sight_is_linear_in_inverse_depth():
-    h = np.array([[3.0, -1.0, 60.0]])
-    anchor = np.eye(3, 4)[None]
-    z = RIG.project_stereo(h)[0]
-    c = [InverseDepth().of(anchor, RIG.triangulate(z[:, :2], z[:, [2, 1]] + [d, 0]))[0] for d in (-0.5, 0.0, 0.5)]
-    np.testing.assert_allclose(c[0] + c[2], 2 * c[1], atol=1e-12)
-
-
-def test_landmarks_keep_their_names():
-    marks = FilterLandmarks.at(
-        InverseDepth(), np.array([7, 3, 9, 1]), np.tile(np.eye(3, 4), (4, 1, 1)), np.full((4, 3), 2.0), 0
-    )
-    marks = marks.select(np.array([0, 3]))
-    assert marks.ids.tolist() == [7, 1] and marks.rows_of([1, 7]).tolist() == [1, 0]
-    with pytest.raises(MeasurementError, match="landmark 3 is not in the map"):
-        marks.rows_of([3])
-    with pytest.raises(MeasurementError, match="landmark 7 is in the map already"):
-        marks.require_new(np.array([4, 7]))
-
-
 # --- the covariance against the dense formulas ---
 
 
@@ -189,7 +152,7 @@ def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
     for i, block in enumerate([*noise, *known]):
         rows = slice(12 + 3 * i, 15 + 3 * i)
         P[rows, rows] += block
-    covariance = replace(Covariance.of_camera(camera).appended(J, noise), known=known)
+    covariance = replace(Covariance.of_camera(camera).appended(J, noise, np.zeros((11, 3, 0))), known=known)
     return covariance.rearranged(np.arange(7), np.arange(7, 11), np.arange(11, 14)), P
 
 
@@ -402,17 +365,6 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch)
     np.testing.assert_allclose(corrected(s, update), deviation * best.x, atol=1e-5)
     w = solution.system.w
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
-
-
-def test_more_iterations_never_raise_the_cost():
-    costs = []
-    for iterations in (2, 3, 5, 8):
-        s, update = far_off(iterations)
-        r = residuals(s, update, corrected(s, update))
-        costs.append(r @ r)
-    start = residuals(s, update, np.zeros(48))
-    assert costs[0] < start @ start and (np.diff(costs) <= 1e-9).all()
-    assert costs[-1] < 2 * 36
 
 
 def test_a_step_that_lowers_no_cost_is_no_information(monkeypatch):

@@ -101,14 +101,6 @@ def test_measuring_makes_the_map_better_and_its_covariances_fit(name):
     assert 0.5 < distances.mean() / 3 < 1.6  # 40 landmarks, correlated through the pose
 
 
-@pytest.mark.parametrize("name", ("ekf", "smoother", "window"))
-def test_left_pixels_alone_are_enough_in_a_prior_map(name):
-    scene = Scene(mono=True)
-    estimate = tracked(name, scene).estimate()
-    assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
-    assert squared_distance(estimate, scene.poses[-1]) < 25
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_inserted_and_never_seen_stays_as_it_is(name):
     scene = Scene(frames=6)
@@ -136,25 +128,12 @@ def test_filter_smoother_and_batch_agree():
     assert np.ptp(poses, axis=0).max() < 0.001
 
 
-def test_after_the_first_frame_serves_as_well():
-    scene = Scene()
-    for name in ("ekf", "smoother"):
-        estimate = tracked(name, scene, before=False).estimate()
-        assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
-
-
 def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt():
     scene = Scene()
     plain = tracked("smoother", scene).estimate()
     rebuilt = tracked("smoother", scene, disturb=lambda k, b: b.revise(lambda z: z) if k in (0, 5) else None).estimate()
     np.testing.assert_allclose(rebuilt.T_world_left, plain.T_world_left, atol=1e-3)  # of 15 mm
     np.testing.assert_allclose(rebuilt.positions, plain.positions, atol=1e-3)
-
-
-def test_the_smoother_with_a_lag_tracks_in_a_prior_map():
-    scene = Scene(frames=30)
-    estimate = tracked("smoother", scene, {"lag": 12}).estimate()
-    assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -11,7 +11,7 @@ from slam.geometry.se3 import exp, inverse, transform
 from tests.slam.scene import RIG
 
 
-@pytest.mark.parametrize("name", ["ekf", "smoother"])
+@pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "window"])
 def test_at_rest_neither_the_pose_nor_its_covariance_changes_and_the_velocity_is_zero(name):
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-1, 1, (30, 2)), rng.uniform(2, 5, 30)])

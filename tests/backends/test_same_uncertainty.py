@@ -45,7 +45,9 @@ def test_frames_that_see_nothing_at_uneven_times_leave_the_same_uncertainty(name
 
 def test_drift_adds_up_while_a_landmark_is_not_seen():
     none, certain = np.zeros((1, 3, 3)), 1e-4 * np.eye(3)[None]
-    marks = SmootherLandmarks.of(np.array([0]), 0, np.array([[0.0, 0.0, 5.0]]), certain, none, world=False)
+    marks = SmootherLandmarks.of(
+        np.array([0]), 0, np.array([[0.0, 0.0, 5.0]]), certain, none, False, np.zeros((1, 3, 0))
+    )
     unseen, drift = np.zeros(0, np.intp), np.diag([1e-6, 2e-6, 3e-6, 1e-5, 2e-5, 3e-5])
     once = marks.left_behind(unseen, np.eye(4), drift)
     twice = once.left_behind(unseen, np.eye(4), drift)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import gtsam
 import numpy as np
@@ -12,11 +11,9 @@ import pytest
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
 from slam.data import Observations, UpdateStatus
-from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
-from slam.testing import hostile
 from slam.window.pose_only import residual_noise
 from slam.window.stereo import RectifiedStereo
 from tests.backends.scenes import RIG, path, run, scene, step
@@ -115,44 +112,6 @@ def test_what_removed_landmarks_have_told_stays_known():
     assert np.linalg.eigvalsh(backend.estimate().covariance - P).max() > 0
 
 
-def test_frames_without_observations_and_a_time_gap():
-    data = drive(40)
-    backend = SmootherBackend(RIG, MODELS)
-    known: set[int] = set()
-    deviations = []
-    for k, (stamp, _, seen) in enumerate(data):
-        if 15 <= k < 20:
-            seen = Observations.empty()
-        if 28 <= k < 33:
-            continue  # no frame at all: a gap of 0.6 s
-        report = step(backend, stamp, seen, known)
-        deviations.append(np.sqrt(np.trace(backend.estimate(landmarks=False).covariance[3:, 3:])))
-        assert report.status is (UpdateStatus.OK if len(seen) and k else UpdateStatus.EMPTY)
-    assert (np.diff(deviations[14:20]) > 0).all(), "uncertainty grows while nothing is seen"
-    assert deviations[20] < 0.5 * deviations[19]
-    trajectory = backend.trajectory()
-    assert len(trajectory) == 35
-    moved, turned = errors(trajectory.poses, data.poses[np.r_[0:28, 33:40]])
-    # Frames without measurements: their motion noise is 0.5 m/s/√s over 0.5 s at most.
-    assert moved.max() < 0.3 and turned.max() < 0.2
-    assert moved[-5:].max() < 0.05 and turned[-5:].max() < 0.01
-
-
-def test_a_gap_of_minutes_is_bridged_by_the_landmarks():
-    data = drive(20)
-    backend, known = SmootherBackend(RIG, MODELS), set()
-    for stamp, _, seen in data:
-        step(backend, stamp, seen, known)
-    prediction = backend.predict(300.0)
-    assert np.isfinite(prediction.covariance).all() and np.isfinite(prediction.innovation).all()
-    last = data.observations[-1]
-    again = last.select(np.isin(last.ids, list(known)))
-    report = backend.update(again, guess=data.poses[-1])
-    assert report.status is UpdateStatus.OK and len(report.used) > 10
-    moved, turned = errors(backend.estimate().T_world_left, data.poses[-1])
-    assert moved < 0.05 and turned < 0.01
-
-
 def test_the_lag_bounds_what_is_kept_and_not_what_is_known():
     data = drive(120, points=600)
     full, lagged = (tracked(data, motion=0.0, **options) for options in ({"lag": None}, {"lag": 8, "past": 10}))
@@ -212,16 +171,6 @@ def test_the_last_poses_have_a_joint_covariance(motion):
     A = se3.adjoint(se3.inverse(found.poses[-2]) @ found.poses[-3])
     step_covariance = A @ P[:6, :6] @ A.T + P[6:, 6:] - A @ P[:6, 6:] - (A @ P[:6, 6:]).T
     assert 0 < np.trace(step_covariance[3:, 3:]) < 0.7 * np.trace(P[9:, 9:]), "errors that poses share cancel"
-
-
-def test_at_first_the_last_poses_are_fewer():
-    backend = SmootherBackend(RIG, MODELS)
-    with pytest.raises(MeasurementError, match="before the first predict"):
-        backend.recent(2)
-    backend.predict(0.0)
-    assert backend.recent(5).covariance.shape == (6, 6)
-    backend.predict(0.1)
-    assert backend.recent(5).covariance.shape == (12, 12)
 
 
 # --- measurements that are mended ---
@@ -285,16 +234,6 @@ def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
     moved = errors(relative, earlier)[0]
     assert moved[: first - 1].max() < 1e-9 and moved[first:].max() > 1e-3
     assert moved.max() < 0.05, "no step between what has left and what has not"
-
-
-def test_mending_needs_nothing_to_mend():
-    backend = SmootherBackend(RIG, MODELS)
-    backend.revise(lambda z: z)
-    backend.predict(0.0)
-    backend.revise(lambda z: z)
-    backend.add(next(iter(drive(2)))[2])
-    with pytest.raises(MeasurementError, match="finite"):
-        backend.revise(lambda z: z + np.nan)
 
 
 def test_whether_the_whole_path_follows_is_told_with_the_present_frame():
@@ -361,7 +300,3 @@ def test_a_map_may_be_looked_at_before_the_camera_is_in_it():
     wrong = Observations(ids, np.array([[600.0, 400], [10, 10], [20, 460]]), np.full((3, 2), np.nan))
     assert len(backend.update(wrong).rejected) == 3
     np.testing.assert_allclose(backend.estimate().covariances, covariances)
-
-
-def test_queries_are_pure_with_a_short_lag():
-    hostile.queries_are_pure(partial(SmootherBackend, lag=3, track=3, past=0))

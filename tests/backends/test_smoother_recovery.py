@@ -90,31 +90,6 @@ def test_one_failure_costs_nothing(break_solver, method, error):
     near_the_truth(backend, data)
 
 
-@pytest.mark.parametrize("lag", [None, 12])
-def test_failures_on_end_cost_their_frames(break_solver, lag):
-    data = drive()
-    break_solver("update", range(12, 16), ERRORS[0])
-    backend = SmootherBackend(RIG, MODELS, lag=lag, motion=0.0)
-    reports = run(backend, data)
-    failed = [r for r in reports if r.status is UpdateStatus.FAILED]
-    assert 1 <= len(failed) <= 3
-    for report in failed:
-        assert report.reason.startswith("smoother: the pose cannot be solved for: gtsam: Indeterminant")
-        assert "\n" not in report.reason and not len(report.used)
-    assert all(r.status is UpdateStatus.OK for r in reports[-4:])
-    near_the_truth(backend, data, factor=2)
-
-
-def test_recovery_is_the_same_every_time(break_solver):
-    data, ends = drive(), []
-    for _ in range(2):
-        break_solver("update", [7, 13], ERRORS[0])
-        backend = SmootherBackend(RIG, MODELS)
-        run(backend, data)
-        ends.append(backend.trajectory().poses)
-    np.testing.assert_array_equal(*ends)
-
-
 def test_impossible_measurements_do_not_end_a_run():
     """Random pixels for known landmarks, for some frames: gated, or solved as well as can be, but no exception."""
     data, known = drive(30), set()

@@ -7,18 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import backends
 from slam.calibration import RigModel, SelfCalibrationConfig
-from slam.calibration.consider import SchmidtFilter
 from slam.config import SystemConfig
-from slam.data import Observations, StereoFeatures
-from slam.geometry.se3 import inverse, log, transform
+from slam.data import StereoFeatures
+from slam.geometry.se3 import inverse, log
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "iekf", "smoother", "window")
+#: By which share of an error's effect each may be off: the smoother's landmarks are followed one by one.
+BACKENDS = {"ekf": 0.05, "iekf": 0.05, "smoother": 0.2, "window": 0.05}
 NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
 CONFIG = SystemConfig(
     models=EstimatorModels(pixel_sigma=0.3),
@@ -57,10 +56,9 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size):
     system, T_true = run(backend, delta)
     T = system.backend.estimate(landmarks=False).T_world_left
     actual = log(inverse(T) @ T_true)
-    predicted = system._session.rig_error.uncertainty.pose[:, : len(delta)] @ delta
+    predicted = system.backend.sensitivities([])[0][:, : len(delta)] @ delta
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
-    # what the landmarks' errors have in common is left out: up to a fifth, most of it across the way
-    assert np.linalg.norm(predicted - actual) < 0.25 * np.linalg.norm(actual)
+    assert np.linalg.norm(predicted - actual) < BACKENDS[backend] * np.linalg.norm(actual)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -73,9 +71,8 @@ def test_landmarks_move_as_their_sensitivities_say(backend):
         features, ids = cloud.features(T, k / 30)
         result = system.process_features(with_error(features, delta))
         points.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
-    marks = system._session.rig_error.uncertainty.landmarks
-    ids, by_rig = marks.ids, marks.by_rig
-    estimated = system.backend.positions(ids)
+    ids = system.landmarks.ids
+    estimated, by_rig = system.backend.positions(ids), system.backend.sensitivities(ids)[1]
     actual = cloud.points[[points[i] for i in ids.tolist()]] - estimated
     predicted = by_rig[:, :, : len(delta)] @ delta
     assert np.linalg.norm(predicted - actual) < 0.1 * np.linalg.norm(actual)
@@ -126,91 +123,5 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
         result = system.process_features(cloud.features(T, k / 30)[0])
     assert result.revision is not None
     np.testing.assert_array_equal(result.common.root[:-2, -1], mean)
-    in_path = system._session.rig_error.common(as_reported=False).root[:-2, -1]
+    in_path = system._session.rig_error.common(system.backend, as_reported=False).root[:-2, -1]
     np.testing.assert_array_equal(in_path, 0 * mean if revises else mean)
-
-
-def test_a_known_error_stays_in_a_path_that_is_not_revised():
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(2, 6, 40)])
-    ids = np.arange(40)
-    uncertainty = SchmidtFilter(MODEL, CONFIG.models, error_of("right_cx", 0.0))
-    none = np.zeros(0, np.int64)
-    for k, T in enumerate(path(10)):
-        uncertainty.observe(T, k / 30, ids, points)
-        uncertainty.change(ids, points, none)
-    step = error_of("right_cx", 1e-3)
-    before = uncertainty.pose[:, : len(step)] @ step
-    uncertainty.path_keeps(step, lambda wanted: points[wanted], landmarks_follow=True)
-    np.testing.assert_allclose(uncertainty.pose[:, -1], before, atol=1e-12)
-    uncertainty.observe(path(10)[-1], 10 / 30, ids, points)  # the landmarks moved with the pose: nothing brings it back
-    np.testing.assert_allclose(uncertainty.pose[:, -1], before, atol=1e-9)
-
-
-def there_and_back(delta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a filter takes the camera to be at the end of a way out, and back at the start; sensitivities there.
-
-    There are new landmarks every four frames; those of the start are seen again at the end only.
-    """
-    rng, none = np.random.default_rng(1), np.zeros(0, np.int64)
-    backend = backends.create("ekf", RIG, models=CONFIG.models)
-    uncertainty = SchmidtFilter(MODEL, CONFIG.models, 0.0 * delta)
-    points = np.column_stack([rng.uniform(-2, 2, (220, 2)), rng.uniform(3, 8, 220)])
-    points[:, 2] += 0.2 * (np.arange(220) // 20)
-    poses, sensitivities, known = [], [], set()
-    for k in range(41):
-        T, first = np.eye(4), 0 if k == 40 else 20 * (k // 4)
-        T[2, 3] = 0.0 if k == 40 else 0.05 * k
-        ids = np.arange(first, first + (20 if k == 40 else 40))
-        uv_left, uv_right = RIG.project(transform(inverse(T), points[ids]))
-        z = np.column_stack([uv_left, uv_right[:, 0]])
-        z = MODEL.rows(MODEL.points(z) - MODEL.field(MODEL.points(z)) @ delta)
-        seen = Observations(ids, z[:, :2].copy(), np.column_stack([z[:, 2], z[:, 1]]))
-        old = np.isin(ids, list(known))
-        backend.predict(k / 10)
-        used = backend.update(seen.select(old)).used
-        pose = backend.estimate(landmarks=False).T_world_left
-        uncertainty.observe(pose, k / 10, used, backend.positions(used))
-        backend.add(seen.select(~old))
-        uncertainty.change(ids[~old], backend.positions(ids[~old]), none)
-        known |= set(ids.tolist())
-        poses.append(pose)
-        sensitivities.append(uncertainty.pose[:, : len(delta)].copy())
-    return np.array([poses[39], poses[40]]), np.array([sensitivities[39], sensitivities[40]])
-
-
-def test_landmarks_of_the_start_bring_the_pose_back_as_they_do_in_a_filter():
-    step = error_of("yaw", 1e-4)
-    (before, J), (after, _) = there_and_back(-step), there_and_back(step)
-    actual = log(inverse(after) @ before)
-    predicted = J @ (2 * step)
-    assert np.linalg.norm(actual[1]) < 0.5 * np.linalg.norm(actual[0])  # the start is known again
-    for one, other in zip(predicted, actual):
-        assert np.linalg.norm(one - other) < 0.15 * np.linalg.norm(actual[0])
-
-
-def walked_after(blackout: int) -> float:
-    """The largest sensitivity of a walk that begins when the camera has seen nothing for so many frames.
-
-    Each landmark is seen in two frames of six.
-    """
-    rng, none, interval = np.random.default_rng(0), np.zeros(0, np.int64), 0.3
-    uncertainty = SchmidtFilter(MODEL, CONFIG.models, np.zeros(len(MODEL.names)))
-    ids, points = np.arange(60), np.column_stack([rng.uniform(-2, 2, (60, 2)), rng.uniform(3, 9, 60)])
-    poses, largest = path(400)[::10], 0.0
-    for k in range(blackout + 1):
-        uncertainty.observe(poses[0], interval * k, none, np.zeros((0, 3)))
-    uncertainty.change(ids, points, none)
-    for k, T in enumerate(poses[1:]):
-        local = transform(inverse(T), points)
-        view = RIG.left.in_image(RIG.project(local)[0]) & (local[:, 2] > 0.3)
-        seen = np.flatnonzero(view & ((ids + k) % 6 < 2))
-        uncertainty.observe(T, interval * (blackout + k + 1), ids[seen], points[seen])
-        largest = max(largest, float(np.abs(uncertainty.pose).max()))
-    return largest
-
-
-@pytest.mark.parametrize("blackout", [30, 400])
-def test_a_stretch_without_sight_changes_no_sensitivity(blackout):
-    """The walk begins where nothing is known of the pose in the world, and landmarks come and go."""
-    assert walked_after(blackout) == pytest.approx(walked_after(0), rel=1e-3)
