@@ -133,7 +133,7 @@ def require_status(report: UpdateReport, expected: UpdateStatus, what: str) -> N
     if not isinstance(status, UpdateStatus):
         require(
             False,
-            f"status of {what} is {status!r}, not slam.data.UpdateStatus.{expected.name}",
+            f"status of {what} is {status!r}, a {type(status).__name__}, not slam.data.UpdateStatus.{expected.name}",
         )
     require(status is expected, f"status of {what}: {status.value} {report.reason!r}, not {expected.value}")
 
