@@ -19,6 +19,7 @@ from slam.mapping.known_landmarks import in_front
 from slam.mapping.monocular import MonocularDepth, frame_covariance, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
+from slam.third_party import checked
 from slam.tracks.localizer import LandmarkMatches, Localizer
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView, expected_landmarks
@@ -95,7 +96,8 @@ class Mapper:
 
     def _view(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapView:
         """The map as the camera sees it."""
-        positions, pose = backend.positions(landmarks.ids), step.estimate.T_world_left
+        positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks))
+        pose = step.estimate.T_world_left
         return MapView.of(self.rig, pose, positions, step.features, self._localizer.pixel_sigma)
 
     def _count(self, landmarks: LandmarkTable, view: MapView, step: Step) -> LandmarkTable:

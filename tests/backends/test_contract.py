@@ -150,7 +150,7 @@ def test_a_status_that_is_a_word_is_told_from_the_right_one():
             return replace(report, status=str(report.status))
 
     failed = {found.check: found.failure for found in findings(Wordy, "runs") if found.failure}
-    assert failed["answers_are_as_documented"].endswith("Wordy.update: status must be a UpdateStatus, got str")
+    assert failed["answers_are_as_documented"].endswith("Wordy.update: status must be of type UpdateStatus, got str")
 
 
 @pytest.mark.parametrize(

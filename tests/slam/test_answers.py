@@ -51,7 +51,8 @@ ANSWERS = [
 def test_a_back_end_of_nonsense_is_named(method, change, words):
     system = StereoSlam(RIG, "surf", Changed(method, change))
     with pytest.raises(SlamError, match=f"Changed.{words}"):
-        system.process(LEFT, RIGHT, 0.0)
+        for stamp in (0.0, 0.1):  # positions are asked for once there are landmarks
+            system.process(LEFT, RIGHT, stamp)
 
 
 class Spoilt(SurfFrontend):

@@ -91,5 +91,5 @@ def test_whatever_is_called_first_uses_one_thread(name, part, monkeypatch, tmp_p
             runner.run(sequence, runner.RunOptions("ekf", "surf", SystemConfig(), tmp_path))
         else:
             with pytest.raises(SlamError, match="no recording"):  # two frames show nothing of a rig
-                calibrating.calibrate([sequence], calibrating.Targets(tmp_path / "rig.yaml"), show_nothing)
+                calibrating.calibrate([sequence], tmp_path / "rig.yaml", show_nothing)
     assert set(found) == {1}
