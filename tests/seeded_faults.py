@@ -91,11 +91,11 @@ FAULTS = (
     ),
     Fault(
         "the prior's information vector is not moved with its reference", "slam/window/marginal.py",
-        "vector[at] = A.T @ vector", "vector[at] = 0.0",
+        "vectors[at] = A.T @ vectors", "vectors[at] = 0.0",
         "tests/slam/window tests/backends/test_window.py",
     ),
     Fault(
-        "a point's derivative by inverse distance forgets its direction", "slam/window/kernels.py",
+        "a point's derivative by inverse distance forgets its direction", "slam/window/chart_kernels.py",
         "E[m, i, 2] = -(e[i, 2] + a * e[i, 0] + b * e[i, 1]) * r * r", "E[m, i, 2] = -e[i, 2] * r * r",
         "tests/slam/window tests/backends/test_window.py",
     ),

@@ -91,8 +91,8 @@ def marginalised(
             (information[:, : 3 * D].reshape(n, D, 3).transpose(1, 0, 2) @ back).transpose(1, 0, 2).reshape(n, 3 * D)
         )
         information = np.concatenate([columns, information[:, 3 * D :]], axis=1)
-        turned = np.swapaxes(back, 1, 2) @ vectors[: 3 * D].reshape(D, 3, -1)
-        vectors = np.concatenate([turned.reshape(3 * D, -1), vectors[3 * D :]])
+        turned = np.swapaxes(back, 1, 2) @ vectors[: 3 * D].reshape(D, 3, vectors.shape[1])
+        vectors = np.concatenate([turned.reshape(3 * D, vectors.shape[1]), vectors[3 * D :]])
     # x = δ − A δ₀ of all but the reference
     relative = inverse(poses[0]) @ poses
     A = np.concatenate([-by.reshape(3 * D, 6), np.eye(6), adjoint(inverse(relative[1:])).reshape(-1, 6)])

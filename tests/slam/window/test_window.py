@@ -210,3 +210,10 @@ def test_what_nothing_determines_is_refused():
     w = window(prior=RelativePrior.none())
     with pytest.raises(np.linalg.LinAlgError):
         solve(replace(w, rows=w.rows.select(w.rows.pose != 2)))
+
+
+def test_a_reference_that_leaves_without_points_leaves_a_prior_of_poses():
+    w = window(prior=RelativePrior.of_pose(truth()[0][0], START, np.zeros((6, 2))))
+    part = replace(w, rows=w.rows.select(w.rows.pose == 0))
+    prior = marginalised(part, 0, np.zeros(0, bool), np.zeros((len(part.rows), 3, 2)))[0]
+    assert len(prior.points) == 0 and prior.by_rig.shape == (len(prior.vector), 2)
