@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -30,7 +29,7 @@ _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "
 _DEGREES = 5, 3
 RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
 _FIRST, _SECOND = np.array(RESIDUAL).T.copy()
-_SCALES = np.sqrt((2 * _FIRST + 1) * (2 * _SECOND + 1))  # for a mean square of one
+_SCALES = np.sqrt((2 * _FIRST + 1) * (2 * _SECOND + 1))  # for a mean square of one over the image
 
 
 class RigModel:
@@ -134,10 +133,11 @@ class RigModel:
 
     def _polynomials(self, x: Array, y: Array) -> Array:
         """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
+        from slam.calibration.model_kernels import polynomials
+
         # 1.1: polynomials are held constant beyond the image, this many half widths from its centre
-        at = np.clip((np.column_stack([x, y]) - self._centre) / self._half, -1.1, 1.1)
-        by_x, by_y = (legvander(v, n).T for v, n in zip(at.T, _DEGREES))
-        return np.asarray((by_x[_FIRST] * by_y[_SECOND]).T * _SCALES)
+        at = (np.stack([x, y]) - self._centre[:, None]) / self._half[:, None]
+        return np.asarray(polynomials(at, 1.1, _FIRST, _SECOND, _SCALES)).T
 
 
 def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
