@@ -37,7 +37,7 @@ def fit(first, second, R, t, focal, noise, median):
         for p in range(n):
             weights[p] = square(information[p], residual[p])
         ordered = np.sort(weights)
-        if not np.isfinite(ordered[n - 1]):  # NaN is sorted to the end
+        if n == 0 or not np.isfinite(ordered[n - 1]):  # NaN is sorted to the end
             last = np.inf
             break
         # 0.2: no less than a fifth of the configured noise
