@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import cv2
@@ -359,7 +358,7 @@ def test_cameras_that_are_not_calibrated(change: dict, words: str, tmp_path: Pat
 
 
 def test_without_the_package_the_line_says_how_to_install_it(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    monkeypatch.setattr("slam.sequences.ros_bag.find_spec", lambda name: None)
     with pytest.raises(SequenceError, match=r"pip install 'surf-stereo-slam\[ros\]'"):
         slam.open_sequence(bag)
 
