@@ -6,7 +6,7 @@ of the two χ² over the window, a log-likelihood ratio, decides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -18,6 +18,7 @@ from slam.data import BoolArray
 from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
+from slam.objects.frame import Frame
 from slam.objects.points import MAX_REJECTIONS
 from slam.objects.track_kernels import (
     improve_members,
@@ -121,20 +122,19 @@ def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
     fit_positions(tracks, rows)
 
 
-def update_members(
-    bodies: Mapping[int, Body], resolved: Set[int], tracks: Tracks, slot: int, config: ObjectsConfig
-) -> dict[int, Array]:
-    """Add the tracks that fit a body to its members, and remove those that do not, in place.
+def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, Array]:
+    """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
 
-    Inside a `resolved` body no proof of motion is needed. For bodies farther away depth noise is larger than the body,
-    so that all around it seems to lie inside.
+    Inside a body that stereo resolves no proof of motion is needed. For bodies farther away depth noise is larger than
+    the body, so that all around it seems to lie inside.
 
     Returns:
         by body, by how much χ² it explains its seen members better than the still world (K,).
     """
-    gains = {}
+    gains, config = {}, frame.setup.config
+    bodies = {id: body for id, body in every.items() if body.measured}
     for body in bodies.values():
-        _improve(body, tracks, slot)
+        _improve(body, tracks, frame.slot)
         gains[body.id] = _expel(body, tracks, config)
     if not bodies:
         return gains
@@ -145,7 +145,7 @@ def update_members(
         near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
         if not len(near):
             continue
-        gain = _gain_of_joining(body, body.id in resolved, tracks, free[near])
+        gain = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
     for body in bodies.values():

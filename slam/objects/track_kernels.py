@@ -15,6 +15,7 @@ from slam.runtime.compilation import helper, kernel
 
 _RIDGE = 1e-9  # numerics: share of the trace, for information over a whole window, and
 _PART = 1e-6  # numerics: for a part of it
+_UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _LEAST = 1e-12  # numerics: and this for windows that are empty
 
 
@@ -382,7 +383,7 @@ def improve_members(A, p, anchor, rows, slot, T, local, information):
 
 
 @kernel
-def members_ahead(local, information, rows, T, P_body, least):
+def members_ahead(local, information, rows, T, P_body):
     """Where a body's points are (M, 3), in world coordinates, and their covariances (M, 3, 3).
 
     Args:
@@ -391,7 +392,6 @@ def members_ahead(local, information, rows, T, P_body, least):
         rows: of the body's tracks.
         T: pose of the body (4, 4).
         P_body: its covariance (6, 6), body axes.
-        least: information that is added to that of every point.
     """
     points, P = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
     own, J, JP = np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 6))
@@ -404,7 +404,7 @@ def members_ahead(local, information, rows, T, P_body, least):
                 JP[i, j] = 0.0
                 for k in range(6):
                     JP[i, j] += J[i, k] * P_body[k, j]
-        invert_symmetric(information[rows[m]], least, own)
+        invert_symmetric(information[rows[m]], _UNKNOWN, own)
         for i in range(3):
             for j in range(3):
                 for k in range(6):

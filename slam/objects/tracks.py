@@ -17,7 +17,6 @@ from slam.geometry.se3 import Array
 from slam.objects.track_kernels import constant_velocities, fit_fixed_points, leave_window
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
-LEAST_INFORMATION = 1e-6  #: numerics: on a member's point that has none yet [1/m²]
 MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
 AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
 EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain, may leave of what moves with it
@@ -83,6 +82,10 @@ class Tracks:
     def count(self, rows: NDArray[np.intp]) -> IdArray:
         """Number of measurements of tracks in the window (M,)."""
         return np.asarray(np.count_nonzero(self.dof[rows], axis=1))
+
+    def select(self, rows: NDArray[np.intp]) -> Tracks:
+        """A table of some of them."""
+        return Tracks(*(getattr(self, f.name)[rows] for f in fields(Tracks)))
 
     def begin(self, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], points: Array) -> NDArray[np.intp]:
         """Begin tracks at features whose points in world coordinates are `points` (M, 3); returns their rows (M,)."""
