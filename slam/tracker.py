@@ -98,16 +98,19 @@ class Tracker:
             index, aligned, replace(corrected, images=None), prediction, landmarks, matches, standing, tracking,
             state.atlas,
         )  # fmt: skip
-        suspects = self._suspects(step)
+        suspects = self._suspects(state, step)
         moving = isin(matches.ids, suspects)
         return replace(step, matches=matches.select(~moving), withheld=matches.select(moving), suspects=suspects)
 
-    def _suspects(self, step: Step) -> IdArray:
+    def _suspects(self, state: State, step: Step) -> IdArray:
         """Ids of landmarks that may move; while the camera stands, all matched ones that do not stay where they are."""
         ids, rows = step.matches.ids, step.matches.rows
         if step.standing.stands:
             return ids[~isin(rows, step.standing.witnesses)]
-        moving = self.objects.newly_moving(step.features, ids, rows, step.pose)
+        ages = step.index - step.landmarks.last_seen[step.landmarks.rows(ids)]
+        moving = self.objects.newly_moving(
+            step.features, ids, rows, ages, lambda ids: _positions(state, ids), step.pose
+        )
         return np.union1d(self.objects.suspects, moving)
 
     def update(self, state: State, step: Step) -> Step | Elsewhere:
@@ -146,7 +149,6 @@ class Tracker:
     def manage(self, state: State, step: Step, frontend: Frontend | None) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
         step = self._session.mapper.update(state.backend, step)
-        self.objects.mapped(step.added.ids, step.added.rows)
         seen, T = step.matches.joined(step.added), step.estimate.T_world_left
         landmarks = self._aligner.with_patches(frontend, step.measured, seen, step.landmarks, T)
         new = step.added.ids[~isin(step.added.ids, step.erased)]

@@ -20,6 +20,7 @@ from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.config import ObjectsConfig
 from slam.objects.estimates import reported
 from slam.objects.estimator import FRAMES, BodyEstimator
+from slam.objects.first_frames import FirstSights, Places, moving_landmarks
 from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.measurement import measure
@@ -61,6 +62,7 @@ class MovingObjectDetector:
         self._stamps = np.full(window, np.nan)
         self._poses = np.tile(np.eye(4), (window, 1, 1))  # of the left camera in the window's frames
         self._number = -1
+        self._first = FirstSights.none()
         self._path: RecentPoses | None = None
         self._regions = Regions.none()
 
@@ -70,22 +72,16 @@ class MovingObjectDetector:
         revise_tracks(self.tracks, self.bodies, self._poses, slot, self.setup.rig, correct)
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, T_world_left: Array
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
+        T_world_left: Array,
     ) -> IdArray:  # fmt: skip
         """See `slam.objects.modes.ObjectDetector`."""
-        number, poses, stamps = self._number + 1, self._poses.copy(), self._stamps.copy()
-        poses[number % len(poses)], stamps[number % len(poses)] = T_world_left, features.stamp
-        nothing = RecentPoses(np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 0)))
-        frame = Frame(self.setup, number, features, np.zeros((0, 3)), stamps, poses, nothing)
-        return finder.newly_moving(frame, self.tracks, ids, rows)
-
-    def mapped(self, ids: IdArray, rows: IndexArray) -> None:
-        """See `slam.objects.modes.ObjectDetector`."""
-        seen = np.flatnonzero(self.tracks.seen)
-        landmark = np.full(int(max(self.tracks.row.max(initial=-1), rows.max(initial=-1))) + 1, -1)
-        landmark[rows] = ids
-        new = seen[landmark[self.tracks.row[seen]] >= 0]
-        self.tracks.landmark[new] = landmark[self.tracks.row[new]]
+        s, now = self.setup, self._number + 1
+        if not 0 < now < s.config.window:
+            return NO_IDS
+        pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
+        self._first = self._first.after(ids, places, np.maximum(now - ages, 0))
+        return ids[moving_landmarks(s.rig, T_world_left, self._first.of(ids), pixels, now, s.sigma, s.config)]
 
     def step(
         self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,
@@ -102,6 +98,8 @@ class MovingObjectDetector:
         self._fit(frame)
         self._change_members(frame)
         found = finder.find_groups(frame, tracks, self.bodies)
+        suspected = tracks.landmark[found.suspects]
+        self.suspects = suspected[suspected >= 0]
         for group in found.groups:
             moving = finder.lasting(group, tracks, frame)
             new = finder.moving_group(frame, tracks, moving) if len(moving) else None
@@ -112,8 +110,6 @@ class MovingObjectDetector:
         self._prove(frame, found.scene)
         self._begin_estimates(frame)
         self._begin_tracks(frame, landmark)
-        doubted = np.union1d(tracks.landmark[found.suspects], tracks.landmark[tracks.body >= 0])
-        self.suspects = doubted[doubted >= 0]
         return self._motion_labels(frame), reported(self.bodies, tracks, self.setup.config)
 
     def _begin(self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Frame:

@@ -7,19 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.data import BoolArray, IdArray, IndexArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import among
-from slam.geometry.pnp import measurement_rows
 from slam.geometry.se3 import Array, points_by_pose
 from slam.objects import membership
 from slam.objects.bodies import Body, in_body_axes, new_body
 from slam.objects.frame import Frame
-from slam.objects.measurement import measure
 from slam.objects.points import compact
-from slam.objects.scene import LAG, Scene, classify_scene, displacements, known_well, tail
+from slam.objects.scene import LAG, Scene, classify_scene, displacements, known_well
 from slam.objects.tracks import Tracks, constant_velocity, fit_velocities
 
-_LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 
@@ -83,30 +80,6 @@ def _classified(frame: Frame, tracks: Tracks, rows: IndexArray, body: Body | Non
     if body is not None:
         moved = replace(moved, points=(tracks.position[rows] - body.T[:3, 3]) @ body.T[:3, :3])
     return rows, classify_scene(moved, place, c.suspect, c.min_support)
-
-
-def newly_moving(frame: Frame, tracks: Tracks, ids: IdArray, rows: IndexArray) -> IdArray:
-    """Those of the landmarks `ids` (K,), seen as the features `rows` (K,), that do not move as the rest did just now.
-
-    The test is that of the scene, before the camera's pose in this frame is known, with the newest measurement against
-    all before. Noise is no larger than these displacements themselves show.
-    """
-    s, c = frame.setup, frame.setup.config
-    named = np.flatnonzero((tracks.landmark >= 0) & (tracks.body < 0))
-    common, at, here = np.intersect1d(tracks.landmark[named], ids, return_indices=True)
-    mine = named[at]
-    z = measurement_rows(frame.features.uv_left[rows[here]], frame.features.uv_right[rows[here]])
-    points, A, dof = measure(s.rig, frame.T_world_left, tracks.position[mine], z, s.sigma)
-    table = tracks.select(mine[dof == 3])
-    table.A[:, frame.slot], table.dof[:, frame.slot] = A[dof == 3], 3
-    table.p[:, frame.slot] = points[dof == 3] - table.anchor
-    known, place = known_well(table, np.arange(len(table)), frame.T_world_left, 2)
-    moved = displacements(table, known, frame.ages, frame.poses[:, :3, 3], s.slide, recent=1)
-    scene = classify_scene(moved, place, c.suspect, c.min_support, (_LEAST_NOISE / s.sigma) ** 2)
-    moves = ~scene.rest
-    if frame.number < c.window:  # later a track that moves by itself is found once it is long enough
-        moves |= scene.alone > c.doubtful * tail(scene.alone[scene.rest])
-    return np.asarray(common[dof == 3][known[moves]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
-from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.frame import Frame
 from slam.objects.pixel_kernels import best_of_products, continue_tracks
 from slam.objects.regions import Regions
-from slam.objects.track_kernels import members_ahead
 from slam.objects.tracks import Tracks
 
+_UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 
 
@@ -77,9 +77,10 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
     tracks.covariance[moves] += dt**2 * tracks.velocity_covariance[moves]
     for body in bodies.values():
         mine = np.flatnonzero(tracks.body == body.id)
-        tracks.position[mine], tracks.covariance[mine] = members_ahead(
-            tracks.local, tracks.local_information, mine, body.T, body.covariance
-        )
+        R, J = body.T[:3, :3], points_by_pose(tracks.local[mine])
+        own = np.linalg.inv(tracks.local_information[mine] + _UNKNOWN * np.eye(3))
+        spread = own + J @ body.covariance @ np.swapaxes(J, 1, 2)
+        tracks.position[mine], tracks.covariance[mine] = transform(body.T, tracks.local[mine]), R @ spread @ R.T
 
 
 @dataclass(frozen=True, eq=False)

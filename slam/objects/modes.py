@@ -14,6 +14,7 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.objects.config import ObjectsConfig
+from slam.objects.first_frames import Places
 from slam.objects.revision import CorrectRows
 
 
@@ -29,20 +30,19 @@ class ObjectDetector(Protocol):
         ...
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, T_world_left: Array
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
+        T_world_left: Array,
     ) -> IdArray:  # fmt: skip
-        """Ids of landmarks that begin to move in this frame, besides `suspects`.
+        """Ids of landmarks that move in the run's first frames, before it is known what moves: see `suspects`.
 
         Args:
             features: of the frame, before the back end's update.
             ids: of the landmarks found in it (K,).
             rows: of their features (K,).
+            ages: frames since each was last measured, or joined the map (K,).
+            places: gives the positions of landmarks (K, 3) in the world [m] by their ids.
             T_world_left: the camera's pose (4, 4), as far as it is known.
         """
-        ...
-
-    def mapped(self, ids: IdArray, rows: IndexArray) -> None:
-        """Take note that features (K,) of the last step's frame became landmarks with these ids."""
         ...
 
     def restart(self) -> None:
@@ -79,13 +79,11 @@ class NoDetector:
     suspects: IdArray = np.zeros(0, np.int64)
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, T_world_left: Array
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
+        T_world_left: Array,
     ) -> IdArray:  # fmt: skip
         """None does."""
         return self.suspects
-
-    def mapped(self, ids: IdArray, rows: IndexArray) -> None:
-        """Landmarks are not followed."""
 
     def restart(self) -> None:
         """There is nothing to forget."""

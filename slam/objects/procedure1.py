@@ -26,6 +26,7 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
+from slam.objects.first_frames import Places
 from slam.objects.following import match_far
 from slam.objects.revision import CorrectRows
 
@@ -241,13 +242,11 @@ class Procedure1Detector:
         self._last: tuple[float, Array] | None = None
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, T_world_left: Array
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
+        T_world_left: Array,
     ) -> IdArray:  # fmt: skip
         """None is known to."""
         return self.suspects
-
-    def mapped(self, ids: IdArray, rows: IndexArray) -> None:
-        """Landmarks are not followed."""
 
     def restart(self) -> None:
         """The database goes on; the last pose does not."""

@@ -22,17 +22,16 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, hat
 from slam.objects import scene_kernels as kernels
-from slam.objects.track_kernels import displaced, places_known
+from slam.objects.track_kernels import displaced
 from slam.objects.tracks import Tracks, times_vectors
 
 LAG = 4  #: frames between the older and the recent measurements, about
-_RECENT = 5  # frames that are recent, at most
+_RECENT = 5  # frames that are recent, at most; of short tracks the later half
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _TAIL = 3.0  # tracks; see `limit`
 _UPPER_QUARTILE = chi_square_limit(3, 0.75)  # of χ²(3)
@@ -84,7 +83,7 @@ class Scene:
 
 def displacements(
     tracks: Tracks, rows: IndexArray, ages: IndexArray, centres: Array, slide: float,
-    body: tuple[Array, Array, BoolArray] | None = None, recent: int = _RECENT,
+    body: tuple[Array, Array, BoolArray] | None = None,
 ) -> Displacements:  # fmt: skip
     """How far tracks (N,) went in the world, or in the axes of a body.
 
@@ -95,28 +94,27 @@ def displacements(
         centres: positions of the left camera by slot (W, 3).
         slide: variance of a feature's direction with the angle from which it is seen [rad].
         body: what they measured in its axes, from `slam.objects.bodies.in_body_axes`; None for the world.
-        recent: so many frames are recent, at most; of short tracks the later half.
     """
     t = tracks
     rays = t.position[rows] - centres[int(np.argmin(ages))]
     if body is None:
         older = t.older_A, t.older_b, t.older_age
-        return Displacements(rays, *displaced(t.A, t.p, t.dof, *older, rows, ages, recent, rays, centres, slide))
+        return Displacements(rays, *displaced(t.A, t.p, t.dof, *older, rows, ages, _RECENT, rays, centres, slide))
     points, A, known = body
     n = len(rows)
     none = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
     dof = np.where(known, t.dof[rows], 0).astype(np.int8)
     points = np.where(known[..., None], points, 0.0)
-    return Displacements(rays, *displaced(A, points, dof, *none, np.arange(n), ages, recent, rays, centres, 0.0))
+    return Displacements(rays, *displaced(A, points, dof, *none, np.arange(n), ages, _RECENT, rays, centres, 0.0))
 
 
-def known_well(
-    tracks: Tracks, rows: IndexArray, T_world_left: Array, min_frames: int
-) -> tuple[NDArray[np.intp], Array]:
+def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array, min_frames: int) -> tuple[IndexArray, Array]:
     """Those of the tracks (K,) seen in enough frames whose depth is known, and where: x/z, y/z, log z (K, 3)."""
     rows = rows[tracks.count(rows) >= min_frames]
-    known, place = places_known(tracks.position, tracks.covariance, rows, T_world_left, _FARTHEST)
-    return known, place
+    local = (tracks.position[rows] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
+    known = local[:, 2] > _FARTHEST * np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
+    x, y, z = local[known].T
+    return rows[known], np.column_stack([x / z, y / z, np.log(z)])
 
 
 def limit(test: float, size: IndexArray | int) -> Array:

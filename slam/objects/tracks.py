@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.se3 import Array
-from slam.objects.track_kernels import constant_velocities, fit_fixed_points, leave_window
+from slam.objects.track_kernels import constant_velocities, fit_fixed_points
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
 MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
@@ -83,10 +83,6 @@ class Tracks:
         """Number of measurements of tracks in the window (M,)."""
         return np.asarray(np.count_nonzero(self.dof[rows], axis=1))
 
-    def select(self, rows: NDArray[np.intp]) -> Tracks:
-        """A table of some of them."""
-        return Tracks(*(getattr(self, f.name)[rows] for f in fields(Tracks)))
-
     def begin(self, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], points: Array) -> NDArray[np.intp]:
         """Begin tracks at features whose points in world coordinates are `points` (M, 3); returns their rows (M,)."""
         unused = np.flatnonzero(self.ids < 0)
@@ -129,9 +125,14 @@ class Tracks:
 
 
 def make_room(tracks: Tracks, slot: int) -> None:
-    """Let what `slot` held leave the window, in place."""
+    """Let what `slot` held leave the window for the fading sums, in place."""
     t = tracks
-    leave_window(t.ids, t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, slot, _MEMORY)
+    leaving, window = t.A[:, slot], t.dof.shape[1]
+    trace = np.trace(t.older_A, axis1=1, axis2=2)
+    t.older_age[:] = _MEMORY * (t.older_age + trace) + window * np.trace(leaving, axis1=1, axis2=2)
+    t.older_b[:] = _MEMORY * t.older_b + times_vectors(leaving, t.p[:, slot])
+    t.older_A[:] = _MEMORY * t.older_A + leaving
+    t.A[:, slot], t.p[:, slot], t.dof[:, slot] = 0.0, 0.0, 0
 
 
 def record(tracks: Tracks, rows: NDArray[np.intp], slot: int, points: Array, information: Array, dof: NDArray) -> None:

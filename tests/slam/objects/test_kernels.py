@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 
 from slam.geometry.gauss_kernels import near_pairs
-from slam.geometry.se3 import exp
 from slam.objects import track_kernels
 
 RNG = np.random.default_rng(5)
@@ -42,20 +41,6 @@ def test_constant_velocities_are_least_squares_in_point_and_velocity():
         np.testing.assert_allclose(P[n], covariance[:3, :3], rtol=1e-5, atol=1e-9)
         np.testing.assert_allclose(PV[n], covariance[3:, 3:], rtol=1e-5, atol=1e-9)
         np.testing.assert_allclose(test[n], x[3:] @ np.linalg.solve(covariance[3:, 3:], x[3:]), rtol=1e-5)
-
-
-def test_both_squares_are_the_same_where_the_body_stands_at_the_worlds_origin():
-    """And a turned body only adds the turn of the points: χ² of a fixed point depends on no axes."""
-    A, p, dof = windows()
-    anchor, rows, known = np.zeros((TRACKS, 3)), np.arange(TRACKS), np.ones(SLOTS, bool)
-    still = np.tile(np.eye(4), (SLOTS, 1, 1))
-    turned = np.tile(exp(np.array([0.3, -0.2, 0.5, 0.0, 0.0, 0.0])), (SLOTS, 1, 1))
-    for history in (still, turned):
-        body, world, numbers, count = track_kernels.squares_of_both(A, p, dof, anchor, rows, history, known)
-        np.testing.assert_allclose(body, world, rtol=1e-6)
-        assert list(numbers[:2]) == [15, 18] and list(count[:2]) == [5, 6]
-    points, information, _ = track_kernels.windows_in_body(A, p, dof, anchor, rows, turned, known)
-    np.testing.assert_allclose(track_kernels.squares(points, information), world, rtol=1e-6)
 
 
 def test_a_displacement_is_less_certain_by_the_slide_of_a_feature_seen_from_elsewhere():

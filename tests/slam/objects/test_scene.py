@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import slam
-from slam.config import SystemConfig
-from slam.geometry.se3 import exp, hat, inverse, log, transform
+from slam.geometry.se3 import hat, transform
 from slam.objects.bodies import in_body_axes
 from slam.objects.scene import _SIZES, Displacements, _full_windows, classify_scene, displacements, tail
 from tests.slam.objects.test_membership import SIGMA, SLOT, TIMES, WINDOW, body_along, path, seen_from, table
@@ -140,38 +138,3 @@ def test_a_drawer_is_found_only_while_it_is_pulled_out(speed: float, count: int)
     place = np.column_stack([tracks.position[rows, :2], np.log(tracks.position[rows, 2])])
     groups = classify_scene(moved, place, 20.0, 4).groups
     assert [group.members.tolist() for group in groups] == [list(range(24, 30))][:count]
-
-
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_boxes_that_move_from_the_first_frame_on_draw_the_camera_less(backend):
-    """Errors of the camera after 15 frames: where nothing is tested before the update they are twice as large."""
-    errors = {tested: [error_after(15, seed, backend, tested) for seed in range(3)] for tested in (True, False)}
-    assert np.mean(errors[True]) < 0.75 * np.mean(errors[False])
-
-
-def error_after(frames, seed, backend, tested):
-    """Distance of the camera from where it is [m] after so many frames before moving boxes."""
-    sequence = slam.open_sequence(f"synthetic:boxes?density=300&sigma=0.2&seed={seed}&layout={seed}")
-    system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, None, backend))
-    if not tested:
-        system.objects.newly_moving = lambda *_: np.zeros(0, np.int64)
-    poses = [system.process_features(sequence.simulate(k).features).estimate.T_world_left for k in range(frames + 1)]
-    world = poses[0] @ inverse(sequence.ground_truth.poses[0])
-    return float(np.linalg.norm(log(inverse(poses[-1]) @ world @ sequence.ground_truth.poses[frames])[3:]))
-
-
-def test_single_landmarks_that_move_at_once_are_withheld_in_the_first_frames():
-    """Also those that joined the map in the frame before; a wrong prediction of the pose moves nothing."""
-    sequence = slam.open_sequence("synthetic:desk?density=150&sigma=0.2")
-    system = slam.StereoSlam(sequence.rig, None, "ekf", config=SystemConfig.for_kind(sequence.kind, None, "ekf"))
-    first = system.process_features(sequence.simulate(0).features)
-    features = sequence.simulate(1).features
-    names = dict(zip(sequence.simulate(0).ids[first.added_features].tolist(), first.added.tolist()))
-    seen = sequence.simulate(1).ids
-    rows = np.array([row for row, i in enumerate(seen.tolist()) if i in names and features.has_stereo[row]])
-    ids, moved = np.array([names[i] for i in seen[rows].tolist()]), rows[:3]
-    features.uv_left[moved, 0] += 8.0
-    features.uv_right[moved, 0] += 8.0
-    wrong = exp(np.array([0.0, 0.002, 0.0, 0.002, 0.0, 0.0])) @ first.estimate.T_world_left
-    withheld = system.objects.newly_moving(features, ids, rows, wrong)
-    assert np.isin(ids[:3], withheld).all() and len(withheld) < 0.1 * len(ids) + 3

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import slam
+from slam.config import SystemConfig
+from slam.geometry.se3 import exp, inverse, log, transform
+from slam.objects.config import ObjectsConfig
+from slam.objects.first_frames import FirstSights, moving_landmarks
+from tests.slam.scene import RIG
+
+SIGMA = 0.3  # pixel noise [px]
+
+
+def seen(points, T_world_left, rng):
+    """Pixels (uL, vL, uR) (N, 3) of points (N, 3)."""
+    left, right = RIG.project(transform(inverse(T_world_left), points))
+    return np.column_stack([left, right[:, 0]]) + SIGMA * rng.standard_normal((len(points), 3))
+
+
+def scene(shift, near=12, count=90, seed=1):
+    """Landmarks all over a room, and a group of near ones: first sights in frame 0, and pixels in frame 3.
+
+    The camera stands still, and the near group moves by `shift` (3,) in between.
+    """
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(1.0, 3.0, count)
+    points = np.column_stack([rng.uniform(-0.45, 0.45, count) * depth, rng.uniform(-0.35, 0.35, count) * depth, depth])
+    points[:near] = np.column_stack([rng.uniform(-0.1, 0.1, (near, 2)), rng.uniform(0.95, 1.05, near)])
+    before = seen(points, np.eye(4), rng)
+    first = RIG.triangulate(before[:, :2], before[:, [2, 1]])
+    now = points + np.where(np.arange(count)[:, None] < near, shift, 0.0)
+    return FirstSights(np.arange(count), first, np.zeros(count, np.int64)), seen(now, np.eye(4), rng)
+
+
+def test_landmarks_that_move_together_are_told_from_a_wrong_pose():
+    """The pose is wrong by 5 mm and 5 mrad, which moves most of the scene by more than the group moved."""
+    first, pixels = scene((0.02, 0.0, 0.0))
+    wrong = exp(np.array([0.0, 0.005, 0.0, 0.005, 0.0, 0.0]))
+    moves = moving_landmarks(RIG, wrong, first, pixels, 3, SIGMA, ObjectsConfig())
+    assert moves[:12].sum() >= 10 and moves[12:].sum() <= 2
+
+
+def test_nothing_moves_in_a_still_scene():
+    """Three of a thousand exceed the limit of a single one, which is χ²(3) at 99.7 %, by chance."""
+    moves = 0
+    for seed in range(10):
+        first, pixels = scene((0.0, 0.0, 0.0), seed=seed)
+        moves += moving_landmarks(RIG, np.eye(4), first, pixels, 3, SIGMA, ObjectsConfig()).sum()
+    assert moves <= 9
+
+
+def test_landmarks_without_a_right_pixel_are_not_tested_and_few_say_nothing():
+    first, pixels = scene((0.05, 0.0, 0.0))
+    pixels[:6, 2] = np.nan
+    moves = moving_landmarks(RIG, np.eye(4), first, pixels, 3, SIGMA, ObjectsConfig())
+    assert not moves[:6].any() and moves[6:12].all()
+    some = first.of(np.arange(8))
+    assert not moving_landmarks(RIG, np.eye(4), some, pixels[:8], 3, SIGMA, ObjectsConfig()).any()
+
+
+def test_first_sights_stay_as_they_were():
+    first = FirstSights.none().after(np.array([5, 2]), lambda ids: np.outer(ids, [1.0, 0, 0]), np.array([0, 1]))
+    later = first.after(np.array([2, 3]), lambda ids: np.outer(ids, [10.0, 0, 0]), np.array([7, 4]))
+    some = later.of(np.array([3, 2, 5]))
+    assert some.points[:, 0].tolist() == [30.0, 2.0, 5.0]
+    assert some.frame.tolist() == [4, 1, 0]
+
+
+def test_first_sights_are_of_the_frame_in_which_landmarks_joined_the_map():
+    """Also of those that are not found again in the next frame; their displacement is taken for the true time."""
+    sequence = slam.open_sequence("synthetic:aisle?density=40")
+    system = slam.StereoSlam(sequence.rig, None, "ekf", config=SystemConfig.for_kind(sequence.kind, None, "ekf"))
+    joined = {}
+    for k in range(8):
+        result = system.process_features(sequence.simulate(k).features)
+        joined.update(dict.fromkeys(result.added.tolist(), k))
+    first = system.objects._first
+    assert len(first.ids) > 20 and any(first.frame > 0)
+    assert [joined[i] for i in first.ids.tolist()] == first.frame.tolist()
+
+
+def test_a_large_group_does_not_hide_single_landmarks_that_move():
+    first, pixels = scene((0.05, 0.0, 0.0), near=30, count=100)
+    pixels[[40, 60, 80], 0] += 8.0
+    pixels[[40, 60, 80], 2] += 8.0
+    moves = moving_landmarks(RIG, np.eye(4), first, pixels, 3, SIGMA, ObjectsConfig())
+    assert moves[[40, 60, 80]].all() and moves[:30].sum() >= 28
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_boxes_that_move_from_the_first_frame_on_draw_the_camera_less(backend):
+    """Errors of the camera after 15 frames: without this test of landmarks they are twice as large."""
+    errors = {tested: [error_after(15, seed, backend, tested) for seed in range(3)] for tested in (True, False)}
+    assert np.mean(errors[True]) < 0.75 * np.mean(errors[False])
+
+
+def error_after(frames, seed, backend, tested):
+    """Distance of the camera from where it is [m] after so many frames before moving boxes."""
+    sequence = slam.open_sequence(f"synthetic:boxes?density=300&sigma=0.2&seed={seed}&layout={seed}")
+    system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, None, backend))
+    if not tested:
+        system.objects.newly_moving = lambda *_: np.zeros(0, np.int64)
+    poses = [system.process_features(sequence.simulate(k).features).estimate.T_world_left for k in range(frames + 1)]
+    world = poses[0] @ inverse(sequence.ground_truth.poses[0])
+    return float(np.linalg.norm(log(inverse(poses[-1]) @ world @ sequence.ground_truth.poses[frames])[3:]))
