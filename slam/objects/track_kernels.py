@@ -98,7 +98,7 @@ def constant_velocities(A, p, rows, times, prior):
 
 @kernel
 def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, rays, centres, slide):
-    """How far tracks went from the older to the recent frames of their windows: see `slam.objects.displacements`.
+    """How far tracks went from the older to the recent frames of their windows: see `slam.objects.scene`.
 
     Args:
         A: information by slot, and so on: see `slam.objects.tracks.Tracks`.
