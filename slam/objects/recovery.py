@@ -31,8 +31,9 @@ def located(
     """What is believed of a body after this frame, by its tracks that are seen, or found again; None for nothing.
 
     Tracks that the estimate did not use are counted as misfits, in place: those that disagree, and those that it could
-    not take, for want of a depth or of room. (Sparing the latter, bodies kept what was never tested, and `boxes` was
-    counted right in a third as many frames.) They are followed on, as they may lie on a part that moves otherwise.
+    not take, for want of a depth or of room. Two parts found as one, such as a box with its lid, shed the points of the
+    other one so. Where these stay, the group is not proven while it is on probation, is dropped, and found anew over
+    and over. They are followed on, as they may lie on a part that moves otherwise.
     """
     features, cameras, T_world_left = frame.features, frame.cameras, frame.T_world_left
     rig, sigma, config = frame.setup.rig, frame.setup.sigma, frame.setup.config
