@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
-from slam.objects.pixel_kernels import information_in_world, move_along_rays
+from slam.geometry.se3 import Array, transform
 
 _FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
 _STEPS = 4  # numerics: of Gauss-Newton at most
@@ -32,10 +31,20 @@ def measure(
     depth = (points - T_world_left[:3, 3]) @ T_world_left[:3, 2]
     rays = np.ones((len(points), 3))
     rays[:, :2] = rig.left.normalise(measured[:, :2])
+    stereo = np.isfinite(measured[:, 2])
     for _ in range(_STEPS):
         z, J = rig.project_stereo(rays * depth[:, None])
-        met, usable, any_far = move_along_rays(rays, depth, z, J, measured, _FAR)
-        if not any_far:
+        usable = (depth > 0) & np.isfinite(z).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
+        step = np.where(usable & stereo, measured[:, 2] - z[:, 2], 0.0)
+        along = np.cross(J[:, 0], J[:, 1])  # along it neither uL nor vL changes
+        with np.errstate(divide="ignore", invalid="ignore"):
+            by_right = np.where(step == 0.0, 0.0, step / (J[:, 2] * along).sum(axis=1))
+        met = rays * depth[:, None] + along * by_right[:, None]
+        far = np.abs(step) > _FAR
+        depth = np.where(far, met[:, 2], depth)
+        if not far.any():
             break
-    found, A, dof = information_in_world(met, usable, J, measured, T_world_left, sigma)
-    return found, A, dof
+    dof = np.where(usable, 2 + stereo, 0).astype(np.int8)
+    G = np.where(usable[:, None, None], J, 0.0) @ T_world_left[:3, :3].T / sigma
+    G[:, 2] *= (dof == 3)[:, None]
+    return transform(T_world_left, np.where(usable[:, None], met, 0.0)), np.swapaxes(G, 1, 2) @ G, dof

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.se3 import Array
-from slam.objects.track_kernels import constant_velocities, fit_fixed_points, leave_window
+from slam.objects.track_kernels import constant_velocities, fit_fixed_points
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
-LEAST_INFORMATION = 1e-6  #: numerics: on a member's point that has none yet [1/m²]
 MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
 AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
 EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain, may leave of what moves with it
@@ -126,9 +125,14 @@ class Tracks:
 
 
 def make_room(tracks: Tracks, slot: int) -> None:
-    """Let what `slot` held leave the window, in place."""
+    """Let what `slot` held leave the window for the fading sums, in place."""
     t = tracks
-    leave_window(t.ids, t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, slot, _MEMORY)
+    leaving, window = t.A[:, slot], t.dof.shape[1]
+    trace = np.trace(t.older_A, axis1=1, axis2=2)
+    t.older_age[:] = _MEMORY * (t.older_age + trace) + window * np.trace(leaving, axis1=1, axis2=2)
+    t.older_b[:] = _MEMORY * t.older_b + times_vectors(leaving, t.p[:, slot])
+    t.older_A[:] = _MEMORY * t.older_A + leaving
+    t.A[:, slot], t.p[:, slot], t.dof[:, slot] = 0.0, 0.0, 0
 
 
 def record(tracks: Tracks, rows: NDArray[np.intp], slot: int, points: Array, information: Array, dof: NDArray) -> None:
