@@ -15,6 +15,7 @@ from slam.objects.bodies import Body
 from slam.objects.frame import Frame
 from slam.objects.pixel_kernels import best_of_products, continue_tracks
 from slam.objects.regions import Regions
+from slam.objects.track_kernels import inverses
 from slam.objects.tracks import Tracks
 
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
@@ -78,7 +79,7 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
     for body in bodies.values():
         mine = np.flatnonzero(tracks.body == body.id)
         R, J = body.T[:3, :3], points_by_pose(tracks.local[mine])
-        own = np.linalg.inv(tracks.local_information[mine] + _UNKNOWN * np.eye(3))
+        own = inverses(tracks.local_information[mine], 0.0, _UNKNOWN)
         spread = own + J @ body.covariance @ np.swapaxes(J, 1, 2)
         tracks.position[mine], tracks.covariance[mine] = transform(body.T, tracks.local[mine]), R @ spread @ R.T
 
@@ -164,7 +165,7 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     local = frame.local[free]
     found = transform(frame.T_world_left, local)
     deviation = np.sqrt(2.0) * s.depth_noise(local[:, 2])
-    own = np.trace(tracks.covariance[left], axis1=1, axis2=2)
+    own = np.einsum("nii->n", tracks.covariance[left])
     start = tracks.position[left]
     squares = (start**2).sum(axis=1)[:, None] + (found**2).sum(axis=1) - 2 * start @ found.T
     allowed = squares < (c.max_speed * frame.dt + SIGMAS * np.sqrt(own[:, None] + deviation**2)) ** 2

@@ -20,10 +20,7 @@ from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
 from slam.objects.frame import Frame
 from slam.objects.points import MAX_REJECTIONS
-from slam.objects.track_kernels import (
-    squares,
-    weighted_means,
-)
+from slam.objects.track_kernels import inverses, squares, weighted_means
 from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, times_vectors
 
 _ROUNDS = 3  # of fitting poses and points in turn
@@ -43,6 +40,7 @@ _MOST = 0.5  # share of the members that must fit for those to leave that do not
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
 _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
 _RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
+_LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
 _WEAK = 1e-8  # numerics: variance that is added to a known pose's [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
@@ -345,8 +343,7 @@ def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float
     near = (local**2).sum(axis=1) < body.reach**2
     out = np.full(len(rows), np.inf)
     P = tracks.covariance[rows[near]]
-    ridge = _RIDGE * np.trace(P, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    out[near] = (away[near] * times_vectors(np.linalg.inv(P + ridge), away[near])).sum(axis=1)
+    out[near] = (away[near] * times_vectors(inverses(P, _RIDGE, _LEAST), away[near])).sum(axis=1)
     return out
 
 
@@ -358,8 +355,7 @@ def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     turned = R.T @ t.A[mine, slot] @ R
     total = t.local_information[mine] + turned
     t.local_information[mine] = total
-    total = total + _RIDGE * np.trace(total, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    t.local[mine] += times_vectors(np.linalg.inv(total), times_vectors(turned, gap))
+    t.local[mine] += times_vectors(inverses(total, _RIDGE, 0.0), times_vectors(turned, gap))
 
 
 def _squares(points: Array, A: Array) -> Array:

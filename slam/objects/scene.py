@@ -112,7 +112,7 @@ def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array, min_frames
     """Those of the tracks (K,) seen in enough frames whose depth is known, and where: x/z, y/z, log z (K, 3)."""
     rows = rows[tracks.count(rows) >= min_frames]
     local = (tracks.position[rows] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
-    known = local[:, 2] > _FARTHEST * np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
+    known = local[:, 2] > _FARTHEST * np.sqrt(np.einsum("nii->n", tracks.covariance[rows]))
     x, y, z = local[known].T
     return rows[known], np.column_stack([x / z, y / z, np.log(z)])
 
@@ -161,19 +161,21 @@ def _full_windows(place: Array, support: int) -> tuple[IndexArray, IndexArray, A
     Returns:
         starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
     """
-    cells = np.floor(place / _SIZES[:, None, None] + _HALVES[:, None]).astype(np.int64) + _CELLS // 2  # (S, 8, N, 3)
-    kinds = np.arange(len(_SIZES) * len(_HALVES)).reshape(len(_SIZES), -1, 1)
-    code = kinds
-    for axis in range(3):
-        code = code * _CELLS + np.clip(cells[..., axis], 0, _CELLS - 1)
-    _, first, which, count = np.unique(code.reshape(-1), return_index=True, return_inverse=True, return_counts=True)
+    at = place.T[:, None, None] / _SIZES.T[:, :, None, None] + [[0.0], [0.5]]
+    x, y, z = np.clip(np.floor(at).astype(np.int64) + _CELLS // 2, 0, _CELLS - 1)  # (S, 2, N) each, the 2 of offsets
+    kind = np.arange(len(_SIZES) * len(_HALVES)).reshape(-1, 2, 2, 2, 1)
+    code = ((kind * _CELLS + x[:, :, None, None]) * _CELLS + y[:, None, :, None]) * _CELLS + z[:, None, None]
+    bits = len(place).bit_length()
+    ordered = np.sort(((code << bits) + np.arange(len(place))).reshape(-1))  # quicker than to sort by code and stably
+    code, tracks = ordered >> bits, ordered & ((1 << bits) - 1)
+    first = np.flatnonzero(np.append(True, code[1:] != code[:-1]))
+    count = np.diff(np.append(first, len(code)))
     full = count >= support
-    inside = np.flatnonzero(full[which])
-    tracks = inside[np.argsort(which[inside], kind="stable")] % len(place)
-    kind = first[full] // len(place)
+    code = code[first[full], None]
+    kind = code[:, 0] // _CELLS**3
     size, half = _SIZES[kind // len(_HALVES)], _HALVES[kind % len(_HALVES)]
-    centres = (cells.reshape(-1, 3)[first[full]] - _CELLS // 2 + 0.5 - half) * size
-    return np.append(0, np.cumsum(count[full])).astype(np.intp), tracks.astype(np.intp), centres, size
+    centres = (code // _CELLS ** np.array([2, 1, 0]) % _CELLS - _CELLS // 2 + 0.5 - half) * size
+    return np.append(0, np.cumsum(count[full])).astype(np.intp), tracks[np.repeat(full, count)], centres, size
 
 
 def _mean_gap(moved: Displacements, rows: IndexArray, common: Array) -> float:

@@ -30,7 +30,31 @@ def _add_times(total, M, v, factor):
         total[i] += factor * row_times(M, i, v)
 
 
+@kernel
+def inverses(M, share, least):
+    """Inverses of symmetric matrices (N, 3, 3) with a `share` of the trace and `least` added to the diagonal."""
+    out = np.empty_like(M)
+    for n in range(len(M)):
+        invert_symmetric(M[n], share * trace(M[n]) + least, out[n])
+    return out
+
+
 # ---------------------------------------------------------------------------------------------- windows of tracks
+
+
+@kernel
+def leave_window(ids, A, p, dof, older_A, older_b, older_age, slot, memory):
+    """Move what `slot` holds from the windows of all tracks to their fading sums, in place."""
+    for n in range(len(ids)):
+        if ids[n] < 0:
+            continue
+        leaving = A[n, slot]
+        older_age[n] = memory * (older_age[n] + trace(older_A[n])) + A.shape[1] * trace(leaving)
+        for i in range(3):
+            older_b[n, i] = memory * older_b[n, i] + row_times(leaving, i, p[n, slot])
+            for j in range(3):
+                older_A[n, i, j] = memory * older_A[n, i, j] + leaving[i, j]
+        leaving[:], p[n, slot], dof[n, slot] = 0.0, 0.0, 0
 
 
 @kernel

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.se3 import Array
-from slam.objects.track_kernels import constant_velocities, fit_fixed_points
+from slam.objects.track_kernels import constant_velocities, fit_fixed_points, leave_window
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
 MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
@@ -127,12 +127,7 @@ class Tracks:
 def make_room(tracks: Tracks, slot: int) -> None:
     """Let what `slot` held leave the window for the fading sums, in place."""
     t = tracks
-    leaving, window = t.A[:, slot], t.dof.shape[1]
-    trace = np.trace(t.older_A, axis1=1, axis2=2)
-    t.older_age[:] = _MEMORY * (t.older_age + trace) + window * np.trace(leaving, axis1=1, axis2=2)
-    t.older_b[:] = _MEMORY * t.older_b + times_vectors(leaving, t.p[:, slot])
-    t.older_A[:] = _MEMORY * t.older_A + leaving
-    t.A[:, slot], t.p[:, slot], t.dof[:, slot] = 0.0, 0.0, 0
+    leave_window(t.ids, t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, slot, _MEMORY)
 
 
 def record(tracks: Tracks, rows: NDArray[np.intp], slot: int, points: Array, information: Array, dof: NDArray) -> None:
