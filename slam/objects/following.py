@@ -13,7 +13,7 @@ from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.frame import Frame
-from slam.objects.pixel_kernels import best_of_products, continue_tracks
+from slam.objects.pixel_kernels import best_of_products, continue_tracks, within_reach
 from slam.objects.regions import Regions
 from slam.objects.track_kernels import inverses
 from slam.objects.tracks import Tracks
@@ -166,9 +166,7 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     found = transform(frame.T_world_left, local)
     deviation = np.sqrt(2.0) * s.depth_noise(local[:, 2])
     own = np.einsum("nii->n", tracks.covariance[left])
-    start = tracks.position[left]
-    squares = (start**2).sum(axis=1)[:, None] + (found**2).sum(axis=1) - 2 * start @ found.T
-    allowed = squares < (c.max_speed * frame.dt + SIGMAS * np.sqrt(own[:, None] + deviation**2)) ** 2
+    allowed = within_reach(tracks.position[left], found, own, deviation**2, c.max_speed * frame.dt, SIGMAS)
     rows, columns = match_far(
         tracks.descriptors[left], tracks.laplacian[left], frame.features, free, allowed, c.wide_d_match, c.wide_ratio
     )  # fmt: skip

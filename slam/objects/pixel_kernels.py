@@ -142,6 +142,18 @@ def _pixel_deviations(J, T_world_left, P, more, sigma, g, out):
 
 
 @kernel
+def within_reach(start, found, start_variance, found_variance, way, sigmas):
+    """Which places (M, 3) are no farther than `way` [m] from the starts (N, 3), given the variances [m²]: (N, M)."""
+    out = np.empty((len(start), len(found)), np.bool_)
+    for n in range(len(start)):
+        x, y, z = start[n]
+        for m in range(len(found)):
+            square = (found[m, 0] - x) ** 2 + (found[m, 1] - y) ** 2 + (found[m, 2] - z) ** 2
+            out[n, m] = square < (way + sigmas * np.sqrt(start_variance[n] + found_variance[m])) ** 2
+    return out
+
+
+@kernel
 def best_of_products(products, allowed, signs, feature_signs, d_match, ratio):
     """Features that continue tracks, each the other's best where that is allowed.
 

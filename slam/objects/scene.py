@@ -112,7 +112,8 @@ def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array, min_frames
     """Those of the tracks (K,) seen in enough frames whose depth is known, and where: x/z, y/z, log z (K, 3)."""
     rows = rows[tracks.count(rows) >= min_frames]
     local = (tracks.position[rows] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
-    known = local[:, 2] > _FARTHEST * np.sqrt(np.einsum("nii->n", tracks.covariance[rows]))
+    variance = np.einsum("nii->n", tracks.covariance[rows])
+    known = local[:, 2] > _FARTHEST * np.sqrt(np.where(variance < 0, np.inf, variance))  # below 0 by rounding alone
     x, y, z = local[known].T
     return rows[known], np.column_stack([x / z, y / z, np.log(z)])
 
