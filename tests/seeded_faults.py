@@ -153,7 +153,7 @@ FAULTS = (
     Fault(
         "a body's points are compared with where it stands now, not where it stood", "slam/objects/following.py",
         "local = transform(inverse(body.T_before), places)", "local = transform(inverse(body.T), places)",
-        "tests/slam/objects/test_first_sight.py tests/slam/objects",
+        "tests/slam/objects/test_following.py tests/slam/objects",
     ),
     Fault(
         "noise of depth counts as a body's own extent", "slam/objects/points.py",

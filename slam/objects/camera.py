@@ -26,8 +26,8 @@ def with_estimate(
     """
     information = np.linalg.inv(estimate.covariance + 1e-12 * np.eye(6))
     if len(landmarks):
-        J = rig.project_stereo(landmarks)[1] @ points_by_pose(landmarks)
-        information = information + np.einsum("nij,nik->jk", J, J) / sigma**2
+        J = (rig.project_stereo(landmarks)[1] @ points_by_pose(landmarks)).reshape(-1, 6)
+        information = information + J.T @ J / sigma**2
     own = np.linalg.inv(information)
     n = 0 if path is None else min(len(path), most - 1)
     blocks = np.zeros((6 * n + 6, 6 * n + 6))

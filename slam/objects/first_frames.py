@@ -2,7 +2,7 @@
 
 What moves from the beginning on would else pull the camera along until the detector knows its tracks, and that error
 stays: the world's axes are those of the first frame. So the way of each landmark from where it was first seen is tested
-as `slam.objects.regions` tests displacements of tracks: windows whose landmarks moved together, and single landmarks
+as `slam.objects.scene` tests displacements of tracks: windows whose landmarks moved together, and single landmarks
 that did not move with the rest. The noise is that of these displacements themselves.
 """
 
@@ -18,9 +18,8 @@ from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.config import ObjectsConfig
-from slam.objects.displacements import Displacements
 from slam.objects.measurement import measure
-from slam.objects.regions import classify_scene, tail
+from slam.objects.scene import Displacements, classify_scene, tail
 
 #: Gives the positions (K, 3) of landmarks in the world [m] by their ids (K,).
 Places = Callable[[IdArray], Array]
@@ -83,8 +82,5 @@ def moving_landmarks(
     moved = Displacements(was - T_world_left[:3, 3], points[known] - was, 0.5 * (A + ridge), lag)
     place = np.column_stack([local[:, :2] / local[:, 2:], np.log(local[:, 2])])
     scene = classify_scene(moved, place, config.suspect, config.min_support, (_LEAST_NOISE / sigma) ** 2)
-    rest = np.ones(len(known), bool)
-    for group in scene.groups:
-        rest[group.members] = False
-    moves[known[~rest | (scene.alone > config.doubtful * tail(scene.alone[rest]))]] = True
+    moves[known[~scene.rest | (scene.alone > config.doubtful * tail(scene.alone[scene.rest]))]] = True
     return moves

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.objects.pixel_kernels import information_in_world, move_along_rays
+from slam.objects.pixel_kernels import points_on_rays
 
 _FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
 _STEPS = 4  # numerics: of Gauss-Newton at most
@@ -23,19 +23,12 @@ def measure(
     measured depth. Rows whose uR is NaN have no information along the ray; unusable rows have none at all.
 
     Args:
-        rig: the cameras.
+        rig: the cameras, rectified.
         T_world_left: pose (4, 4) of the left camera.
         points: expected points (N, 3) in world coordinates.
         measured: (N, 3) = (uL, vL, uR).
         sigma: pixel noise [px].
     """
-    depth = (points - T_world_left[:3, 3]) @ T_world_left[:3, 2]
-    rays = np.ones((len(points), 3))
-    rays[:, :2] = rig.left.normalise(measured[:, :2])
-    for _ in range(_STEPS):
-        z, J = rig.project_stereo(rays * depth[:, None])
-        met, usable, any_far = move_along_rays(rays, depth, z, J, measured, _FAR)
-        if not any_far:
-            break
-    found, A, dof = information_in_world(met, usable, J, measured, T_world_left, sigma)
-    return found, A, dof
+    camera = rig.rectified_parameters
+    out, A, dof = points_on_rays(camera, T_world_left, points, measured, sigma, _FAR, _STEPS)
+    return out, A, dof

@@ -6,7 +6,7 @@ of the two χ² over the window, a log-likelihood ratio, decides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -15,17 +15,12 @@ from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray
-from slam.geometry.se3 import Array, exp, points_by_pose, transform
+from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
+from slam.objects.frame import Frame
 from slam.objects.points import MAX_REJECTIONS
-from slam.objects.track_kernels import (
-    improve_members,
-    squares,
-    squares_from_box,
-    squares_of_both,
-    weighted_means,
-)
+from slam.objects.track_kernels import inverses, squares, weighted_means
 from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, times_vectors
 
 _ROUNDS = 3  # of fitting poses and points in turn
@@ -44,6 +39,8 @@ _WORSE = -9.0  # a member for which the still world is better by more leaves
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
 _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
+_RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
+_LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
 _WEAK = 1e-8  # numerics: variance that is added to a known pose's [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
@@ -60,9 +57,10 @@ class MembershipTest:
 
 def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> MembershipTest:
     """Compare the fit of tracks to a body with that to the still world, over the window."""
-    t = tracks
-    fixed, still, numbers, count = squares_of_both(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
-    limit = _limits(3 * t.dof.shape[1])[np.maximum(numbers - 3, 1)]
+    points, A, known = in_body_axes(body, tracks, rows)
+    dof = np.where(known, tracks.dof[rows], 0)
+    fixed, still, count = _squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
+    limit = _limits(3 * dof.shape[1])[np.maximum(dof.sum(axis=1) - 3, 1)]
     fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
     return MembershipTest(still - fixed, fits, count)
 
@@ -121,20 +119,19 @@ def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
     fit_positions(tracks, rows)
 
 
-def update_members(
-    bodies: Mapping[int, Body], resolved: Set[int], tracks: Tracks, slot: int, config: ObjectsConfig
-) -> dict[int, Array]:
-    """Add the tracks that fit a body to its members, and remove those that do not, in place.
+def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, Array]:
+    """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
 
-    Inside a `resolved` body no proof of motion is needed. For bodies farther away depth noise is larger than the body,
-    so that all around it seems to lie inside.
+    Inside a body that stereo resolves no proof of motion is needed. For bodies farther away depth noise is larger than
+    the body, so that all around it seems to lie inside.
 
     Returns:
         by body, by how much χ² it explains its seen members better than the still world (K,).
     """
-    gains = {}
+    gains, config = {}, frame.setup.config
+    bodies = {id: body for id, body in every.items() if body.measured}
     for body in bodies.values():
-        _improve(body, tracks, slot)
+        _improve(body, tracks, frame.slot)
         gains[body.id] = _expel(body, tracks, config)
     if not bodies:
         return gains
@@ -145,7 +142,7 @@ def update_members(
         near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
         if not len(near):
             continue
-        gain = _gain_of_joining(body, body.id in resolved, tracks, free[near])
+        gain = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
     for body in bodies.values():
@@ -249,7 +246,7 @@ def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.int
         alone = float(_squares(*in_body_axes(own, tracks, rows)[:2]).sum())
         points, A, known = in_body_axes(body, tracks, rows)
         fixed = float(_squares(points, A).sum())
-        still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
+        still = float(_still(tracks, rows, known).sum())
         by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
         certain = _squares_with_pose_error(points, A, body)
         apart = body.seen > PROBATION and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
@@ -311,7 +308,7 @@ def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
     if not len(rows):
         return False
     points, A, known = in_body_axes(whole, tracks, rows)
-    still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
+    still = float(_still(tracks, rows, known).sum())
     return float(_squares(points, A).sum()) < _PART_EXPLAINED * still
 
 
@@ -331,7 +328,7 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     every = np.concatenate([ones, others])
     more = left(one, every) - left(one, ones) - left(other, others)
     _, _, known = in_body_axes(one, tracks, every)
-    still = float(_squares(tracks.p[every], np.where(known[..., None, None], tracks.A[every], 0.0)).sum())
+    still = float(_still(tracks, every, known).sum())
     return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
 
 
@@ -341,20 +338,34 @@ def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float
     The extent is widened by `margin`, a share of what it measures across.
     """
     wider = margin * body.across
-    lower, upper = body.lower - wider, body.upper + wider
-    return np.asarray(squares_from_box(tracks.position, tracks.covariance, rows, body.T, lower, upper, body.reach))
+    local = transform(inverse(body.T), tracks.position[rows])
+    away = (local - np.clip(local, body.lower - wider, body.upper + wider)) @ body.T[:3, :3].T
+    near = (local**2).sum(axis=1) < body.reach**2
+    out = np.full(len(rows), np.inf)
+    P = tracks.covariance[rows[near]]
+    out[near] = (away[near] * times_vectors(inverses(P, _RIDGE, _LEAST), away[near])).sum(axis=1)
+    return out
 
 
 def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     """Take this frame's measurements into the members' points."""
-    mine = np.flatnonzero((tracks.body == body.id) & (tracks.misfit == 0) & (tracks.dof[:, slot] > 0))
-    t = tracks
-    improve_members(t.A, t.p, t.anchor, mine, slot, body.T, t.local, t.local_information)
+    t, R = tracks, body.T[:3, :3]
+    mine = np.flatnonzero((t.body == body.id) & (t.misfit == 0) & (t.dof[:, slot] > 0))
+    gap = (t.p[mine, slot] + t.anchor[mine] - body.T[:3, 3]) @ R - t.local[mine]
+    turned = R.T @ t.A[mine, slot] @ R
+    total = t.local_information[mine] + turned
+    t.local_information[mine] = total
+    t.local[mine] += times_vectors(inverses(total, _RIDGE, 0.0), times_vectors(turned, gap))
 
 
 def _squares(points: Array, A: Array) -> Array:
     """χ² (N,) of "one fixed point" for points by slot (N, W, 3) with information (N, W, 3, 3)."""
     return np.asarray(squares(points, A))
+
+
+def _still(tracks: Tracks, rows: NDArray[np.intp], known: BoolArray) -> Array:
+    """χ² (N,) of "one fixed point in the world" in the slots of tracks that are `known` (N, W)."""
+    return _squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))
 
 
 def _means(points: Array, A: Array) -> Array:

@@ -1,11 +1,11 @@
-"""Compiled loops over pixels: how far off a track may be seen, which feature it is, and which point that says."""
+"""Compiled loops over pixels: how far off a track may be seen, and which feature it is."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.se3 import transform
-from slam.kernels.stereo import by_point
+from slam.kernels.se3 import transform, transform_back
+from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import helper, kernel
 
 _NEIGHBOURS = 8  # cost: features looked at in a window: the nearest ones
@@ -13,68 +13,36 @@ _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 
 
 @kernel
-def move_along_rays(rays, depth, z, J, measured, far):
-    """Move points along their rays so that they meet the measured uR.
+def points_on_rays(camera, T_world_left, points, measured, sigma, far, steps):
+    """Points (N, 3) on the measured rays, their information (N, 3, 3), and numbers measured (N,).
 
-    Args:
-        rays: through the measured left pixels (N, 3), third coordinate 1.
-        depth: of the points (N,); changed where a point was off by more than `far`.
-        z: the points' pixels (N, 3).
-        J: their derivatives (N, 3, 3).
-        measured: pixels (N, 3); uR is NaN where there is none.
-        far: [px].
-
-    Returns:
-        points (N, 3) in camera coordinates, which of them can be used (N,), and whether any was far off.
+    See `slam.objects.measurement.measure`; `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, `far`
+    [px] how far off an expected point may be, and `steps` how often it is linearised at most.
     """
-    points, usable, any_far = np.zeros((len(rays), 3)), np.empty(len(rays), np.bool_), False
-    for n in range(len(rays)):
-        known = 0.0  # becomes NaN where a pixel or a derivative is not finite
-        for i in range(3):
-            known += 0.0 * z[n, i]
-            for j in range(3):
-                known += 0.0 * J[n, i, j]
-        usable[n] = depth[n] > 0 and known == 0.0
-        if not usable[n]:
-            continue
-        for i in range(3):
-            points[n, i] = depth[n] * rays[n, i]
-        step = measured[n, 2] - z[n, 2]
-        if np.isnan(step):
-            continue
-        a, b, c = J[n, 0], J[n, 1], J[n, 2]
-        x, y, w = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-        step_by_right = step / (c[0] * x + c[1] * y + c[2] * w)  # along a × b neither uL nor vL changes
-        points[n, 0] += x * step_by_right
-        points[n, 1] += y * step_by_right
-        points[n, 2] += w * step_by_right
-        if abs(step) > far:
-            any_far = True
-            depth[n] = points[n, 2]
-    return points, usable, any_far
-
-
-@kernel
-def information_in_world(points, usable, J, measured, T_world_left, sigma):
-    """Points (N, 3) in world coordinates, their information (N, 3, 3), and how many numbers each rests on (N,).
-
-    Args:
-        points: in camera coordinates (N, 3).
-        usable: which of them can be used (N,).
-        J: derivatives of the pixels by the points (N, 3, 3).
-        measured: pixels (N, 3); uR is NaN where there is none.
-        T_world_left: pose (4, 4) of the camera.
-        sigma: pixel noise [px].
-    """
-    out, A, dof = np.empty((len(points), 3)), np.zeros((len(points), 3, 3)), np.zeros(len(points), np.int8)
-    g = np.empty(3)
+    fu, fv, u0, v0, right_fu, _, shift = camera
+    out, A, dof = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3)), np.zeros(len(points), np.int8)
+    place, r, J, g = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
     for n in range(len(points)):
-        transform(T_world_left, points[n], out[n])
-        if not usable[n]:
+        x, y = (measured[n, 0] - u0) / fu, (measured[n, 1] - v0) / fv
+        transform_back(T_world_left, points[n], place)
+        met, stereo, front = place[2], not np.isnan(measured[n, 2]), False
+        for _ in range(steps):
+            depth = met
+            place[0], place[1], place[2] = x * depth, y * depth, depth
+            front = residual(camera, place, measured[n], r, J) and r[0] + r[1] == r[0] + r[1]
+            if not (front and stereo):
+                break
+            met = depth - r[2] * depth * depth / (right_fu * shift)  # on the ray uR changes by f' b / z
+            if abs(r[2]) <= far:
+                break
+        if not front:
+            transform(T_world_left, np.zeros(3), out[n])
             continue
-        dof[n] = 2 if np.isnan(measured[n, 2]) else 3
+        place[0], place[1], place[2] = x * met, y * met, met
+        transform(T_world_left, place, out[n])
+        dof[n] = 3 if stereo else 2
         for k in range(dof[n]):
-            by_point(J[n, k], T_world_left, g)
+            by_point(J[k], T_world_left, g)
             for i in range(3):
                 for j in range(3):
                     A[n, i, j] += g[i] * g[j] / (sigma * sigma)
@@ -171,6 +139,18 @@ def _pixel_deviations(J, T_world_left, P, more, sigma, g, out):
             for k in range(3):
                 square += g[j] * (P[j, k] + more[j, k]) * g[k]
         out[i] = np.sqrt(square)
+
+
+@kernel
+def within_reach(start, found, start_variance, found_variance, way, sigmas):
+    """Which places (M, 3) are no farther than `way` [m] from the starts (N, 3), given the variances [m²]: (N, M)."""
+    out = np.empty((len(start), len(found)), np.bool_)
+    for n in range(len(start)):
+        x, y, z = start[n]
+        for m in range(len(found)):
+            square = (found[m, 0] - x) ** 2 + (found[m, 1] - y) ** 2 + (found[m, 2] - z) ** 2
+            out[n, m] = square < (way + sigmas * np.sqrt(start_variance[n] + found_variance[m])) ** 2
+    return out
 
 
 @kernel

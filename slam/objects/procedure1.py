@@ -27,7 +27,7 @@ from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
 from slam.objects.first_frames import Places
-from slam.objects.matching import match_far
+from slam.objects.following import match_far
 from slam.objects.revision import CorrectRows
 
 _LARGEST = 2**28  # bytes of a database's file

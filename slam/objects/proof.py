@@ -24,11 +24,10 @@ from scipy.special import chdtrc, fdtrc
 
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, points_by_pose
 from slam.objects.bodies import Body
-from slam.objects.displacements import Displacements
-from slam.objects.regions import Scene
+from slam.objects.frame import Frame
+from slam.objects.scene import Displacements, Scene
 
 PROVEN = 12.0  #: −log10 of the chance from which a body has moved for certain if it went farther than the camera; at 8
 #: the same bodies are found in `boxes` and on drives, and twice as many pieces of a walker
@@ -54,22 +53,15 @@ class Way:
     part: bool = False
 
     @classmethod
-    def of(cls, body: Body, stamps: Array, cameras: Array, rig: StereoRig, sigma: float) -> Way:
-        """Of a body in those frames in which it was measured.
-
-        Args:
-            body: the body.
-            stamps: of the window's slots (W,) [s]; NaN where there is none yet.
-            cameras: poses T_world_left (W, 4, 4) in them.
-            rig: the cameras.
-            sigma: pixel noise [px].
-        """
+    def of(cls, body: Body, frame: Frame) -> Way:
+        """Of a body in those frames of the window in which it was measured."""
+        stamps, cameras = frame.stamps, frame.poses
         seen = np.flatnonzero(body.known & np.isfinite(stamps))
         seen = seen[np.argsort(stamps[seen])]
         places = body.history[seen, :3, :3] @ (0.5 * (body.lower + body.upper)) + body.history[seen, :3, 3]
         rays = places - cameras[seen, :3, 3]
         depth = np.einsum("ni,ni->n", rays, cameras[seen, :3, 2])
-        off = depth[:, None] * rays * sigma / (rig.left.fu * rig.baseline)  # by a disparity that is wrong by sigma
+        off = rays * (frame.setup.depth_noise(depth) / depth)[:, None]  # by a disparity that is wrong by sigma
         if not len(seen):
             return cls(places, stamps[seen], np.zeros(3), 0.0)
         camera = float(np.linalg.norm(np.ptp(cameras[seen, :3, 3], axis=0)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, RecentPoses, StereoFeatures
+from slam.data import BoolArray, StereoFeatures
 from slam.geometry.arrays import among
 from slam.geometry.pnp import find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
@@ -15,7 +15,8 @@ from slam.objects.belief import BodyBelief
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.estimator import BodyEstimator
-from slam.objects.matching import match_far
+from slam.objects.following import match_far
+from slam.objects.frame import Frame
 from slam.objects.points import MIN_POINTS
 from slam.objects.tracks import AGREES, Tracks
 
@@ -25,20 +26,21 @@ _DEPTHS = 0.2  # share of the depth by which stereo may be off
 
 
 def located(
-    body: Body, tracks: Tracks, features: StereoFeatures, measured: Array, cameras: RecentPoses,
-    estimator: BodyEstimator, rig: StereoRig, sigma: float, config: ObjectsConfig, seed: int,
+    body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator
 ) -> BodyBelief | None:  # fmt: skip
     """What is believed of a body after this frame, by its tracks that are seen, or found again; None for nothing.
 
     Tracks that the estimate did not use are counted as misfits, in place: those that disagree, and those that it could
-    not take, for want of a depth or of room. (Sparing the latter, bodies kept what was never tested, and `boxes` was
-    counted right in a third as many frames.) They are followed on, as they may lie on a part that moves otherwise.
-    `measured` are the features' points in camera coordinates (N, 3), NaN where there is no depth.
+    not take, for want of a depth or of room. Two parts found as one, such as a box with its lid, shed the points of the
+    other one so. Where these stay, the group is not proven while it is on probation, is dropped, and found anew over
+    and over. They are followed on, as they may lie on a part that moves otherwise.
     """
+    features, cameras, T_world_left = frame.features, frame.cameras, frame.T_world_left
+    rig, sigma, config = frame.setup.rig, frame.setup.sigma, frame.setup.config
+    measured, seed = frame.local, frame.number
     members = np.flatnonzero(tracks.body == body.id)
     mine = members[tracks.seen[members]]
     rows = tracks.row[mine]
-    T_world_left = cameras.poses[-1]
 
     def estimated(mine: NDArray[np.intp], rows: NDArray[np.intp], T: Array | None = None) -> BodyBelief | None:
         return estimator.updated(body.belief, body.id, observed(body, tracks, mine, rows, features, T), cameras)

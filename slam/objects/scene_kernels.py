@@ -1,6 +1,6 @@
 """Compiled loops of the test of the scene: sums of normal equations over many sets of tracks, and what they say.
 
-Symmetric 6x6 matrices of tracks are kept as their lower triangles (21,), row by row: see `slam.objects.regions` for the
+Symmetric 6x6 matrices of tracks are kept as their lower triangles (21,), row by row: see `slam.objects.scene` for the
 meaning of Λ, η and ξ.
 """
 
@@ -24,8 +24,6 @@ _BETTER_AROUND = 6.0  # where it lies outside the window
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
 _MOST = 20  # cost: windows looked into for the next group
 _MEDIAN = chi_square_limit(3, 0.5)  # of χ²(3)
-_CELLS = 2**12  # more than there are windows along an axis
-_SPREAD = 0x1E3779B97F4A7C15  # numerics: an odd number that spreads codes over a table
 
 # ---------------------------------------------------------------------------------------------- a common motion
 
@@ -148,109 +146,7 @@ def _times(triangle, v, out):
         k += 1
 
 
-# ---------------------------------------------------------------------------------------------- windows
-
-
-@kernel
-def full_windows(place, sizes, support):
-    """Windows with at least `support` tracks, of every size, each half a width from the next along every axis.
-
-    Args:
-        place: of the tracks (N, 3).
-        sizes: of windows (S, 3).
-        support: least number of tracks in a window.
-
-    Returns:
-        starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
-    """
-    kinds, n = 8 * len(sizes), len(place)
-    most = kinds * (n // support)
-    starts, tracks = np.zeros(most + 1, np.int64), np.empty(kinds * n, np.int64)
-    centres, widths = np.empty((most, 3)), np.empty((most, 3))
-    lines = np.empty((2, n, 3), np.int64)
-    window, size, code = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    full, begin = np.empty(n, np.int64), np.empty(n, np.int64)
-    places = 1
-    while places < 2 * n:
-        places *= 2
-    table = np.empty(places, np.int64)
-    windows = 0
-    for kind in range(kinds):
-        if kind % 8 == 0:
-            _lines(place, sizes[kind // 8], lines)
-        count = _grouped(lines, kind, table, window, size, code)
-        chosen = _with_support(size[:count], code, support, full)
-        for k in range(chosen):
-            begin[full[k]] = starts[windows]
-            starts[windows + 1] = starts[windows] + size[full[k]]
-            rest = code[full[k]]
-            for axis in range(2, -1, -1):
-                half = 0.5 * ((kind >> (2 - axis)) & 1)
-                widths[windows, axis] = sizes[kind // 8, axis]
-                centres[windows, axis] = (rest % _CELLS - _CELLS // 2 + 0.5 - half) * widths[windows, axis]
-                rest //= _CELLS
-            windows += 1
-        for i in range(n):
-            if size[window[i]] >= support:
-                tracks[begin[window[i]]] = i
-                begin[window[i]] += 1
-    return starts[: windows + 1].copy(), tracks[: starts[windows]].copy(), centres[:windows], widths[:windows]
-
-
-@helper
-def _lines(place, size, out):
-    """In which cell along each axis every track lies, where cells begin at 0, and where at a half (2, N, 3)."""
-    for i in range(len(place)):
-        for axis in range(3):
-            at = place[i, axis] / size[axis]
-            for half in range(2):
-                cell = int(np.floor(at + 0.5 * half)) + _CELLS // 2
-                out[half, i, axis] = min(max(cell, 0), _CELLS - 1)
-
-
-@helper
-def _grouped(lines, kind, table, window, size, code):
-    """Number the windows of one size and offset that are not empty; returns how many there are.
-
-    Args:
-        lines: from `_lines`.
-        kind: its lowest three bits say along which axes the windows are offset.
-        table: of 2^k places, at least twice as many as tracks; overwritten, and so are
-        window: the window of each track (N,),
-        size: the number of tracks in each window, and
-        code: the cells of each window, as one number.
-    """
-    table[:] = -1
-    count = 0
-    for i in range(len(window)):
-        own = 0
-        for axis in range(3):
-            own = own * _CELLS + lines[(kind >> (2 - axis)) & 1, i, axis]
-        at = ((own * _SPREAD) >> 20) & (len(table) - 1)
-        while table[at] >= 0 and code[table[at]] != own:
-            at = (at + 1) & (len(table) - 1)
-        if table[at] < 0:
-            table[at], code[count], size[count] = count, own, 0
-            count += 1
-        window[i] = table[at]
-        size[window[i]] += 1
-    return count
-
-
-@helper
-def _with_support(size, code, support, out):
-    """Windows with enough tracks, by ascending code, into `out`; returns how many there are."""
-    count = 0
-    for k in range(len(size)):
-        if size[k] < support:
-            continue
-        at = count
-        while at > 0 and code[out[at - 1]] > code[k]:
-            out[at] = out[at - 1]
-            at -= 1
-        out[at] = k
-        count += 1
-    return count
+# ---------------------------------------------------------------------------------------------- groups
 
 
 @helper

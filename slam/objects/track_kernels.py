@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.linear import column_times, invert_symmetric, multiply, row_times, square, trace, turn, turn_back
-from slam.kernels.se3 import point_by_motion, transform, transform_back
 from slam.runtime.compilation import helper, kernel
 
 _RIDGE = 1e-9  # numerics: share of the trace, for information over a whole window, and
@@ -31,32 +30,16 @@ def _add_times(total, M, v, factor):
         total[i] += factor * row_times(M, i, v)
 
 
-# ---------------------------------------------------------------------------------------------- windows of tracks
-
-
 @kernel
-def places_known(position, covariance, rows, T_world_left, farthest):
-    """Tracks whose depth is known well, and where they are seen.
+def inverses(M, share, least):
+    """Inverses of symmetric matrices (N, 3, 3) with a `share` of the trace and `least` added to the diagonal."""
+    out = np.empty_like(M)
+    for n in range(len(M)):
+        invert_symmetric(M[n], share * trace(M[n]) + least, out[n])
+    return out
 
-    Args:
-        position: of the tracks, in world coordinates.
-        covariance: of the positions.
-        rows: of the tracks.
-        T_world_left: pose (4, 4) of the camera.
-        farthest: least ratio of the depth to its deviation.
 
-    Returns:
-        rows (K,), and x/z, y/z, log z of each (K, 3).
-    """
-    known, place, away, count = np.empty(len(rows), np.intp), np.empty((len(rows), 3)), np.empty(3), 0
-    for m in range(len(rows)):
-        n = rows[m]
-        transform_back(T_world_left, position[n], away)
-        if away[2] > farthest * np.sqrt(trace(covariance[n])):
-            known[count] = n
-            place[count, 0], place[count, 1], place[count, 2] = away[0] / away[2], away[1] / away[2], np.log(away[2])
-            count += 1
-    return known[:count], place[:count]
+# ---------------------------------------------------------------------------------------------- windows of tracks
 
 
 @kernel
@@ -71,9 +54,7 @@ def leave_window(ids, A, p, dof, older_A, older_b, older_age, slot, memory):
             older_b[n, i] = memory * older_b[n, i] + row_times(leaving, i, p[n, slot])
             for j in range(3):
                 older_A[n, i, j] = memory * older_A[n, i, j] + leaving[i, j]
-        leaving[:] = 0.0
-        p[n, slot] = 0.0
-        dof[n, slot] = 0
+        leaving[:], p[n, slot], dof[n, slot] = 0.0, 0.0, 0
 
 
 @kernel
@@ -141,7 +122,7 @@ def constant_velocities(A, p, rows, times, prior):
 
 @kernel
 def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, rays, centres, slide):
-    """How far tracks went from the older to the recent frames of their windows: see `slam.objects.displacements`.
+    """How far tracks went from the older to the recent frames of their windows: see `slam.objects.scene`.
 
     Args:
         A: information by slot, and so on: see `slam.objects.tracks.Tracks`.
@@ -299,115 +280,3 @@ def squares(points, A):
     for m in range(len(points)):
         out[m] = _square(points[m], A[m], mean)
     return out
-
-
-@kernel
-def squares_of_both(A, p, dof, anchor, rows, history, known):
-    """How well fixed points explain what tracks measured while there was a body: one in it, and one in the world.
-
-    The arguments are those of `windows_in_body`.
-
-    Returns:
-        χ² in the body (M,), in the world (M,), of how many numbers (M,), and of how many measurements (M,).
-    """
-    in_body, in_world = np.empty(len(rows)), np.empty(len(rows))
-    numbers, count = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.int64)
-    points, turned, mean = np.empty(p.shape[1:]), np.empty(A.shape[1:]), np.empty(3)
-    there = np.empty(A.shape[1], np.bool_)
-    for m in range(len(rows)):
-        n = rows[m]
-        _into_body(A[n], p[n], dof[n], anchor[n], history, known, points, turned, there)
-        in_body[m] = _square(points, turned, mean)
-        for w in range(len(there)):
-            turned[w] = 0.0
-            if there[w]:
-                _add(turned[w], A[n, w], 1.0)
-                numbers[m] += dof[n, w]
-                count[m] += 1
-        in_world[m] = _square(p[n], turned, mean)
-    return in_body, in_world, numbers, count
-
-
-@kernel
-def squares_from_box(position, covariance, rows, T, lower, upper, reach):
-    """Squared distances (M,) of tracks from a box in a body's coordinates, in units of their noise.
-
-    Infinite for those farther than `reach` from the origin of the body, whose pose is T (4, 4).
-    """
-    squares = np.full(len(rows), np.inf)
-    inside, away, P = np.empty(3), np.empty(3), np.empty((3, 3))
-    for m in range(len(rows)):
-        n = rows[m]
-        transform_back(T, position[n], inside)
-        if inside[0] ** 2 + inside[1] ** 2 + inside[2] ** 2 >= reach**2:
-            continue
-        for i in range(3):
-            inside[i] -= min(max(inside[i], lower[i]), upper[i])
-        for i in range(3):
-            away[i] = row_times(T, i, inside)
-        invert_symmetric(covariance[n], _RIDGE * trace(covariance[n]) + _LEAST, P)
-        squares[m] = square(P, away)
-    return squares
-
-
-@kernel
-def improve_members(A, p, anchor, rows, slot, T, local, information):
-    """Take what tracks measured in a slot into their points in a body's coordinates, in place.
-
-    Args:
-        A: information by slot.
-        p: points by slot, relative to the anchors.
-        anchor: of the tracks, in world coordinates.
-        rows: of the body's tracks.
-        slot: of the measurements.
-        T: pose of the body (4, 4).
-        local: points in the body's coordinates (N, 3).
-        information: of these (N, 3, 3).
-    """
-    turned, P = np.empty((3, 3)), np.empty((3, 3))
-    away, gap, told = np.empty(3), np.empty(3), np.empty(3)
-    for m in range(len(rows)):
-        n = rows[m]
-        for i in range(3):
-            away[i] = p[n, slot, i] + anchor[n, i] - T[i, 3]
-        for i in range(3):
-            gap[i] = column_times(T, i, away) - local[n, i]
-        turn_back(T, A[n, slot], turned)
-        for i in range(3):
-            told[i] = row_times(turned, i, gap)
-        _add(information[n], turned, 1.0)
-        invert_symmetric(information[n], _RIDGE * trace(information[n]), P)
-        for i in range(3):
-            local[n, i] += row_times(P, i, told)
-
-
-@kernel
-def members_ahead(local, information, rows, T, P_body, least):
-    """Where a body's points are (M, 3), in world coordinates, and their covariances (M, 3, 3).
-
-    Args:
-        local: points in the body's coordinates.
-        information: of these.
-        rows: of the body's tracks.
-        T: pose of the body (4, 4).
-        P_body: its covariance (6, 6), body axes.
-        least: information that is added to that of every point.
-    """
-    points, P = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
-    own, J, JP = np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 6))
-    for m in range(len(rows)):
-        y = local[rows[m]]
-        transform(T, y, points[m])
-        point_by_motion(y, 1.0, J)
-        for i in range(3):
-            for j in range(6):
-                JP[i, j] = 0.0
-                for k in range(6):
-                    JP[i, j] += J[i, k] * P_body[k, j]
-        invert_symmetric(information[rows[m]], least, own)
-        for i in range(3):
-            for j in range(3):
-                for k in range(6):
-                    own[i, j] += JP[i, k] * J[j, k]
-        turn(T, own, P[m])
-    return points, P

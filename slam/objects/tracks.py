@@ -17,7 +17,6 @@ from slam.geometry.se3 import Array
 from slam.objects.track_kernels import constant_velocities, fit_fixed_points, leave_window
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
-LEAST_INFORMATION = 1e-6  #: numerics: on a member's point that has none yet [1/m²]
 MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
 AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
 EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain, may leave of what moves with it
@@ -126,7 +125,7 @@ class Tracks:
 
 
 def make_room(tracks: Tracks, slot: int) -> None:
-    """Let what `slot` held leave the window, in place."""
+    """Let what `slot` held leave the window for the fading sums, in place."""
     t = tracks
     leave_window(t.ids, t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, slot, _MEMORY)
 

@@ -27,7 +27,7 @@ def test_a_body_is_predicted_by_its_own_motion_model() -> None:
     )
     detector, dt = MovingObjectDetector(RIG, ObjectsConfig(), models), 0.1
     detector.step(NO_BACKEND, StereoFeatures.empty(0.0), HERE, NONE)
-    times = np.zeros(detector.config.window)
+    times = np.zeros(detector.setup.config.window)
     body = new_body(1, np.array([0, 0, 3.0]), np.array([0, 0.2, 0, 1.0, 0, 0]), times, 0.0, 0.1)
     detector.bodies[1] = body
     detector.step(NO_BACKEND, StereoFeatures.empty(dt), replace(HERE, stamp=dt), NONE)

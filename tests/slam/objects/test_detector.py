@@ -117,7 +117,7 @@ def test_what_leaves_the_window_is_remembered_and_nothing_else():
         system.process_features(sequence.simulate(k).features)
     tracks = system.objects.tracks
     alive = tracks.ids >= 0
-    assert not tracks.dof[alive & ~tracks.seen, system.objects.slot].any()
+    assert not tracks.dof[alive & ~tracks.seen, system.objects._number % 12].any()
     full = tracks.count(np.arange(len(tracks))) == system.config.objects.window
     first = alive & (tracks.ids < len(sequence.simulate(0).features) // 2)  # begun in the first frame
     assert (full & first).any() and (np.trace(tracks.older_A[full & first], axis1=1, axis2=2) > 0).all()

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slam.data import StereoFeatures
 from slam.geometry.se3 import transform
-from slam.objects.config import ObjectsConfig
 from slam.objects.following import follow
-from tests.slam.objects.test_recovery import POINTS, RIG, SIGMA, scene
+from slam.objects.regions import Regions
+from tests.slam.objects.test_recovery import POINTS, RIG, frame_of, scene
 
 
 @pytest.mark.parametrize(("missed", "by_both"), [(1, False), (2, True)])
@@ -18,9 +19,7 @@ def test_a_body_that_was_not_measured_has_no_claim_to_features(missed, by_both):
     body, tracks, features, truth = scene(4, np.zeros(6), np.random.default_rng(3))
     members = np.flatnonzero(tracks.body == body.id)
     free = tracks.begin(np.arange(10, 14), features, np.arange(4), transform(truth, POINTS))
-    local = RIG.triangulate(features.uv_left, features.uv_right)
-    config = ObjectsConfig(max_speed=25.0)
-    follow(tracks, {1: replace(body, missed=missed)}, [], np.eye(4), features, local, 0.1, RIG, SIGMA, config)
+    follow(tracks, {1: replace(body, missed=missed)}, Regions.none(), frame_of(features, 25.0))
     assert (np.sort(np.append(tracks.row[members], tracks.row[free])) >= 0).sum() == (8 if by_both else 4)
     if by_both:
         assert tracks.row[free].tolist() == tracks.row[members].tolist() == [0, 1, 2, 3]
@@ -32,8 +31,20 @@ def test_points_of_a_body_that_is_out_of_sight_keep_their_looks(missed, keeps):
     members = np.flatnonzero(tracks.body == body.id)
     before = tracks.descriptors[members].copy()
     features.descriptors[:] = np.roll(features.descriptors, 20, axis=1) * 0.3 + features.descriptors * 0.9
-    local = RIG.triangulate(features.uv_left, features.uv_right)
-    config = ObjectsConfig(max_speed=25.0)
-    follow(tracks, {1: replace(body, missed=missed)}, [], np.eye(4), features, local, 0.1, RIG, SIGMA, config)
+    follow(tracks, {1: replace(body, missed=missed)}, Regions.none(), frame_of(features, 25.0))
     assert (tracks.row[members] >= 0).all()
     np.testing.assert_array_equal(tracks.descriptors[members], before if keeps else features.descriptors)
+
+
+def test_a_body_takes_points_along_that_are_too_young_for_a_velocity():
+    body, tracks, _, _ = scene(4, np.zeros(6), np.random.default_rng(3))
+    before = body.T.copy()
+    before[0, 3] -= 3.0  # 140 px: its speed and the noise of depth allow 1.9 m
+    points = np.append(POINTS, [[0.1, 0.1, 0.0]], axis=0)
+    uv, uv_right = RIG.project(transform(body.T, points))
+    features = StereoFeatures(
+        0.0, uv, uv_right, np.ones(5), np.zeros(5), np.ones(5), np.ones(5, np.int8), np.eye(5, 64, dtype=np.float32)
+    )
+    (young,) = tracks.begin(np.array([10]), features, np.array([4]), transform(before, points[4:]))
+    follow(tracks, {1: replace(body, T_before=before)}, Regions.none(), frame_of(features, 1.0))
+    assert tracks.row[young] == 4

@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam.geometry.kernels import near_pairs
-from slam.geometry.se3 import exp
-from slam.objects import scene_kernels, track_kernels
+from slam.objects import track_kernels
 
 RNG = np.random.default_rng(5)
 TRACKS, SLOTS = 7, 6
@@ -44,34 +43,6 @@ def test_constant_velocities_are_least_squares_in_point_and_velocity():
         np.testing.assert_allclose(test[n], x[3:] @ np.linalg.solve(covariance[3:, 3:], x[3:]), rtol=1e-5)
 
 
-def test_both_squares_are_the_same_where_the_body_stands_at_the_worlds_origin():
-    """And a turned body only adds the turn of the points: χ² of a fixed point depends on no axes."""
-    A, p, dof = windows()
-    anchor, rows, known = np.zeros((TRACKS, 3)), np.arange(TRACKS), np.ones(SLOTS, bool)
-    still = np.tile(np.eye(4), (SLOTS, 1, 1))
-    turned = np.tile(exp(np.array([0.3, -0.2, 0.5, 0.0, 0.0, 0.0])), (SLOTS, 1, 1))
-    for history in (still, turned):
-        body, world, numbers, count = track_kernels.squares_of_both(A, p, dof, anchor, rows, history, known)
-        np.testing.assert_allclose(body, world, rtol=1e-6)
-        assert list(numbers[:2]) == [15, 18] and list(count[:2]) == [5, 6]
-    points, information, _ = track_kernels.windows_in_body(A, p, dof, anchor, rows, turned, known)
-    np.testing.assert_allclose(track_kernels.squares(points, information), world, rtol=1e-6)
-
-
-def test_the_common_motion_solves_the_normal_equations_where_no_track_pulls():
-    n = 30
-    points, lag = RNG.normal((0, 0, 3), 1.0, (n, 3)), np.full(n, 2.0)
-    motion = np.array([0.01, -0.02, 0.005, 0.01, 0.02, -0.01])
-    d = lag[:, None] * (np.cross(motion[:3], points) + motion[3:])
-    problem = scene_kernels.normal_equations(points, d, np.repeat(1e4 * np.eye(3)[None], n, axis=0), lag)
-    windows = scene_kernels.full_windows(np.ones((n, 3)), np.ones((1, 3)), n + 1)
-    asked = np.full(n + 1, 30.0)
-    group, values, alone, found, scale = scene_kernels.groups_apart(*problem, points, *windows, asked, 4, 1.0)
-    np.testing.assert_allclose(found, motion, atol=1e-6)  # a weak prior draws it to zero
-    np.testing.assert_allclose(alone, 0.0, atol=1e-4)
-    assert scale == 1.0 and not len(values) and (group == -1).all()
-
-
 def test_a_displacement_is_less_certain_by_the_slide_of_a_feature_seen_from_elsewhere():
     """The camera goes by 0.2 m across a line of sight of 2 m: 0.1 rad, so much variance of the direction, at 2 m."""
     A, p, dof = np.tile(1e6 * np.eye(3), (1, SLOTS, 1, 1)), np.zeros((1, SLOTS, 3)), np.full((1, SLOTS), 3, np.int8)
@@ -82,26 +53,6 @@ def test_a_displacement_is_less_certain_by_the_slide_of_a_feature_seen_from_else
         _, W, _ = track_kernels.displaced(A, p, dof, *none, np.array([0]), ages, 3, ray, centres, slide)
         P[slide] = np.linalg.inv(W[0])
     np.testing.assert_allclose(P[1e-4] - P[0.0], 1e-4 * 0.1 * 2.0**2 * np.diag([1.0, 1.0, 0.0]), atol=1e-12)
-
-
-def test_windows_hold_all_tracks_of_their_cells():
-    """Against a dictionary of cells, for every size and offset; tracks ascend, and so do the cells."""
-    rng = np.random.default_rng(5)
-    place, sizes, support = rng.uniform(-1, 1, (120, 3)), np.array([[0.4, 0.4, 0.8], [0.8, 0.8, 1.6]]), 4
-    starts, tracks, centres, widths = scene_kernels.full_windows(place, sizes, support)
-    expected = []
-    for size in sizes:
-        for offset in np.ndindex(2, 2, 2):
-            cells: dict[tuple, list[int]] = {}
-            for n, cell in enumerate(np.floor(place / size + 0.5 * np.array(offset)).astype(int).tolist()):
-                cells.setdefault(tuple(cell), []).append(n)
-            full = sorted(cell for cell, inside in cells.items() if len(inside) >= support)
-            expected += [(size * (np.array(cell) + 0.5 - 0.5 * np.array(offset)), size, cells[cell]) for cell in full]
-    assert len(expected) == len(centres) > 20
-    for m, (centre, width, inside) in enumerate(expected):
-        assert tracks[starts[m] : starts[m + 1]].tolist() == inside
-        np.testing.assert_allclose(centres[m], centre, atol=1e-12)
-        np.testing.assert_allclose(widths[m], width)
 
 
 def test_pairs_of_near_gaussians():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ WINDOW = 12
 SLOT = WINDOW - 1
 SIGMA = 0.002  # [m]
 RIG = StereoRig.rectified_pair(260.0, 160, 120, 0.12, 320, 240)
+FRAME: Any = SimpleNamespace(setup=SimpleNamespace(config=ObjectsConfig()), slot=SLOT, resolves=lambda _: True)
 TIMES = (np.arange(WINDOW) - SLOT) / 30.0
 
 
@@ -81,13 +84,13 @@ def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> No
     seen = np.concatenate([seen_from(poses, local[:12], 2), seen_from(path(LID), local[12:], 3)])
     tracks = table(seen)
     body = body_along(poses, np.arange(16), tracks)
-    gains = membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())
+    gains = membership.update_members({1: body}, FRAME, tracks)
     lid = np.arange(12, 16)
     assert (tracks.body[:12] == 1).all()
     assert (tracks.body[lid] == -1).all() and tracks.expelled[lid].all()
     assert len(gains[1]) == 12
     record(tracks, lid, SLOT, seen[lid, SLOT], np.broadcast_to(np.eye(3) / SIGMA**2, (4, 3, 3)), np.full(4, 3, np.int8))
-    membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())
+    membership.update_members({1: body}, FRAME, tracks)
     assert (tracks.body[lid] == -1).all()
 
 
@@ -182,5 +185,5 @@ def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:
     still = np.tile(path(MOVING)[SLOT], (WINDOW, 1, 1))
     tracks = table(seen_from(still, local, 10))
     body = body_along(still, np.arange(8), tracks)
-    membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())
+    membership.update_members({1: body}, FRAME, tracks)
     assert tracks.sure[:8].all() and not tracks.sure[8]

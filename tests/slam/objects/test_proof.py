@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from slam.geometry.se3 import points_by_pose
-from slam.objects.displacements import Displacements
 from slam.objects.proof import PROVEN, Way, with_frame
-from slam.objects.regions import Scene
+from slam.objects.scene import Displacements, Scene
 
 
 def scene(sigma: float = 1e-6) -> Scene:

@@ -16,12 +16,14 @@ from slam.objects import membership
 from slam.objects.bodies import new_body, with_extent
 from slam.objects.config import ObjectsConfig
 from slam.objects.estimator import BodyEstimator
+from slam.objects.frame import Frame, Setup
 from slam.objects.recovery import located
 from slam.objects.tracks import Tracks
 
 RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
-SIGMA, WINDOW = 0.7, 12
-ESTIMATOR = BodyEstimator(RIG, models_for("driving"))
+WINDOW = 12
+MODELS = models_for("driving")
+ESTIMATOR = BodyEstimator(RIG, MODELS)
 CAMERAS = RecentPoses(np.array([-0.1, 0.0]), np.tile(np.eye(4), (2, 1, 1)), 1e-10 * np.eye(12))
 POINTS = np.array([[0.3, 0.0, 0.0], [-0.3, 0.4, 0.1], [0.0, -0.6, 0.2], [0.2, 0.5, -0.1]])
 
@@ -54,11 +56,17 @@ def scene(seen, off, rng, deviation=0.5):
     return body, tracks, features, truth
 
 
+def frame_of(features, max_speed=40.0):
+    """The frame of some features, with the camera at the world's origin."""
+    setup = Setup(RIG, ObjectsConfig(max_speed=max_speed), MODELS)
+    stamps = np.concatenate([[-0.1, 0.0], np.full(WINDOW - 2, np.nan)])
+    local = RIG.triangulate(features.uv_left, features.uv_right)
+    return Frame(setup, 1, features, local, stamps, np.tile(np.eye(4), (WINDOW, 1, 1)), CAMERAS)
+
+
 def place(body, tracks, features):
     """Its pose after the frame, None where it was not measured."""
-    local = RIG.triangulate(features.uv_left, features.uv_right)
-    config = ObjectsConfig(max_speed=40.0)
-    belief = located(body, tracks, features, local, CAMERAS, ESTIMATOR, RIG, SIGMA, config, 0)
+    belief = located(body, tracks, frame_of(features), ESTIMATOR)
     return belief.estimate.T_world_object if belief.estimate.measured else None
 
 

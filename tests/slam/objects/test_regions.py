@@ -1,100 +1,108 @@
+"""Regions that are followed until they have moved by their own size: tracks come and go, the region stays."""
+
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
+import pytest
 
-from slam.geometry.se3 import hat
-from slam.objects.displacements import Displacements
-from slam.objects.regions import classify_scene, tail
+from slam.data import RecentPoses, StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.models import models_for
+from slam.objects import regions
+from slam.objects.config import ObjectsConfig
+from slam.objects.frame import Frame, Setup
+from slam.objects.regions import Regions, follow_regions, proven_region
+from slam.objects.tracks import ConstantVelocity
 
-RNG = np.random.default_rng(3)
-
-
-def scene(count=80, near=12, shift=(0.0, 0.0, 0.0), pose_error=(0.0,) * 6, noise=1e-3):
-    """A wall with a group of nearer points before it; the pose error displaces all, the shift the near ones."""
-    points = np.column_stack([RNG.uniform(-1, 1, (count, 2)), RNG.uniform(2.0, 2.4, count)])
-    points[:near] = np.column_stack([RNG.uniform(-0.1, 0.1, (near, 2)), RNG.uniform(0.95, 1.05, near)])
-    pose_error = np.asarray(pose_error)
-    d = pose_error[3:] - np.einsum("nij,j->ni", hat(points), pose_error[:3]) + noise * RNG.standard_normal((count, 3))
-    d[:near] += shift
-    W = np.repeat(np.eye(3)[None] / noise**2, count, axis=0)
-    view = np.column_stack([points[:, :2] / points[:, 2:], np.log(points[:, 2])])
-    return Displacements(points, d, W, np.ones(count)), view
+DT, WINDOW = 0.1, 12
+VELOCITY, START = np.array([0.5, 0.0, 5.0]), np.array([5.0, 0, 20])
+RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
+SETUP = Setup(RIG, ObjectsConfig(size=2.0, min_speed=1.0, max_speed=25.0), models_for("driving"))
 
 
-def test_a_wrong_pose_moves_nothing():
-    """A rotation of 20 mrad and a shift of 2 cm displace every point by more than ten deviations."""
-    moved, view = scene(pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
-    found = classify_scene(moved, view, 30.0, 4)
-    assert not found.groups
-    assert found.alone.max() < 30  # χ²(3) of 80 points: 99.9999 %
+def frame(dt: float = DT, camera: float = 0.0) -> Frame:
+    stamps = np.concatenate([[-dt, 0.0], np.full(WINDOW - 2, np.nan)])
+    cameras = RecentPoses(np.zeros(1), np.eye(4)[None], np.diag([0.0] * 3 + [camera] * 3))
+    poses = np.tile(np.eye(4), (WINDOW, 1, 1))
+    return Frame(SETUP, 1, StereoFeatures.empty(0.0), np.zeros((0, 3)), stamps, poses, cameras)
 
 
-def test_the_near_group_is_found_though_the_pose_is_wrong():
-    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
-    found = classify_scene(moved, view, 30.0, 4)
-    assert len(found.groups) == 1
-    assert set(found.groups[0].members) <= set(range(12)) and len(found.groups[0].members) >= 10
-    assert abs(found.groups[0].away - 0.006) < 0.002
+def step(monkeypatch, r, points, velocities, rng, still=(), test=50.0, dt=DT, camera=0.0):
+    """A frame's tracks, known to 0.1 m and 0.5 m/s; those at `still` are fixed points. Regions, members, and bodies."""
+    n = len(points)
+    tests = np.broadcast_to(test, n).copy()
+    tests[list(still)] = 1.0
+    motion = ConstantVelocity(
+        points, np.tile(0.01 * np.eye(3), (n, 1, 1)), velocities + 0.2 * rng.standard_normal((n, 3)),
+        np.tile(0.25 * np.eye(3), (n, 1, 1)), tests,
+    )  # fmt: skip
+    monkeypatch.setattr(regions, "constant_velocity", lambda *_: motion)
+    yes, no = np.ones(n, bool), np.zeros(n, bool)
+    tracks: Any = SimpleNamespace(seen=yes, body=np.full(n, -1), still=no, count=lambda rows: np.full(len(rows), 4))
+    now = frame(dt, camera)
+    r, members = follow_regions(r, now, tracks)
+    return r, members, [i for i, rows in members if proven_region(r, i, len(rows), now)]
 
 
-def test_where_the_near_group_rules_the_pose_it_is_still_the_one_that_moves():
-    """The pose follows the box, so that its own points stand still and the wall is displaced."""
-    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.0, 0.0, -0.006, 0.0, 0.0]))
-    found = classify_scene(moved, view, 30.0, 4)
-    assert len(found.groups) == 1 and set(found.groups[0].members) <= set(range(12))
+def run(monkeypatch, frames, speed, seed, velocity=VELOCITY, around=0, camera=0.0):
+    """Three tracks at a time at a place that goes with `speed`; `around` still points inside it."""
+    r, rng = Regions.none(), np.random.default_rng(seed)
+    for k in range(frames):
+        points = START + k * DT * speed + rng.uniform(-0.5, 0.5, (3 + around, 3))
+        velocities = np.concatenate([np.tile(velocity, (3, 1)), np.zeros((around, 3))])
+        r, _, bodies = step(monkeypatch, r, points, velocities, rng, range(3, 3 + around), camera=camera)
+        yield r, bodies
 
 
-def test_too_few_tracks_say_nothing():
-    moved, view = scene(count=8, near=4, shift=(0.1, 0, 0))
-    assert not classify_scene(moved, view, 30.0, 4).groups
+def test_short_tracks_on_a_moving_region_make_a_body_once_it_has_moved_by_its_size(monkeypatch):
+    steps = list(run(monkeypatch, 10, VELOCITY, 0))
+    assert all(len(r) == 1 for r, _ in steps)
+    moved = DT * np.linalg.norm(VELOCITY) * np.arange(10)
+    assert not any(bodies for (_, bodies), way in zip(steps, moved) if way < 1.5)
+    assert steps[-1][1] == [0]
+    assert steps[-1][0].state[0, 3:] == pytest.approx(VELOCITY, abs=0.5)
 
 
-def test_single_false_tracks_find_no_company():
-    """Three tracks that jumped, each its own way: no window holds enough that moved alike."""
-    moved, view = scene()
-    for row, jump in zip((20, 40, 60), np.eye(3)):
-        moved.d[row] += 0.5 * jump
-    found = classify_scene(moved, view, 30.0, 4)
-    assert not found.groups
-    assert set(np.flatnonzero(found.alone > 100)) == {20, 40, 60}
+@pytest.mark.parametrize(
+    ("speed", "velocity", "around", "camera"),
+    [
+        (0 * VELOCITY, VELOCITY, 0, 0.0),  # false velocities of what stands still
+        (VELOCITY, VELOCITY, 4, 0.0),  # as many still points inside
+        (np.array([3.0, 0, 0]), np.array([1.5, 0, 0]), 0, 0.0),  # it takes up other still tracks, not by its velocity
+        (VELOCITY, VELOCITY, 0, 4.0),  # all is within the error of the camera
+    ],
+)
+def test_what_does_not_move_by_itself_for_certain_makes_none(monkeypatch, speed, velocity, around, camera):
+    assert not any(bodies for _, bodies in run(monkeypatch, 12, speed, 1, velocity, around, camera))
 
 
-def test_two_groups_that_move_differently_are_two():
-    moved, view = scene(count=120, near=12, shift=(0.006, 0.0, 0.0))
-    second = np.arange(12, 24)
-    moved.points[second] = np.column_stack([RNG.uniform(0.4, 0.5, (12, 2)), RNG.uniform(0.95, 1.05, 12)])
-    view[second] = np.column_stack(
-        [moved.points[second, :2] / moved.points[second, 2:], np.log(moved.points[second, 2])]
-    )
-    moved.d[second] += (0.0, -0.008, 0.0)
-    found = classify_scene(moved, view, 30.0, 4)
-    assert len(found.groups) == 2
-    assert {frozenset(g.members <= 11) for g in found.groups} == {frozenset({True}), frozenset({False})}
+@pytest.mark.parametrize(("test", "contradicts"), [(1000.0, 0), (20.0, 1)])
+def test_what_moves_in_any_case_does_not_contradict_a_region(monkeypatch, test, contradicts):
+    """Depths of a track may jump; it says little against the region's motion that explains far more than stillness."""
+    r, rng = [*run(monkeypatch, 1, VELOCITY, 3)][-1][0], np.random.default_rng(3)
+    velocities = np.array([*[VELOCITY] * 3, 2 * VELOCITY])
+    tests = np.array([50.0, 50.0, 50.0, test])
+    after, *_ = step(monkeypatch, r, START + DT * VELOCITY + np.zeros((4, 3)), velocities, rng, test=tests)
+    assert after.contradicting[0] == contradicts
 
 
-def test_where_errors_have_heavy_tails_a_small_group_that_agrees_by_chance_does_not_move():
-    """Displacements of a third of the scene are four times as uncertain as modelled: so may be those of the group."""
-    found = {}
-    for spoilt in (False, True):
-        moved, view = scene(shift=(0.0022, 0.0, 0.0))
-        if spoilt:
-            third = RNG.permutation(np.arange(12, 80))[:27]
-            moved.d[third] += 4e-3 * RNG.standard_normal((27, 3))
-        found[spoilt] = classify_scene(moved, view, 20.0, 4)
-    assert len(found[False].groups) == 1
-    assert not found[True].groups
-    assert tail(found[True].alone) > 1.5 > tail(found[False].alone)
+def test_where_depth_is_noisier_than_the_region_nothing_is_followed(monkeypatch):
+    rng = np.random.default_rng(3)
+    for depth, count in ((20.0, 1), (60.0, 0)):
+        points = np.array([0, 0, depth]) + rng.uniform(0, 1, (5, 3))
+        r, *_ = step(monkeypatch, Regions.none(), points, np.tile(VELOCITY, (5, 1)), rng)
+        assert len(r) == count
+    assert SETUP.radius(60.0) == pytest.approx(3.0) and SETUP.radius(5.0) == 1.0
 
 
-def test_three_bodies_with_a_third_of_the_tracks_do_not_hide_each_other():
-    """The tail of errors is that of the tracks in no group: bodies together may have more than a quarter of all."""
-    moved, view = scene(count=200, near=24, shift=(0.006, 0.0, 0.0))
-    for start, x, shift in ((24, 0.45, (0.0, -0.008, 0.0)), (48, -0.45, (0.0, 0.007, 0.003))):
-        rows = slice(start, start + 24)
-        moved.points[rows] = np.column_stack(
-            [RNG.uniform(x - 0.05, x + 0.05, 24), RNG.uniform(-0.1, 0.1, 24), RNG.uniform(0.95, 1.05, 24)]
-        )
-        view[rows] = np.column_stack([moved.points[rows, :2] / moved.points[rows, 2:], np.log(moved.points[rows, 2])])
-        moved.d[rows] += shift
-    found = classify_scene(moved, view, 30.0, 4)
-    assert sorted(int(group.members.min()) // 24 for group in found.groups) == [0, 1, 2]
+def test_tracks_from_everywhere_are_no_region(monkeypatch):
+    """After a long gap the region may be anywhere; what then agrees with its motion does not lie in it."""
+    r, rng, gap = [*run(monkeypatch, 2, VELOCITY, 4)][-1][0], np.random.default_rng(4), 20.0
+    points = START + gap * VELOCITY + rng.uniform(-1, 1, (60, 3)) * np.array([8.0, 3.0, 8.0])
+    r, members, _ = step(monkeypatch, r, points, np.tile(VELOCITY, (60, 1)), rng, dt=gap)
+    for i, rows in members:
+        away = np.linalg.norm(points[rows] - r.state[i, :3], axis=1)
+        assert len(rows) < 6 and (away < 4.0).all()

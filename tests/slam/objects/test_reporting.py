@@ -52,7 +52,7 @@ def test_a_body_whose_covariance_has_run_away_is_not_reported_and_starts_anew(mo
     step, detector = moving_box
     ids = {thing.id for k in range(EVEN, GONE - 10) for thing in step(k).objects}
     with monkeypatch.context() as patch:
-        patch.setattr(type(detector.models), "known", lambda *_: False)
+        patch.setattr(type(detector.setup.models), "known", lambda *_: False)
         assert not step(GONE - 10).objects
         assert all(body.belief is None for body in detector.bodies.values())
     after = [step(k).objects for k in range(GONE - 9, GONE)]

@@ -51,7 +51,7 @@ def velocities(revised):
         estimate = Estimate(features.stamp, T, 1e-6 * np.eye(6), *NO_LANDMARKS)
         detector.step(NO_BACKEND, features, estimate, np.full(len(points), -1))
     rows = np.flatnonzero(detector.tracks.seen)
-    times = detector._times(features)
+    times = np.nan_to_num(detector._stamps - features.stamp)
     return constant_velocity(detector.tracks, rows, times, 25.0).velocity[:, 2]
 
 
