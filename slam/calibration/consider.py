@@ -7,6 +7,11 @@ With δ the error of the applied correction and ``Σ`` its covariance, poses and
 Measurements of a path have been corrected by different corrections c_k. With θ the true parameters, the error that
 they leave is ``Σ_k G_k F_k (θ − c_k) = J θ − Σ_k G_k F_k c_k``, with gains G_k and fields F_k. So δ is θ, the
 baseline's length, and 1, whose column has the field ``−F_k c_k``.
+
+Some changes of the parameters move the right row alone: the direction of the baseline across, say. Back ends do not
+measure it. So what they follow are combinations ``Vᵀ δ`` (`RigModel.seen`), with the field F V: as ``F = F V Vᵀ``, all
+covariances are the same. Fewer cannot be followed: combinations that hardly move pixels are those of which a recording
+teaches little, and after some seconds they are a good part of the covariance.
 """
 
 from __future__ import annotations
@@ -43,6 +48,7 @@ class RemainingRigError:
         self._calibration, self.measured_with = calibration, calibration.applied
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
+        self._seen = calibration.model.seen
 
     def follow(self, backend: Backend, pose: Array | None = None) -> None:
         """Let a back end that can follow the errors, before its first frame; `pose` (6, m) is J of its first pose."""
@@ -50,13 +56,11 @@ class RemainingRigError:
             backend.consider(self.field, pose)
 
     def field(self, z: Array) -> Array:
-        """Derivatives (N, 3, n + 2) of true rows (uL, vL, uR) by parameters, baseline and 1, at corrected ones."""
-        model = self._calibration.model
+        """Derivatives (N, 3, k + 1) of true rows (uL, vL, uR) by what is followed and by 1, at corrected rows."""
+        model, seen = self._calibration.model, self._seen
         points = np.column_stack([z[:, :2] - model.origin, z[:, 0] - z[:, 2]])
-        field = np.zeros((*z.shape, len(model.names) + 2))
-        field[:, :, :-2] = model.field(points)
-        field[:, 2, -2] = -points[:, 2]  # with a longer baseline, the nominal one's disparity is smaller
-        field[:, :, -1] = -field[:, :, :-2] @ (self._calibration.applied.parameters - self._revised)
+        known = -seen[:-1].T @ (self._calibration.applied.parameters - self._revised)
+        field = model.field_of(points, np.column_stack([seen, seen @ known]))
         field[:, 2] = field[:, 0] - field[:, 2]  # of uR
         return field
 
@@ -113,20 +117,21 @@ class RemainingRigError:
         J, revised = backend.sensitivities(np.zeros(0, np.int64))[0], self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
-            J[:, -1] -= J[:, :-2] @ self._revised
+            J[:, -1] -= J[:, :-1] @ (self._seen[:-1].T @ self._revised)
         return CommonError(J, self._common_root(revised))
 
     def _common_root(self, revised: Array) -> Array:
-        """Square root (n + 2, n + 2) of the mean square of parameters less `revised` (n,), baseline, and 1.
+        """Square root (k + 1, k + 1) of the mean square of what is followed, less that of `revised` (n,), and of 1.
 
         It is the symmetric root, so that its columns mean the same in all frames.
         """
-        covariance = self._calibration.covariance
+        covariance, seen = self._calibration.covariance, self._seen
         if self._root is None or not np.array_equal(self._root[0], covariance):
-            values, vectors = np.linalg.eigh(covariance)
-            root = np.diag([*np.zeros(len(values)), BASELINE, 1.0])
-            root[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
+            followed = seen[:-1].T @ covariance @ seen[:-1] + BASELINE**2 * np.outer(seen[-1], seen[-1])
+            values, vectors = np.linalg.eigh(followed)
+            root = np.eye(len(values) + 1)
+            root[:-1, :-1] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
             self._root = covariance, root
         root = self._root[1].copy()
-        root[:-2, -1] = self._calibration.applied.parameters - revised
+        root[:-1, -1] = seen[:-1].T @ (self._calibration.applied.parameters - revised)
         return root
