@@ -5,13 +5,8 @@ With δ the error of the applied correction and ``Σ`` its covariance, poses and
 (`slam.interfaces.ConsideringBackend`); what is known of δ is the self-calibration's.
 
 Measurements of a path have been corrected by different corrections c_k. With θ the true parameters, the error that
-they leave is ``Σ_k G_k F_k (θ − c_k) = J θ − Σ_k G_k F_k c_k``, with gains G_k and fields F_k. So δ is θ, the
-baseline's length, and 1, whose column has the field ``−F_k c_k``.
-
-Some changes of the parameters move the right row alone: the direction of the baseline across, say. Back ends do not
-measure it. So what they follow are combinations ``Vᵀ δ`` (`RigModel.seen`), with the field F V: as ``F = F V Vᵀ``, all
-covariances are the same. Fewer cannot be followed: combinations that hardly move pixels are those of which a recording
-teaches little, and after some seconds they are a good part of the covariance.
+they leave is ``Σ_k G_k F_k (θ − c_k) = J θ − Σ_k G_k F_k c_k``, with gains G_k and fields F_k. So δ is what is followed
+of θ (`slam.calibration.followed`) and of the baseline's length, and 1, whose column has the field ``−F_k c_k``.
 """
 
 from __future__ import annotations
@@ -22,14 +17,12 @@ import numpy as np
 
 from slam.calibration.correction import Revision
 from slam.calibration.estimator import SelfCalibration
+from slam.calibration.followed import FollowedErrors
 from slam.data import Estimate
 from slam.geometry.arrays import Array
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
 from slam.rig_error import CommonError
 
-#: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
-#: tenths of a percent. It scales the whole world, so images never show it.
-BASELINE = 0.002
 #: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
 _SIGNIFICANT = 0.5
 
@@ -41,6 +34,7 @@ class RemainingRigError:
         calibration: the self-calibration.
 
     Attributes:
+        followed: the combinations of errors that back ends follow.
         measured_with: the correction of all measurements given to the back end.
     """
 
@@ -48,7 +42,7 @@ class RemainingRigError:
         self._calibration, self.measured_with = calibration, calibration.applied
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
-        self._seen = calibration.model.seen
+        self.followed = FollowedErrors(calibration.model)
 
     def follow(self, backend: Backend, pose: Array | None = None) -> None:
         """Let a back end that can follow the errors, before its first frame; `pose` (6, m) is J of its first pose."""
@@ -57,12 +51,7 @@ class RemainingRigError:
 
     def field(self, z: Array) -> Array:
         """Derivatives (N, 3, k + 1) of true rows (uL, vL, uR) by what is followed and by 1, at corrected rows."""
-        model, seen = self._calibration.model, self._seen
-        points = np.column_stack([z[:, :2] - model.origin, z[:, 0] - z[:, 2]])
-        known = -seen[:-1].T @ (self._calibration.applied.parameters - self._revised)
-        field = model.field_of(points, np.column_stack([seen, seen @ known]))
-        field[:, 2] = field[:, 0] - field[:, 2]  # of uR
-        return field
+        return self.followed.field(z, -self.followed.of(self._calibration.applied.parameters - self._revised))
 
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by the present posterior from now on; returns the change, or None.
@@ -117,7 +106,7 @@ class RemainingRigError:
         J, revised = backend.sensitivities(np.zeros(0, np.int64))[0], self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
-            J[:, -1] -= J[:, :-1] @ (self._seen[:-1].T @ self._revised)
+            J[:, -1] -= J[:, :-1] @ self.followed.of(self._revised)
         return CommonError(J, self._common_root(revised))
 
     def _common_root(self, revised: Array) -> Array:
@@ -125,13 +114,12 @@ class RemainingRigError:
 
         It is the symmetric root, so that its columns mean the same in all frames.
         """
-        covariance, seen = self._calibration.covariance, self._seen
+        covariance = self._calibration.covariance
         if self._root is None or not np.array_equal(self._root[0], covariance):
-            followed = seen[:-1].T @ covariance @ seen[:-1] + BASELINE**2 * np.outer(seen[-1], seen[-1])
-            values, vectors = np.linalg.eigh(followed)
-            root = np.eye(len(values) + 1)
+            values, vectors = np.linalg.eigh(self.followed.covariance(covariance))
+            root: Array = np.eye(len(values) + 1)
             root[:-1, :-1] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
             self._root = covariance, root
         root = self._root[1].copy()
-        root[:-1, -1] = seen[:-1].T @ (self._calibration.applied.parameters - revised)
+        root[:-1, -1] = self.followed.of(self._calibration.applied.parameters - revised)
         return root

@@ -88,29 +88,6 @@ class RigModel:
         both = np.concatenate([parameters, self._gauge @ parameters])
         return np.asarray((_field(points, self.focal).reshape(-1, len(both)) @ both).reshape(-1, 3))
 
-    def field_of(self, points: Array, changes: Array) -> Array:
-        """Change (N, 3, k) [px] of points (N, 3) by k changes (n + 1, k) of the parameters and the baseline's length.
-
-        The last, a share, changes no pixel but the disparity at which the true rig would have seen the point.
-        """
-        both = np.concatenate([changes[:-1], self._gauge @ changes[:-1]])
-        field = (_field(points, self.focal).reshape(-1, len(both)) @ both).reshape(len(points), 3, changes.shape[1])
-        field[:, 2] -= points[:, 2:] * changes[-1]  # with a longer baseline, the nominal one's disparity is smaller
-        return np.asarray(field)
-
-    @cached_property
-    def seen(self) -> Array:
-        """Orthonormal changes (n + 1, k) of the parameters and the baseline that move a point's (x, y, d) anywhere.
-
-        Other changes move the right row alone.
-        """
-        far = self.far()
-        # (0, 0.1, 0.2): disparities [focal lengths], of which the field is linear to quintic
-        points = np.concatenate([far + np.array([0.0, 0.0, d * self.focal]) for d in (0.0, 0.1, 0.2)])
-        field = self.field_of(points, np.eye(len(self.names) + 1))
-        _, sizes, rows = np.linalg.svd(field.reshape(-1, len(self.names) + 1), full_matrices=False)
-        return np.asarray(rows[sizes > 1e-9 * sizes[0]].T)  # 1e-9: numerics, rounding
-
     @cached_property
     def _gauge(self) -> Array:
         """Rotation of the ideal rig (3, n) [rad] that cancels the left image's mean displacement by the parameters."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from slam.calibration import RigModel, SelfCalibrationConfig
+from slam.calibration.followed import BASELINE, FollowedErrors
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import inverse, log
@@ -25,6 +26,7 @@ CONFIG = SystemConfig(
     self_calibration=NEVER_LEARNS,
 )
 MODEL = RigModel(RIG)
+FOLLOWED = FollowedErrors(MODEL)
 
 
 def with_error(features: StereoFeatures, delta: np.ndarray) -> StereoFeatures:
@@ -41,17 +43,29 @@ def error_of(name: str, size: float) -> np.ndarray:
     return delta
 
 
-def followed(delta: np.ndarray) -> np.ndarray:
-    """What a back end follows of an error of the parameters."""
-    return MODEL.seen[:-1].T @ delta
-
-
 def run(backend: str, delta: np.ndarray, frames: int = 45) -> tuple[StereoSlam, np.ndarray]:
     cloud, system = Cloud(150), StereoSlam(RIG, None, backend, config=CONFIG)
     truth = path(frames)
     for k, T in enumerate(truth):
         system.process_features(with_error(cloud.features(T, k / 30)[0], delta))
     return system, truth[-1]
+
+
+def test_what_is_followed_moves_rows_as_all_errors_do():
+    """Four combinations move the right row alone: shift, scale and tilt of the right image, the baseline's way down."""
+    z = np.random.default_rng(0).uniform([0, 0, -100], [RIG.width, RIG.height, RIG.width], (50, 3))
+    z[0, 2] = np.nan
+    theta = 1e-3 * np.random.default_rng(1).normal(size=len(MODEL.names))
+    root = np.diag([*np.full(len(theta), 1e-3), BASELINE])
+    field, left = np.zeros((50, 3, len(theta) + 1)), z[:, :2] - MODEL.origin
+    points = np.column_stack([left, z[:, 0] - z[:, 2]])
+    field[:, :, :-1], field[:, 2, -1] = MODEL.field(points), -points[:, 2]
+    field[:, 2] = field[:, 0] - field[:, 2]
+    found = FOLLOWED.field(z, FOLLOWED.of(theta))
+    assert found.shape[2] - 1 == len(theta) + 1 - 4
+    np.testing.assert_allclose(found[:, :, -1], field[:, :, :-1] @ theta, atol=1e-8)
+    G, H = found[1:, :, :-1].reshape(147, -1), (field[1:] @ root).reshape(147, -1)
+    np.testing.assert_allclose(G @ FOLLOWED.covariance(root[:-1, :-1] ** 2) @ G.T, H @ H.T, atol=1e-8)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -61,7 +75,7 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size):
     system, T_true = run(backend, delta)
     T = system.backend.estimate(landmarks=False).T_world_left
     actual = log(inverse(T) @ T_true)
-    predicted = system.backend.sensitivities([])[0][:, :-1] @ followed(delta)
+    predicted = system.backend.sensitivities([])[0][:, :-1] @ FOLLOWED.of(delta)
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
     assert np.linalg.norm(predicted - actual) < BACKENDS[backend] * np.linalg.norm(actual)
 
@@ -79,7 +93,7 @@ def test_landmarks_move_as_their_sensitivities_say(backend):
     ids = system.landmarks.ids
     estimated, by_rig = system.backend.positions(ids), system.backend.sensitivities(ids)[1]
     actual = cloud.points[[points[i] for i in ids.tolist()]] - estimated
-    predicted = by_rig[:, :, :-1] @ followed(delta)
+    predicted = by_rig[:, :, :-1] @ FOLLOWED.of(delta)
     assert np.linalg.norm(predicted - actual) < 0.1 * np.linalg.norm(actual)
 
 
@@ -127,6 +141,6 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
             system.calibration._motion_agrees = lambda: True
         result = system.process_features(cloud.features(T, k / 30)[0])
     assert result.revision is not None
-    np.testing.assert_array_equal(result.common.root[:-1, -1], followed(mean))
+    np.testing.assert_array_equal(result.common.root[:-1, -1], FOLLOWED.of(mean))
     in_path = system._session.rig_error.common(system.backend, as_reported=False).root[:-1, -1]
-    np.testing.assert_array_equal(in_path, followed(0 * mean if revises else mean))
+    np.testing.assert_array_equal(in_path, FOLLOWED.of(0 * mean if revises else mean))

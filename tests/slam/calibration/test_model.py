@@ -72,18 +72,6 @@ def test_a_shift_of_the_left_image_does_not_turn_the_rig(name):
     assert np.abs(change.mean(axis=0)).max() < 0.05 * 0.01 * F  # the image as a whole stays where it is
 
 
-def test_changes_that_nothing_shows_to_a_back_end_are_those_of_the_right_row():
-    seen, n = MODEL.seen, len(MODEL.names)
-    points = np.random.default_rng(0).uniform([-600, -180, 0], [600, 180, 150], (200, 3))
-    field = MODEL.field_of(points, np.eye(n + 1))
-    np.testing.assert_allclose(field[:, :, :n], MODEL.field(points), rtol=0, atol=1e-9 * F)
-    np.testing.assert_allclose(MODEL.field_of(points, seen) @ seen.T, field, rtol=0, atol=1e-9 * F)
-    unseen = np.eye(n + 1) - seen @ seen.T
-    assert np.trace(unseen) == pytest.approx(4)  # the right rows' shift, scale and tilt, and the baseline's way down
-    for name in ("right_cy", "right_aspect", "down"):
-        assert unseen[MODEL.names.index(name), MODEL.names.index(name)] == pytest.approx(1)
-
-
 def test_sums_of_residual_fields_need_not_build_them():
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-400, 400, 9), rng.uniform(-150, 150, 9), rng.uniform(0, 40, 9)])
