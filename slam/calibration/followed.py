@@ -49,9 +49,9 @@ class FollowedErrors:
         return np.asarray(self._V.T @ parameters @ self._V + np.outer(self._by_baseline, self._by_baseline))
 
     def field(self, z: Array, known: Array) -> Array:
-        """Derivatives (N, 3, k + 1) of rows (uL, vL, uR) (N, 3) [px] by the combinations; last, by `known` (k,) of them.
+        """Derivatives (N, 3, k + 1) of rows (uL, vL, uR) (N, 3) [px] by the combinations; last, by `known` (k,).
 
-        A missing uR has none.
+        The last are the sum of the others times `known`. A missing uR has none.
         """
         u, v = self._origin / self._focal
         missing = np.isnan(z[:, 2])
