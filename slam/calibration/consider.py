@@ -12,6 +12,7 @@ of θ (`slam.calibration.followed`) and of the baseline's length, and 1, whose c
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from slam.calibration.estimator import SelfCalibration
 from slam.calibration.followed import FollowedErrors
 from slam.data import Estimate
 from slam.geometry.arrays import Array
+from slam.geometry.se3 import adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
 from slam.rig_error import CommonError
 
@@ -41,6 +43,7 @@ class RemainingRigError:
     def __init__(self, calibration: SelfCalibration) -> None:
         self._calibration, self.measured_with = calibration, calibration.applied
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
+        self._turned = np.zeros(6)  # how the world turned as the whole path was revised: a motion, on the left
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
         self.followed = FollowedErrors(calibration.model)
 
@@ -73,9 +76,12 @@ class RemainingRigError:
             return None
         revision = Revision(self.measured_with, applied)
         whole = not restarted and backend.revises_path
-        backend.revise(revision.rows)
         if whole:
-            self._revised = self._revised + applied.parameters - self.measured_with.parameters
+            step = applied.parameters - self.measured_with.parameters
+            self._revised = self._revised + step
+            if isinstance(backend, ConsideringBackend):
+                self._turned = self._turned + _adjoint_of(backend) @ _of_pose(backend)[:, :-1] @ self.followed.of(step)
+        backend.revise(revision.rows)
         self.measured_with = applied
         return revision
 
@@ -96,6 +102,9 @@ class RemainingRigError:
         The covariance that `added_to` adds to the pose is ``J S Sᵀ Jᵀ``. Poses of several frames have the common errors
         ``J₁ S c``, ``J₂ S c``, …, with the same c of unit variance, where S is of the last frame.
 
+        Where a whole path is revised, the newest pose stays and all before it move. Poses as reported keep in this way
+        what the earlier correction did to them: as if the world had turned under the path.
+
         Args:
             backend: the present one.
             as_reported: for poses as reported in each frame, with the correction of that time; else for the present
@@ -103,10 +112,11 @@ class RemainingRigError:
         """
         if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
             return CommonError()
-        J, revised = backend.sensitivities(np.zeros(0, np.int64))[0], self._revised
+        J, revised = _of_pose(backend), self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
             J[:, -1] -= J[:, :-1] @ self.followed.of(self._revised)
+            J[:, -1] += np.linalg.solve(_adjoint_of(backend), self._turned)
         return CommonError(J, self._common_root(revised))
 
     def _common_root(self, revised: Array) -> Array:
@@ -123,3 +133,13 @@ class RemainingRigError:
         root = self._root[1].copy()
         root[:-1, -1] = self.followed.of(self._calibration.applied.parameters - revised)
         return root
+
+
+def _of_pose(backend: ConsideringBackend) -> Array:
+    """J (6, k + 1) of the newest pose."""
+    return backend.sensitivities(np.zeros(0, np.int64))[0]
+
+
+def _adjoint_of(backend: Any) -> Array:
+    """From motions on the right of the newest pose to those on the left of the world (6, 6)."""
+    return adjoint(backend.estimate(landmarks=False).T_world_left)

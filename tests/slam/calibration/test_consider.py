@@ -127,20 +127,30 @@ def test_a_result_says_what_its_error_shares_with_other_frames(backend):
 
 @pytest.mark.parametrize(
     ("backend", "options", "revises"),
-    [("ekf", {}, False), ("smoother", {"lag": None}, True), ("smoother", {"lag": 5, "past": 3, "motion": 0.0}, False)],
-    ids=["ekf", "smoother", "bounded smoother"],
+    [
+        ("ekf", {}, False),
+        ("window", {}, True),
+        ("smoother", {"lag": None}, True),
+        ("smoother", {"lag": 5, "past": 3, "motion": 0.0}, False),
+    ],
+    ids=["ekf", "window", "smoother", "bounded smoother"],
 )
 def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(backend, options, revises):
     system = StereoSlam(RIG, None, backend, config=replace(CONFIG, backend=options))
-    cloud, truth = Cloud(150), path(20)
+    cloud, truth, mean = Cloud(150), path(30), error_of("yaw", 1e-3)
+    revised = None
     for k, T in enumerate(truth):
         if k == 19:
             known = system.calibration._solution
-            mean = error_of("yaw", 1e-3)
             system.calibration._solution = replace(known, mean=mean, inner=1e-4 * known.inner)
             system.calibration._motion_agrees = lambda: True
-        result = system.process_features(cloud.features(T, k / 30)[0])
-    assert result.revision is not None
+        result = system.process_features(with_error(cloud.features(T, k / 30)[0], mean))
+        revised = result.revision or revised
+    assert revised is not None
+    error = log(inverse(result.estimate.T_world_left) @ truth[-1])
+    assert np.linalg.norm(error[3:]) > 1e-3
+    known = result.common.jacobian @ result.common.root[:, -1]
+    assert np.linalg.norm(known - error) < 0.2 * np.linalg.norm(error)
     np.testing.assert_array_equal(result.common.root[:-1, -1], FOLLOWED.of(mean))
     in_path = system._session.rig_error.common(system.backend, as_reported=False).root[:-1, -1]
     np.testing.assert_array_equal(in_path, FOLLOWED.of(0 * mean if revises else mean))
