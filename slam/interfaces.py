@@ -182,6 +182,9 @@ class ConsideringBackend(Protocol):
             field: derivatives (N, 3, m) of the true rectified rows (uL, vL, uR) by δ at corrected rows (N, 3) [px];
                 rows of a missing uR do not count. The last of the errors is known to be 1: a displacement.
             pose: J (6, m) of the first pose; None for zero.
+
+        Raises:
+            MeasurementError: after the first `Backend.predict`, or with landmarks in the map.
         """
         ...
 

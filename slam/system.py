@@ -24,7 +24,7 @@ from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.step import Step
 from slam.naming import count
-from slam.objects.modes import detector_for
+from slam.objects.modes import ObjectDetector, detector_for
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.one_thread import OneThread
@@ -112,14 +112,22 @@ class StereoSlam:
         inside.require_fits(first)
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
         self._session = Session(inside.rig, inner, names[1], first, self.calibration)
-        self.objects = detector_for(inside.rig, c.objects, inner.models)
-        self._tracker = Tracker(self._session, self.objects, self.frontend)
+        self._tracker = Tracker(self._session, detector_for(inside.rig, c.objects, inner.models), self.frontend)
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
         if prior_map is not None:
             prior_map.require_fits(self.frontend_name)
         self._state = self._session.begin(first, prior_map)
+
+    @property
+    def objects(self) -> ObjectDetector:
+        """The detector of what moves; another one may be put in its place."""
+        return self._tracker.objects
+
+    @objects.setter
+    def objects(self, detector: ObjectDetector) -> None:
+        self._tracker.objects = detector
 
     def __repr__(self) -> str:
         frontend = "no front end" if self.frontend is None else type(self.frontend).__name__

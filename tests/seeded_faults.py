@@ -197,8 +197,8 @@ FAULTS = (
     ),
     # calibration
     Fault(
-        "the baseline's forward part moves rows the wrong way", "slam/calibration/model.py",
-        "pose = -1 - y * y, right * y, right, d, -d * y", "pose = -1 - y * y, right * y, right, d, d * y",
+        "the baseline's forward part moves rows the wrong way", "slam/calibration/model_kernels.py",
+        "-1 - y * y, right * y, right, d, -d * y", "-1 - y * y, right * y, right, d, d * y",
         "tests/slam/calibration",
     ),
     Fault(

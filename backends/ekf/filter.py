@@ -27,7 +27,7 @@ from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION
-from slam.window.stereo import Field, RectifiedMeasurement
+from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
@@ -195,6 +195,8 @@ class EkfBackend:
     def consider(self, field: Field, pose: Array | None = None) -> None:
         """See `slam.interfaces.ConsideringBackend.consider`."""
         s, m = self.state, field(np.zeros((0, 3))).shape[2]
+        if s.frame >= 0 or len(s.landmarks):
+            raise MeasurementError(f"{self._form.name}: {TOO_LATE}")
         by_rig = np.zeros((CAMERA, m))
         if pose is not None:
             by_rig[:POSE] = np.linalg.solve(s.camera.by_error(), pose)

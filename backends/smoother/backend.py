@@ -25,7 +25,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
-from slam.window.stereo import Field
+from slam.window.stereo import TOO_LATE, Field
 
 
 class SmootherBackend:
@@ -168,6 +168,8 @@ class SmootherBackend:
 
     def consider(self, field: Field, pose: Array | None = None) -> None:
         """See `slam.interfaces.ConsideringBackend.consider`."""
+        if self.state.started or len(self.state.landmarks):
+            raise MeasurementError(f"smoother: {TOO_LATE}")
         first = np.zeros((6, field(np.zeros((0, 3))).shape[2])) if pose is None else pose
         self._steps, self.state = replace(self._steps, field=field), SmootherState.empty(first)
 

@@ -22,7 +22,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
-from slam.window.stereo import Field
+from slam.window.stereo import TOO_LATE, Field
 
 
 class WindowBackend:
@@ -172,6 +172,8 @@ class WindowBackend:
 
     def consider(self, field: Field, pose: Array | None = None) -> None:
         """See `slam.interfaces.ConsideringBackend.consider`."""
+        if len(self._state.frames) or len(self._state.landmarks):
+            raise MeasurementError(f"window: {TOO_LATE}")
         first = np.zeros((6, field(np.zeros((0, 3))).shape[2])) if pose is None else pose
         self._steps, self._state = replace(self._steps, field=field), WindowState.empty(first)
         self._history = History.of(self._state)

@@ -38,9 +38,9 @@ class RigCorrection:
     def pixels(self, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
         """Corrected rectified pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
         points = self.model.points(np.column_stack([uv_left, uv_right[:, 0]]))
-        vertical = uv_right[:, 1] - uv_left[:, 1] + self.model.vertical(points) @ self.parameters
-        z = self.model.rows(points + self.model.shift(points, self.parameters))
-        return z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
+        change = self.model.shift_with_vertical(points, self.parameters)
+        z = self.model.rows(points + change[:, :3])
+        return z[:, :2], np.column_stack([z[:, 2], z[:, 1] + uv_right[:, 1] - uv_left[:, 1] + change[:, 3]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,6 +64,7 @@ class Accumulator:
     def __init__(self, inflation: float, length: int) -> None:
         self._prior = inflation
         self._blocks: list[Evidence] = []
+        self._sum: Evidence | None = None
         self._length = length
         self._in_last = 0
         self.count = 0
@@ -71,6 +72,7 @@ class Accumulator:
 
     def add(self, evidence: Evidence) -> None:
         """Take in a likelihood."""
+        self._sum = evidence if self._sum is None else self._sum + evidence
         if not self._blocks or self._in_last == self._length:
             self._blocks.append(evidence)
             self._in_last = 0
@@ -87,9 +89,7 @@ class Accumulator:
 
     def total(self) -> Evidence | None:
         """The sum, with its information divided by the inflation; None if there is no likelihood."""
-        if not self._blocks:
-            return None
-        return sum(self._blocks[1:], self._blocks[0]).scaled(1 / self.inflation)
+        return None if self._sum is None else self._sum.scaled(1 / self.inflation)
 
     def update_inflation(self, mean: Array, covariance: Array) -> None:
         """Estimate the inflation from the scatter of the blocks' gradients about the solution of the blocks alone.
@@ -99,11 +99,10 @@ class Accumulator:
         `mean` (n,) is near that solution or not; `covariance` (n, n) is without residual fields.
         """
         count = len(self._blocks)
-        if count < 2 or self._in_last < self._length:  # it changes slowly: once a block is enough
+        if self._sum is None or count < 2 or self._in_last < self._length:  # it changes slowly: once a block is enough
             return
-        total_S, total_e = (sum(block[i] for block in self._blocks) for i in (0, 1))
         # 1e-12: least eigenvalue of an information that counts, as a share of the largest
-        own = mean + np.linalg.lstsq(total_S, total_e - total_S @ mean, rcond=1e-12)[0]
+        own = mean + np.linalg.lstsq(self._sum.S, self._sum.e - self._sum.S @ mean, rcond=1e-12)[0]
         scatter = terms = 0.0
         for S, e, _ in self._blocks:
             gradient = e - S @ own

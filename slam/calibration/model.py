@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -30,6 +29,7 @@ _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "
 _DEGREES = 5, 3
 RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
 _FIRST, _SECOND = np.array(RESIDUAL).T.copy()
+_SCALES = np.sqrt((2 * _FIRST + 1) * (2 * _SECOND + 1))  # for a mean square of one over the image
 
 
 class RigModel:
@@ -80,13 +80,18 @@ class RigModel:
         the pose rotate with each revision, the ideal rig is rotated such that the left image as a whole does not move.
         """
         field, n = _field(points, self.focal), len(self.names)
-        turned = field[:, :, n:].reshape(-1, 3) @ self._gauge
-        return np.asarray(field[:, :, :n] + turned.reshape(-1, 3, n))
+        return np.asarray(field[:, :3, :n] + field[:, :3, n:] @ self._gauge)
 
     def shift(self, points: Array, parameters: Array) -> Array:
         """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,): ``field(points) @ parameters``."""
+        return self.shift_with_vertical(points, parameters)[:, :3]
+
+    def shift_with_vertical(self, points: Array, parameters: Array) -> Array:
+        """Change (N, 4) [px] as of `shift`, then of the vertical disparity: ``vertical(points) @ parameters``."""
+        from slam.calibration.model_kernels import shift
+
         both = np.concatenate([parameters, self._gauge @ parameters])
-        return np.asarray((_field(points, self.focal).reshape(-1, len(both)) @ both).reshape(-1, 3))
+        return np.asarray(shift(np.ascontiguousarray(points, float), self.focal, both))
 
     @cached_property
     def _gauge(self) -> Array:
@@ -101,11 +106,7 @@ class RigModel:
         A pair of pixels of one point on an ideal rig has none; the baseline's direction adds
         ``d · (forward · y - down)``, which the correction takes away.
         """
-        x, y, d = points.T / self.focal
-        right = x - d
-        pose = -1 - y * y, right * y, right, d, -d * y
-        left_lens, right_lens = (lens_change(u, y)[1] for u in (x, right))
-        return self.focal * np.concatenate([-left_lens, right_lens, np.stack(pose, axis=1)], axis=1)
+        return _field(points, self.focal)[:, 3, : len(self.names)]
 
     def residual_products(self, factors: Array, points: Array) -> Array:
         """Sum over points (N, 3) of factors (N, 3, n) times the residual fields (N, 3, m) there: (n, m).
@@ -132,29 +133,21 @@ class RigModel:
 
     def _polynomials(self, x: Array, y: Array) -> Array:
         """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
+        from slam.calibration.model_kernels import polynomials
+
         # 1.1: polynomials are held constant beyond the image, this many half widths from its centre
-        at = np.clip((np.column_stack([x, y]) - self._centre) / self._half, -1.1, 1.1)
-        by_x, by_y = (legvander(v, n) * np.sqrt(2 * np.arange(n + 1) + 1) for v, n in zip(at.T, _DEGREES))
-        return np.asarray(by_x[:, _FIRST] * by_y[:, _SECOND])
+        at = (np.stack([x, y]) - self._centre[:, None]) / self._half[:, None]
+        return np.asarray(polynomials(at, 1.1, _FIRST, _SECOND, _SCALES)).T
 
 
 def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
     """Change of x and of y (N, 8 each) [focal lengths] by the parameters of one camera, see `LENS`."""
-    r2, both, none, one = x * x + y * y, 2 * x * y, np.zeros(len(x)), np.ones(len(x))
-    along = one, none, x, none, x * r2, x * r2 * r2, both, r2 + 2 * x * x
-    across = none, one, y, y, y * r2, y * r2 * r2, r2 + 2 * y * y, both
-    return np.stack(along, axis=1), np.stack(across, axis=1)
+    field = _field(np.column_stack([x, y, np.zeros(len(x))]), 1.0)
+    return field[:, 0, : len(LENS)], field[:, 1, : len(LENS)]
 
 
 def _field(points: Array, focal: float) -> Array:
-    """Change (N, 3, n + 3) [px] of points ``(x, y, d)`` (N, 3) [px] by the parameters, and by a turn of the rig."""
-    x, y, d = points.T / focal
-    right, none, side = x - d, np.zeros(len(x)), len(LENS)
-    out = np.zeros((len(x), 3, 2 * side + len(POSE) + 3))
-    out[:, 0, :side], out[:, 1, :side] = lens_change(x, y)
-    out[:, 2, :side], out[:, 2, side : 2 * side] = out[:, 0, :side], -lens_change(right, y)[0]
-    out[:, 2, 2 * side : -3] = np.stack([right * y, -1 - right * right, y, none, d * right], axis=1)
-    out[:, 0, -3:] = np.stack([-x * y, 1 + x * x, -y], axis=1)
-    out[:, 1, -3:] = np.stack([-1 - y * y, x * y, x], axis=1)
-    out[:, 2, -3:] = np.stack([-d * y, d * x, none], axis=1)
-    return focal * out
+    """Change (N, 4, n + 3) [px] of points (N, 3) [px] and their vertical disparities by parameters and a turn."""
+    from slam.calibration.model_kernels import field
+
+    return np.asarray(field(np.ascontiguousarray(points, float), focal))

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.calibration.evidence import Evidence, student_weights
+from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
-from slam.geometry.se3 import Array, so3_exp
+from slam.geometry.se3 import Array
 
 
 class Pair(NamedTuple):
@@ -61,25 +61,12 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
     `R` (3, 3) and `t` (3,) [baselines] a first guess. Of the `noise`, a point's covariance (3, 3) [px²], only the form
     matters.
     """
-    points, last = first, np.inf
-    for _ in range(20):  # 20: iterations at most
-        at = linearised(first, second, points, R, t, focal, noise)
-        squared = at.squared
-        if not np.isfinite(squared).all():
-            return None
-        weights = student_weights(squared, 3, 0.2)  # 0.2: no less than a fifth of the configured noise
-        J, weighted = at.J_motion.reshape(-1, 6), weights[:, None, None] * at.information @ at.J_motion
-        H = weighted.reshape(-1, 6).T @ J
-        step = np.linalg.solve(H + _ridge(H), weighted.reshape(-1, 6).T @ at.residual.ravel())
-        R, t = so3_exp(step[:3]) @ R, t + step[3:]
-        change = (J @ step).reshape(-1, 3)
-        rest = at.information @ (at.residual - change)[:, :, None]
-        points = first + (np.swapaxes(at.J_point, 1, 2) @ rest)[:, :, 0] @ noise
-        last = np.abs(change).max()
-        if not last >= 1e-3:  # 1e-3: [px]; at 0.02 focal lengths were wrong by percents
-            break
+    from slam.calibration.motion_kernels import fit
+
+    arrays = (np.ascontiguousarray(a, float) for a in (first, second, R, t))
+    R, t, points, at, weights, last = fit(*arrays, focal, noise, chi_square_limit(3, 0.5))
     # 3e-3: change of a predicted point [px] in the last iteration: in some pairs single points oscillate
-    return Fit(R, t, points, at, weights) if last < 3e-3 else None
+    return Fit(R, t, points, Linear(*at), weights) if last < 3e-3 else None
 
 
 def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) -> Evidence | None:
@@ -103,14 +90,10 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
     normal, gradient = rows.T @ J.reshape(rows.shape), rows.T @ at.residual.ravel()
     by_point = np.swapaxes(at.J_point, 1, 2) @ by_moved
     cross = model.residual_products(by_point, fit.points) - model.residual_products(by_moved, at.moved)
-    motion = np.linalg.solve(normal[:6, :6] + _ridge(normal[:6, :6]), normal[:6, 6:])  # Schur complement
+    H = normal[:6, :6] + 1e-12 * np.trace(normal[:6, :6]) * np.eye(6)  # invertible
+    motion = np.linalg.solve(H, normal[:6, 6:])  # Schur complement
     S = normal[6:, 6:] - motion.T @ normal[:6, 6:]
     return Evidence(S, S @ parameters + gradient[6:] - motion.T @ gradient[:6], cross[6:] - motion.T @ cross[:6])
-
-
-def _ridge(H: Array) -> Array:
-    """What makes normal equations (6, 6) of a motion invertible."""
-    return 1e-12 * np.trace(H) * np.eye(6)
 
 
 def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:

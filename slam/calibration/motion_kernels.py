@@ -1,21 +1,92 @@
-"""Compiled loop of `slam.calibration.motion`."""
+"""Compiled loops of `slam.calibration.motion`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import invert_symmetric
-from slam.runtime.compilation import kernel
+from slam.kernels.linear import column_times, factorise, invert_symmetric, row_times, solve_factorised, square
+from slam.kernels.se3 import exp
+from slam.runtime.compilation import helper, kernel
 
 
 @kernel
 def linearise(first, second, points, R, t, focal, noise):
     """The fields of `slam.calibration.motion.Linear`; see `slam.calibration.motion.linearised` for the arguments."""
     n = len(points)
-    moved, residual = np.empty((n, 3)), np.empty((n, 3))
-    J_point, J_motion, information = np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3, 3))
+    out = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3)), np.empty((n, 3, 3))
+    _linearise(first, second, points, R, t, focal, noise, *out)
+    return out
+
+
+@kernel
+def fit(first, second, R, t, focal, noise, median):
+    """Gauss-Newton of `slam.calibration.motion.fit_motion`; see there for the arguments.
+
+    Points are weighted as in `slam.calibration.evidence.student_weights`, `median` being that of χ². Returns the fields
+    of `slam.calibration.motion.Fit`, and the last change of a predicted point [px], infinite where there is no
+    solution.
+    """
+    n, last = len(first), np.inf
+    R, t, points, weights = R.copy(), t.copy(), first.copy(), np.empty(len(first))
+    at = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3)), np.empty((n, 3, 3))
+    _, J_point, J_motion, residual, information = at
+    H, step, turn, before = np.empty((6, 6)), np.empty(6), np.empty((3, 4)), np.empty((3, 3))
+    rest, weighted = np.empty(3), np.empty(3)
+    for _ in range(20):  # 20: iterations at most
+        _linearise(first, second, points, R, t, focal, noise, *at)
+        for p in range(n):
+            weights[p] = square(information[p], residual[p])
+        ordered = np.sort(weights)
+        if n == 0 or not np.isfinite(ordered[n - 1]):  # NaN is sorted to the end
+            last = np.inf
+            break
+        # 0.2: no less than a fifth of the configured noise
+        scale = max(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]) / median, 0.2 * 0.2)
+        step[:] = 0.0
+        H[:] = 0.0
+        for p in range(n):
+            weights[p] = 7.0 / (4.0 + weights[p] / scale) / scale
+            for i in range(6):
+                for k in range(3):
+                    weighted[k] = weights[p] * column_times(information[p], k, J_motion[p, :, i])
+                step[i] += weighted[0] * residual[p, 0] + weighted[1] * residual[p, 1] + weighted[2] * residual[p, 2]
+                for j in range(i + 1):
+                    H[i, j] += column_times(J_motion[p], j, weighted)
+        ridge = 1e-12 * (H[0, 0] + H[1, 1] + H[2, 2] + H[3, 3] + H[4, 4] + H[5, 5])
+        for i in range(6):
+            H[i, i] += ridge
+        factorise(H, 6)
+        solve_factorised(H, 6, step)
+        exp(step, turn)
+        before[:] = R
+        for i in range(3):
+            t[i] += step[3 + i]
+            for j in range(3):
+                R[i, j] = column_times(before, j, turn[i])
+        last = 0.0
+        for p in range(n):
+            for i in range(3):
+                change = 0.0
+                for k in range(6):
+                    change += J_motion[p, i, k] * step[k]
+                rest[i] = residual[p, i] - change
+                last = last if abs(change) <= last else abs(change)  # NaN counts
+            for i in range(3):
+                weighted[i] = row_times(information[p], i, rest)
+            for i in range(3):
+                rest[i] = column_times(J_point[p], i, weighted)
+            for i in range(3):
+                points[p, i] = first[p, i] + column_times(noise, i, rest)
+        if not last >= 1e-3:  # 1e-3: [px]; at 0.02 focal lengths were wrong by percents
+            break
+    return R, t, points, at, weights, last
+
+
+@helper
+def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, residual, information):
+    """`linearise` into arrays."""
     by_all, by_depth, B, C = np.empty((3, 9)), np.empty(9), np.empty((3, 3)), np.empty((3, 3))
-    for p in range(n):
+    for p in range(len(points)):
         x, y, d = points[p, 0], points[p, 1], points[p, 2]
         turned = R[0, 0] * x + R[0, 1] * y + R[0, 2] * focal, R[1, 0] * x + R[1, 1] * y + R[1, 2] * focal
         ahead = R[2, 0] * x + R[2, 1] * y + R[2, 2] * focal
@@ -52,4 +123,3 @@ def linearise(first, second, points, R, t, focal, noise):
                 for k in range(3):
                     C[i, j] += B[i, k] * J_point[p, j, k]
         invert_symmetric(C, 0.0, information[p])
-    return moved, J_point, J_motion, residual, information

@@ -86,7 +86,7 @@ def load_recording(path: str | Path) -> Recording:
 
 def _recording(arrays: dict[str, np.ndarray]) -> Recording:
     header = json_text(str(arrays.get("header", "{}")), "header", SequenceError)
-    if header.get("format") != _HEADER["format"]:
+    if not isinstance(header, dict) or header.get("format") != _HEADER["format"]:
         raise SequenceError("is no recording of this version")
     if header["version"] != _HEADER["version"]:
         raise SequenceError(f"is a recording of version {header['version']}; this one reads {_HEADER['version']}")
@@ -101,9 +101,11 @@ def _recording(arrays: dict[str, np.ndarray]) -> Recording:
     rig = StereoRig(left, right, np.array(tree["R"], float), np.array(tree["b"], float))
     models |= {"motion": MotionModel(**models["motion"]), "objects": ObjectModels(**models["objects"])}
     models_for(header["kind"])
+    if not isinstance(header["name"], str):
+        raise SequenceError("its name is no text")
     truth = Trajectory(arrays["truth_stamps"], arrays["truth_poses"]) if "truth_stamps" in arrays else None
     frames = _frames(arrays, rig)
-    return Recording(str(header["name"]), rig, EstimatorModels(**models), frames, truth, kind=header["kind"])
+    return Recording(header["name"], rig, EstimatorModels(**models), frames, truth, kind=header["kind"])
 
 
 def _frames(arrays: Mapping[str, np.ndarray], rig: StereoRig) -> tuple[RecordedFrame, ...]:

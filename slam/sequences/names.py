@@ -191,6 +191,6 @@ def _unevenness(numbers: Sequence[int]) -> float:
 
 def odd_ones(names: Sequence[str]) -> list[str]:
     """Names unlike those of the others but for numbers, where these are few: thumbnails and the like."""
-    forms = [re.sub(r"\d+", "0", stem(name)) for name in names]
+    forms = [re.sub(r"\d+(\.\d+)?", "0", stem(name)) for name in names]
     usual, count = Counter(forms).most_common(1)[0] if forms else ("", 0)
     return [name for name, form in zip(names, forms) if form != usual] if 4 * count >= 3 * len(forms) else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -155,23 +156,33 @@ class Bag:
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open a recording, and close it in the end; SequenceError for every fault of it, or where rosbags is missing."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
+    if find_spec("rosbags") is None:
         line = "ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
-        raise SequenceError(f"{path}: {line}") from None
-    with naming_recording(path), ExitStack() as stack:
-        if path.name.lower().endswith(".zstd"):
-            from backports import zstd  # by which rosbags decompresses, too
+        raise SequenceError(f"{path}: {line}")
+    with ExitStack() as stack:
+        with naming_recording(path):
+            bag = _opened(path, stack)
+        yield bag
 
-            target = Path(stack.enter_context(TemporaryDirectory())) / path.stem
-            with zstd.open(path, "rb") as packed, target.open("wb") as file:
-                shutil.copyfileobj(packed, file)
-            path = target
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        stack.enter_context(reader)
-        yield Bag(path, reader)
+
+def _opened(path: Path, stack: ExitStack) -> Bag:
+    """A recording, of which the stack closes what is open; a compressed file is decompressed as rosbags would."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    if path.name.lower().endswith(".zstd"):
+        try:
+            from compression import zstd  # type: ignore[import-not-found, unused-ignore]
+        except ImportError:  # before Python 3.14
+            from backports import zstd
+
+        target = Path(stack.enter_context(TemporaryDirectory())) / path.stem
+        with zstd.open(path, "rb") as packed, target.open("wb") as file:
+            shutil.copyfileobj(packed, file)
+        path = target
+    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    stack.enter_context(reader)
+    return Bag(path, reader)
 
 
 def camera_info(bag: Bag, topic: str) -> dict[str, Entry]:

@@ -133,6 +133,8 @@ def misuse_is_refused(factory: Factory) -> None:
             raises(MeasurementError, getattr(backend, method), argument, what=f"{method} {what}")
         else:
             getattr(backend, method)(argument)
+    if hasattr(backend, "consider"):
+        raises(MeasurementError, backend.consider, lambda z: np.zeros((*z.shape, 1)), what="consider after predict")
     place: Any = getattr(backend, "place", None)
     for depth in (-5.0, 0.0, float("nan")) if place is not None else ():
         raises(MeasurementError, place, *cloud([7], [[0, 0, depth]]), what=f"place at a depth of {depth}")

@@ -21,6 +21,9 @@ from slam.models import EstimatorModels
 from slam.window.agreement import landmarks_pose
 from slam.window.gating import with_noise
 
+#: Why a back end refuses `slam.interfaces.ConsideringBackend.consider`.
+TOO_LATE = "errors of the rig are followed from before the first predict or insert on"
+
 #: Derivatives (N, 3, m) of measurements (N, 3) by m errors of the rig: see `slam.interfaces.ConsideringBackend`.
 Field = Callable[[Array], Array]
 

@@ -25,6 +25,7 @@ from slam.mapping.atlas.pose_graph import PoseGraph
 from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
 
+_ACTIVE = 200  # cost: loops in the pose graph at most: each makes the next one slower
 _INACTIVE = 200  # cost: loops outside the pose graph that are kept
 _UNKNOWN_DIRECTION = np.pi / np.sqrt(3)  # derived: standard deviation of an unknown angle [rad]
 
@@ -98,6 +99,7 @@ class Atlas:
     confirmed: bool = False  # whether another keyframe shortly before agreed with `pending`
     gaps: tuple[TrackingGap, ...] = ()  # one before each back end but the first
     restarts: int = 0  # number of gaps before the last keyframe
+    dropped: int = 0  # number of this run's loops taken out of the pose graph to save time
     prior_count: int = 0  # number of keyframes of the prior map that this run started in; they come first
 
     def __len__(self) -> int:
@@ -152,7 +154,17 @@ class Atlas:
         """
         closed = sum(loop.second >= self.prior_count for loop in self.loops)
         known = {"known": self.prior_count} if self.prior_count else {}
-        return {"keyframes": len(self), **known, "closed": closed, "refused": len(self.refused)}
+        return {"keyframes": len(self), **known, "closed": closed + self.dropped, "refused": len(self.refused)}
+
+    def with_loop(self, loop: Loop) -> Atlas:
+        """A copy with one more loop; of too many, the one whose neighbours on the path are closest is dropped."""
+        loops, dropped = (*self.loops, loop), self.dropped
+        while len(loops) > _ACTIVE:
+            at = self.travelled[[x.second for x in loops]]
+            least = 1 + int(np.argmin(at[2:] - at[:-2]))
+            dropped += loops[least].second >= self.prior_count
+            loops = loops[:least] + loops[least + 1 :]
+        return replace(self, loops=loops, dropped=dropped)
 
     def with_inactive_loop(self, loop: Loop) -> Atlas:
         """A copy with one more loop outside the pose graph."""

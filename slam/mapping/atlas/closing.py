@@ -61,7 +61,7 @@ def close(
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
             return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
-        return replace(atlas, loops=(*atlas.loops, loop)).solved_by(graph, rig)
+        return atlas.with_loop(loop).solved_by(graph, rig)
     except np.linalg.LinAlgError:
         return replace(given, refused=(*given.refused, loop.pair))
 

@@ -14,7 +14,7 @@ from slam.data import Estimate, FrameResult, Observations, Prediction, StereoFea
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import adjoint, exp, inverse, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.atlas import landmarks_by_pose
+from slam.mapping.atlas.atlas import Loop, landmarks_by_pose
 
 LAP = 100  # frames
 BIAS, SIGMAS = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, 5e-3]), np.array([1e-3, 2e-3, 1e-3, 5e-3, 5e-3, 1e-2])
@@ -179,3 +179,16 @@ def test_a_run_in_a_saved_map_keeps_its_keyframes_and_loops(closed, sequence, tm
     assert kept[: len(pairs)] == pairs
     assert second.atlas.summary()["known"] == len(before)
     assert after.holds == f"{len(after)} landmarks, {len(after.keyframes)} keyframes, {len(after.loops)} loops"
+
+
+def test_loops_stay_bounded_and_spread_along_the_path(closed, monkeypatch):
+    monkeypatch.setattr("slam.mapping.atlas.atlas._ACTIVE", 6)
+    atlas = replace(closed[0].atlas, loops=(), dropped=0)
+    seconds = range(10, len(atlas))
+    for second in seconds:
+        atlas = atlas.with_loop(Loop(second - 10, second, np.eye(4), np.eye(6), 20))
+    kept = [loop.second for loop in atlas.loops]
+    assert (len(kept), kept[0], kept[-1]) == (6, seconds[0], seconds[-1])
+    assert atlas.summary()["closed"] == len(seconds) > 2 * len(kept)
+    gaps = np.diff(atlas.travelled[kept])
+    assert gaps.max() < 0.5 * gaps.sum()
