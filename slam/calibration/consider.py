@@ -5,26 +5,26 @@ With δ the error of the applied correction and ``Σ`` its covariance, poses and
 (`slam.interfaces.ConsideringBackend`); what is known of δ is the self-calibration's.
 
 Measurements of a path have been corrected by different corrections c_k. With θ the true parameters, the error that
-they leave is ``Σ_k G_k F_k (θ − c_k) = J θ − Σ_k G_k F_k c_k``, with gains G_k and fields F_k. So δ is θ, the
-baseline's length, and 1, whose column has the field ``−F_k c_k``.
+they leave is ``Σ_k G_k F_k (θ − c_k) = J θ − Σ_k G_k F_k c_k``, with gains G_k and fields F_k. So δ is what is followed
+of θ (`slam.calibration.followed`) and of the baseline's length, and 1, whose column has the field ``−F_k c_k``.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from slam.calibration.correction import Revision
 from slam.calibration.estimator import SelfCalibration
+from slam.calibration.followed import FollowedErrors
 from slam.data import Estimate
 from slam.geometry.arrays import Array
+from slam.geometry.se3 import adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
 from slam.rig_error import CommonError
 
-#: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
-#: tenths of a percent. It scales the whole world, so images never show it.
-BASELINE = 0.002
 #: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
 _SIGNIFICANT = 0.5
 
@@ -36,13 +36,16 @@ class RemainingRigError:
         calibration: the self-calibration.
 
     Attributes:
+        followed: the combinations of errors that back ends follow.
         measured_with: the correction of all measurements given to the back end.
     """
 
     def __init__(self, calibration: SelfCalibration) -> None:
         self._calibration, self.measured_with = calibration, calibration.applied
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
+        self._turned = np.zeros(6)  # how the world turned as the whole path was revised: a motion, on the left
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
+        self.followed = FollowedErrors(calibration.model)
 
     def follow(self, backend: Backend, pose: Array | None = None) -> None:
         """Let a back end that can follow the errors, before its first frame; `pose` (6, m) is J of its first pose."""
@@ -50,15 +53,8 @@ class RemainingRigError:
             backend.consider(self.field, pose)
 
     def field(self, z: Array) -> Array:
-        """Derivatives (N, 3, n + 2) of true rows (uL, vL, uR) by parameters, baseline and 1, at corrected ones."""
-        model = self._calibration.model
-        points = np.column_stack([z[:, :2] - model.origin, z[:, 0] - z[:, 2]])
-        field = np.zeros((*z.shape, len(model.names) + 2))
-        field[:, :, :-2] = model.field(points)
-        field[:, 2, -2] = -points[:, 2]  # with a longer baseline, the nominal one's disparity is smaller
-        field[:, :, -1] = -field[:, :, :-2] @ (self._calibration.applied.parameters - self._revised)
-        field[:, 2] = field[:, 0] - field[:, 2]  # of uR
-        return field
+        """Derivatives (N, 3, k + 1) of true rows (uL, vL, uR) by what is followed and by 1, at corrected rows."""
+        return self.followed.field(z, -self.followed.of(self._calibration.applied.parameters - self._revised))
 
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by the present posterior from now on; returns the change, or None.
@@ -80,9 +76,12 @@ class RemainingRigError:
             return None
         revision = Revision(self.measured_with, applied)
         whole = not restarted and backend.revises_path
-        backend.revise(revision.rows)
         if whole:
-            self._revised = self._revised + applied.parameters - self.measured_with.parameters
+            step = applied.parameters - self.measured_with.parameters
+            self._revised = self._revised + step
+            if isinstance(backend, ConsideringBackend):
+                self._turned = self._turned + _adjoint_of(backend) @ _of_pose(backend)[:, :-1] @ self.followed.of(step)
+        backend.revise(revision.rows)
         self.measured_with = applied
         return revision
 
@@ -103,6 +102,9 @@ class RemainingRigError:
         The covariance that `added_to` adds to the pose is ``J S Sᵀ Jᵀ``. Poses of several frames have the common errors
         ``J₁ S c``, ``J₂ S c``, …, with the same c of unit variance, where S is of the last frame.
 
+        Where a whole path is revised, the newest pose stays and all before it move. Poses as reported keep in this way
+        what the earlier correction did to them: as if the world had turned under the path.
+
         Args:
             backend: the present one.
             as_reported: for poses as reported in each frame, with the correction of that time; else for the present
@@ -110,23 +112,34 @@ class RemainingRigError:
         """
         if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
             return CommonError()
-        J, revised = backend.sensitivities(np.zeros(0, np.int64))[0], self._revised
+        J, revised = _of_pose(backend), self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
-            J[:, -1] -= J[:, :-2] @ self._revised
+            J[:, -1] -= J[:, :-1] @ self.followed.of(self._revised)
+            J[:, -1] += np.linalg.solve(_adjoint_of(backend), self._turned)
         return CommonError(J, self._common_root(revised))
 
     def _common_root(self, revised: Array) -> Array:
-        """Square root (n + 2, n + 2) of the mean square of parameters less `revised` (n,), baseline, and 1.
+        """Square root (k + 1, k + 1) of the mean square of what is followed, less that of `revised` (n,), and of 1.
 
         It is the symmetric root, so that its columns mean the same in all frames.
         """
         covariance = self._calibration.covariance
         if self._root is None or not np.array_equal(self._root[0], covariance):
-            values, vectors = np.linalg.eigh(covariance)
-            root = np.diag([*np.zeros(len(values)), BASELINE, 1.0])
-            root[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
+            values, vectors = np.linalg.eigh(self.followed.covariance(covariance))
+            root: Array = np.eye(len(values) + 1)
+            root[:-1, :-1] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
             self._root = covariance, root
         root = self._root[1].copy()
-        root[:-2, -1] = self._calibration.applied.parameters - revised
+        root[:-1, -1] = self.followed.of(self._calibration.applied.parameters - revised)
         return root
+
+
+def _of_pose(backend: ConsideringBackend) -> Array:
+    """J (6, k + 1) of the newest pose."""
+    return backend.sensitivities(np.zeros(0, np.int64))[0]
+
+
+def _adjoint_of(backend: Any) -> Array:
+    """From motions on the right of the newest pose to those on the left of the world (6, 6)."""
+    return adjoint(backend.estimate(landmarks=False).T_world_left)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from slam.calibration import RigModel, SelfCalibrationConfig
+from slam.calibration.followed import BASELINE, FollowedErrors
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import inverse, log
@@ -25,6 +26,7 @@ CONFIG = SystemConfig(
     self_calibration=NEVER_LEARNS,
 )
 MODEL = RigModel(RIG)
+FOLLOWED = FollowedErrors(MODEL)
 
 
 def with_error(features: StereoFeatures, delta: np.ndarray) -> StereoFeatures:
@@ -49,6 +51,23 @@ def run(backend: str, delta: np.ndarray, frames: int = 45) -> tuple[StereoSlam, 
     return system, truth[-1]
 
 
+def test_what_is_followed_moves_rows_as_all_errors_do():
+    """Four combinations move the right row alone: shift, scale and tilt of the right image, the baseline's way down."""
+    z = np.random.default_rng(0).uniform([0, 0, -100], [RIG.width, RIG.height, RIG.width], (50, 3))
+    z[0, 2] = np.nan
+    theta = 1e-3 * np.random.default_rng(1).normal(size=len(MODEL.names))
+    root = np.diag([*np.full(len(theta), 1e-3), BASELINE])
+    field, left = np.zeros((50, 3, len(theta) + 1)), z[:, :2] - MODEL.origin
+    points = np.column_stack([left, z[:, 0] - z[:, 2]])
+    field[:, :, :-1], field[:, 2, -1] = MODEL.field(points), -points[:, 2]
+    field[:, 2] = field[:, 0] - field[:, 2]
+    found = FOLLOWED.field(z, FOLLOWED.of(theta))
+    assert found.shape[2] - 1 == len(theta) + 1 - 4
+    np.testing.assert_allclose(found[:, :, -1], field[:, :, :-1] @ theta, atol=1e-8)
+    G, H = found[1:, :, :-1].reshape(147, -1), (field[1:] @ root).reshape(147, -1)
+    np.testing.assert_allclose(G @ FOLLOWED.covariance(root[:-1, :-1] ** 2) @ G.T, H @ H.T, atol=1e-8)
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("name", "size"), [("yaw", 1e-3), ("right_f", 2e-3), ("right_k1", 5e-3)])
 def test_the_pose_moves_as_its_sensitivity_says(backend, name, size):
@@ -56,7 +75,7 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size):
     system, T_true = run(backend, delta)
     T = system.backend.estimate(landmarks=False).T_world_left
     actual = log(inverse(T) @ T_true)
-    predicted = system.backend.sensitivities([])[0][:, : len(delta)] @ delta
+    predicted = system.backend.sensitivities([])[0][:, :-1] @ FOLLOWED.of(delta)
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
     assert np.linalg.norm(predicted - actual) < BACKENDS[backend] * np.linalg.norm(actual)
 
@@ -74,7 +93,7 @@ def test_landmarks_move_as_their_sensitivities_say(backend):
     ids = system.landmarks.ids
     estimated, by_rig = system.backend.positions(ids), system.backend.sensitivities(ids)[1]
     actual = cloud.points[[points[i] for i in ids.tolist()]] - estimated
-    predicted = by_rig[:, :, : len(delta)] @ delta
+    predicted = by_rig[:, :, :-1] @ FOLLOWED.of(delta)
     assert np.linalg.norm(predicted - actual) < 0.1 * np.linalg.norm(actual)
 
 
@@ -108,20 +127,30 @@ def test_a_result_says_what_its_error_shares_with_other_frames(backend):
 
 @pytest.mark.parametrize(
     ("backend", "options", "revises"),
-    [("ekf", {}, False), ("smoother", {"lag": None}, True), ("smoother", {"lag": 5, "past": 3, "motion": 0.0}, False)],
-    ids=["ekf", "smoother", "bounded smoother"],
+    [
+        ("ekf", {}, False),
+        ("window", {}, True),
+        ("smoother", {"lag": None}, True),
+        ("smoother", {"lag": 5, "past": 3, "motion": 0.0}, False),
+    ],
+    ids=["ekf", "window", "smoother", "bounded smoother"],
 )
 def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(backend, options, revises):
     system = StereoSlam(RIG, None, backend, config=replace(CONFIG, backend=options))
-    cloud, truth = Cloud(150), path(20)
+    cloud, truth, mean = Cloud(150), path(30), error_of("yaw", 1e-3)
+    revised = None
     for k, T in enumerate(truth):
         if k == 19:
             known = system.calibration._solution
-            mean = error_of("yaw", 1e-3)
             system.calibration._solution = replace(known, mean=mean, inner=1e-4 * known.inner)
             system.calibration._motion_agrees = lambda: True
-        result = system.process_features(cloud.features(T, k / 30)[0])
-    assert result.revision is not None
-    np.testing.assert_array_equal(result.common.root[:-2, -1], mean)
-    in_path = system._session.rig_error.common(system.backend, as_reported=False).root[:-2, -1]
-    np.testing.assert_array_equal(in_path, 0 * mean if revises else mean)
+        result = system.process_features(with_error(cloud.features(T, k / 30)[0], mean))
+        revised = result.revision or revised
+    assert revised is not None
+    error = log(inverse(result.estimate.T_world_left) @ truth[-1])
+    assert np.linalg.norm(error[3:]) > 1e-3
+    known = result.common.jacobian @ result.common.root[:, -1]
+    assert np.linalg.norm(known - error) < 0.2 * np.linalg.norm(error)
+    np.testing.assert_array_equal(result.common.root[:-1, -1], FOLLOWED.of(mean))
+    in_path = system._session.rig_error.common(system.backend, as_reported=False).root[:-1, -1]
+    np.testing.assert_array_equal(in_path, FOLLOWED.of(0 * mean if revises else mean))
