@@ -23,7 +23,7 @@ from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import known_landmarks
+from slam.mapping.known_landmarks import definite, known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION
@@ -149,8 +149,7 @@ class EkfBackend:
         marks = s.landmarks.select(rows)
         D = self._coordinates.jacobian(marks.anchors, marks.c)
         blocks = D @ (s.covariance.marginals()[0][rows] if landmarks else np.zeros((0, 3, 3))) @ D.transpose(0, 2, 1)
-        covariances = 0.5 * (blocks + blocks.transpose(0, 2, 1))
-        return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, covariances)
+        return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, definite(blocks))
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""

@@ -146,7 +146,7 @@ def _judged(model: RigModel, parameters: Array, noise: float) -> str:
     disparity = float(np.sqrt(np.mean((changed[:, 0] - changed[:, 2]) ** 2)))
     rows = float(np.sqrt(np.mean((changed[:, 1] - changed[:, 3]) ** 2)))
     share = max(disparity, rows) / noise
-    word = "good" if share < 0.2 else "worth correcting (--calibration)" if share < 1 else "bad: calibrate anew"
+    word = "good" if share < 0.2 else "worth correcting, as runs do by default" if share < 1 else "bad: calibrate anew"
     return (
         f"By this the calibration is off by {disparity:.2f} px in disparity and {rows:.2f} px in rows (RMS over the "
         f"image), so that at {_AWAY:g} baselines depths are {100 * disparity / far:.1f} % wrong. This is {word}; "
