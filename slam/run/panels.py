@@ -29,6 +29,7 @@ _TRUTH, _OLD = "0.3", "0.75"
 _LANDMARKS = {"not seen now": ("#7cb342", ".", 2.0), "seen now": ("#c62828", "^", 3.5)}  # told apart by shape, too
 _CORRECTED, _CLOSED, _REFUSED = "#4527a0", "0.1", "#d81b60"  # what loops do
 _BODIES = ("#00838f", "#6a1b9a", "#5d4037", "#ad1457")
+_SEEN = 4.0  # a panel of errors reaches so many times as far as the largest one, at most
 _DASHES = ("-", "--", ":", "-.")  # around bands: where those of two back ends are equal, both are seen
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _SIGMAS = 2.0  # size of ellipses
@@ -192,13 +193,21 @@ def error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
             if len(untracked):
                 label = f"{run.name}, not tracked"
                 axis.plot(untracked, np.zeros(len(untracked)), "x", ms=4, color=colour, label=label)
-    for axis, name, of in zip(axes, ("right", "down", "forward", "rotation"), (unit, unit, unit, "deg")):
+    cut = False
+    for k, (axis, name, of) in enumerate(
+        zip(axes, ("right", "down", "forward", "rotation"), (unit, unit, unit, "deg"), strict=True)
+    ):
+        seen = _SEEN * factors[k] * max(np.nanmax(np.abs(error[:, k]), initial=0.0) for _, error, _ in series)
+        if known and 0 < seen < axis.get_ylim()[1]:  # else the error is a flat line in a wide band
+            axis.set_ylim(-seen if k < 3 else 0, seen)
+            cut = True
         axis.set_ylabel(f"{name} [{of}]" if known else f"σ {name} [{of}]")
         axis.axhline(0, color="0.6", lw=0.5)
         axis.margins(x=0.01)
     measured = any(run.truth is not None and not run.truth_is_exact for run in runs)
     turned, band = (", truth turned to fit", ", with the truth's own errors") if measured else ("", "")
-    errors = f"Error of the online pose{turned}; band: ±3σ as claimed{band}"
+    ends = ", cut where it is far wider" if cut else ""
+    errors = f"Error of the online pose{turned}; band: ±3σ as claimed{band}{ends}"
     set_title(axes[0], errors if known else "No true path is known, so no errors: claimed σ of the online pose")
     axes[-1].set_xlabel("time [s]")
     if len(axes[0].get_legend_handles_labels()[0]) > 1:  # a line alone is that of the one run
