@@ -198,7 +198,8 @@ FAULTS = (
     # calibration
     Fault(
         "the baseline's forward part moves rows the wrong way", "slam/calibration/model_kernels.py",
-        "-1 - y * y, right * y, right, d, -d * y", "-1 - y * y, right * y, right, d, d * y",
+        "vertical_by_pose = -1 - y * y, right * y, right, d, -d * y",
+        "vertical_by_pose = -1 - y * y, right * y, right, d, d * y",
         "tests/slam/calibration",
     ),
     Fault(
