@@ -224,8 +224,8 @@ def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
             "moving cars masked out": drive(sequence, backend, clear, "objects.mode=off"),
         }
         for name, run in paths.items():
-            distance = evaluate(path_of(run), sequence).get("GPS distance RMSE [m]")
-            rows.append({"back end": backend, "object": f"camera, {name}", "GPS distance RMSE [m]": distance})
+            ate = evaluate(path_of(run), sequence)["ATE RMSE [m]"]
+            rows.append({"back end": backend, "object": f"camera, {name}", "ATE [m]": ate})
     return rows
 
 
@@ -326,7 +326,7 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
         rows.append({
             "back end": backend, "object": id, "car": car, "frames": f"{history[0][0]}-{history[-1][0]}",
             "measured": len(history), "speed within 25 m [m/s]": float(own), "labelled [m/s]": float(true),
-            "error [%]": float(100 * abs(own / true - 1)), "GPS distance RMSE [m]": None,
+            "error [%]": float(100 * abs(own / true - 1)), "ATE [m]": None,
             "objects [ms]": float(np.median([r.milliseconds["objects"] for r in results])),
         })  # fmt: skip
     return rows
