@@ -170,9 +170,9 @@ class ConsideringBackend(Protocol):
 
     An error of the rig acts on all frames alike, and does not average out as pixel noise does. The back end considers,
     but does not estimate it (Schmidt, 1966): with δ (m,) such errors, ``T_true = T exp(J δ)``, ``y_true = y + L δ``.
-    `Backend.estimate` and all gains are those of an exact rig; a system adds the part of δ by its present covariance.
-    Without these methods it adds nothing: covariances are of pixel noise alone, too small if the calibration is not
-    exact.
+    `Backend.estimate` and all gains are those of an exact rig, but for rounding; a system adds the part of δ by its
+    present covariance. Without these methods it adds nothing: covariances are of pixel noise alone, too small if the
+    calibration is not exact.
     """
 
     def consider(self, field: Callable[[Array], Array], pose: Array | None = None) -> None:
