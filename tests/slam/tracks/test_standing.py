@@ -124,6 +124,7 @@ def test_what_fills_the_view_of_a_standing_vehicle_does_not_take_it_along(backen
     assert results[35].estimate.covariance[3, 3] > 1.0 > 1e-3 > results[-1].estimate.covariance[3, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_people_who_walk_by_hardly_move_the_camera(slam_data, backend):
     """The limits lie half above what is reached: 6.8 mm and 0.16° (`ekf`), 4.5 mm and 0.10° (`smoother`)."""
