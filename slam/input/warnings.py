@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
-from slam.errors import CalibrationError
+from slam.errors import CalibrationError, SequenceError
 from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
@@ -54,13 +55,20 @@ class InputWarnings:
         self._stamps: list[float] = []
         self._count = self._poor = self._unpaired = 0
         self._pair_is_known = self._texture_is_known = self._partners_are_known = self._moment_is_known = False
+        self._two_images = self._doubled = False  # a pair of different images was seen, one of equal ones
         self._before: StereoFrame | None = None
         self._fits = np.zeros(3, int)  # matches with the right image of this frame, the next one and the one before
         for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig.left, rig.right))):
             self._warn(unlikely)
+            self._pair_is_known = self._moment_is_known = self._partners_are_known = True  # what follows from it, too
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
-        """Check a frame and the features found in it, which are as documented."""
+        """Check a frame and the features found in it, which are as documented.
+
+        Raises:
+            SequenceError: left and right are exchanged, for certain: no pair before was right, features fit the rig
+                the other way round, and hardly any has a right match as it is.
+        """
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
@@ -68,9 +76,10 @@ class InputWarnings:
         if not self._texture_is_known:
             self._check_texture(frame.left, len(features))
         if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK:  # a power of two
-            self._check_pair(frame)
+            self._check_pair(frame, 10 * int(features.has_stereo.sum()) < len(features))
         if not self._partners_are_known and frame.right is not None:
             self._check_partners(features)
+        self._two_images |= frame.right is not None
         self._before = frame
         self._count += 1
 
@@ -116,7 +125,7 @@ class InputWarnings:
         found = f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image"
         self._warn(found + cause)
 
-    def _check_pair(self, frame: StereoFrame) -> None:
+    def _check_pair(self, frame: StereoFrame, unpaired: bool) -> None:
         """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
         if self._pair_is_known and self._moment_is_known:
             return
@@ -125,6 +134,8 @@ class InputWarnings:
             return
         if not self._pair_is_known and (own.swapped or own.same):
             self._pair_is_known = self._moment_is_known = True
+            if own.swapped and unpaired:
+                raise SequenceError(_swapped(own))
             self._warn(_swapped(own) if own.swapped else _the_same(own, self._rig))
         elif not self._moment_is_known and self._before is not None:
             self._check_moment(frame, own)
@@ -162,6 +173,19 @@ class InputWarnings:
             self._pair_is_known = self._moment_is_known = True
             return None
 
+    def one_image_twice(self, frame: StereoFrame) -> StereoFrame:
+        """A frame whose left and right image are the same byte for byte, without its right one, which measures nothing.
+
+        SequenceError where there was no pair of two images before: it is one camera twice.
+        """
+        line = f"frame {frame.index}: left and right are one and the same image"
+        if not self._two_images:
+            raise SequenceError(f"{line}: two cameras are needed (see left=… and right=…)")
+        if not self._doubled:
+            self._doubled = True
+            self._warn(f"{line}; it and others like it are used without the right one")
+        return replace(frame, right=None)
+
     def note_repeated(self, number: int) -> None:
         """Warn of a frame with the images of the frame before, by its number in its sequence."""
         if not self.repeated:
@@ -193,7 +217,7 @@ def _swapped(found: PairGeometry) -> str:
 def _the_same(found: PairGeometry, rig: StereoRig) -> str:
     horizon = rig.rectified.rig.left.fu * rig.baseline / NO_DISPARITY
     return (
-        f"left and right image show the same: {found.without_disparity} of {found.matches} features have no "
+        f"left and right image show the same: {found.at_same_place} of {found.matches} features have no "
         f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
     )
 

@@ -26,7 +26,8 @@ from slam.sequences.images import read_image, recorded_size, size_text
 class Sequence(Protocol):
     """A stereo recording of any length: iterating it decodes one frame at a time, in constant memory.
 
-    Recorded sequences keep this protocol, and so do the synthetic worlds.
+    Recorded sequences keep this protocol, and so do the synthetic worlds. Its length is the number of listed frames;
+    iterating yields fewer where left images turn out to be unreadable.
     """
 
     @property
@@ -59,16 +60,12 @@ class Sequence(Protocol):
         """What was found wrong so far, one line each; what iterating finds is added."""
         ...
 
-    def __len__(self) -> int:
-        """Number of listed frames; iterating yields fewer where left images turn out to be unreadable."""
-        ...
+    def __len__(self) -> int: ...
 
-    def __iter__(self) -> Iterator[StereoFrame]:
-        """All frames in order of time."""
-        ...
+    def __iter__(self) -> Iterator[StereoFrame]: ...
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
-        """Frames `start` up to, but without, `stop`; frames outside are not decoded.
+        """Frames `start` up to, but without, `stop`, in order of time; frames outside are not decoded.
 
         Raises:
             SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.

@@ -104,10 +104,10 @@ def recorded_size(rig: StereoRig) -> Size:
     return (rig.height, rig.width) if rig.turns % 2 else (rig.width, rig.height)
 
 
-def require_same_size(left: tuple[int, ...], right: tuple[int, ...], *names: object) -> None:
-    """Raise SequenceError where the images of two cameras, by these names, differ in size (width first)."""
-    if left != right:
-        sizes = ", ".join(f"{name} is {size_text(size)}" for name, size in zip(names, (left, right)))
+def require_same_size(left: np.ndarray, right: np.ndarray, *names: object) -> None:
+    """Raise SequenceError where the images (H, W) of two cameras, by these names, differ in size."""
+    if left.shape != right.shape:
+        sizes = ", ".join(f"{name} is {size_text(image.shape[::-1])}" for name, image in zip(names, (left, right)))
         raise SequenceError(f"left and right images differ in size: {sizes}")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from importlib.util import find_spec
@@ -17,7 +16,6 @@ from slam.geometry.rig import StereoRig
 from slam.naming import suggestion
 from slam.sequences.calibration import array, naming
 from slam.sequences.calibration_keys import Entries, Entry, rig_of
-from slam.sequences.given import layout_of
 from slam.sequences.images import Size, decode_image, require_image_size, size_text
 from slam.sequences.names import SIDES
 
@@ -31,6 +29,8 @@ _MATRICES: dict[str, tuple[str, tuple[int, ...] | None]] = {
     "R": ("rectificationmatrix", (3, 3)),  # from raw to rectified camera axes
     "P": ("projectionmatrix", (3, 4)),  # of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair
 }
+_ZSTD = b"\x28\xb5\x2f\xfd"  # begins what is compressed
+_LARGEST, _RATIO = 2**30, 50  # [bytes] of a message; of what is unpacked, times its size
 _SAME_PLACE = 1e-6  # [m] from a pair's left camera
 _LISTED = 12  # topics named in a message
 
@@ -40,7 +40,7 @@ DEPTH = frozenset({"16UC1", "32FC1"})
 # Bits and channels of an encoding, and OpenCV's conversion to grey. OpenCV names a Bayer pattern by its second row.
 _ENCODINGS: dict[str, tuple[int, int, str]] = {
     **{name: (bits, 1, "") for bits in (8, 16) for name in (f"mono{bits}", f"{bits}UC1")},
-    "8UC3": (8, 3, "COLOR_BGR2GRAY"),
+    **{f"{bits}UC{n}": (bits, n, f"COLOR_{'BGR' if n == 3 else 'BGRA'}2GRAY") for bits in (8, 16) for n in (3, 4)},
     **{name: (8, 2, "COLOR_YUV2GRAY_UYVY") for name in ("yuv422", "uyvy")},
     **{name: (8, 2, "COLOR_YUV2GRAY_YUY2") for name in ("yuv422_yuy2", "yuyv")},
     **{
@@ -57,7 +57,7 @@ _ENCODINGS: dict[str, tuple[int, int, str]] = {
 
 
 @contextmanager
-def naming_recording(path: Path) -> Iterator[None]:
+def _one_line(path: Path) -> Iterator[None]:
     """Whatever goes wrong with a damaged recording as one SequenceError with its name."""
     try:
         yield
@@ -128,12 +128,13 @@ class Bag:
             yield Message(connection.topic, connection.msgtype, int(time), data)
 
     def read(self, message: Message) -> Any:
-        """A message as an object."""
-        return self._reader.deserialize(message.data, message.kind)
+        """A message as an object; one that is compressed by itself, in a file without its folder, is decompressed."""
+        packed = bytes(message.data[: len(_ZSTD)]) == _ZSTD
+        return self._reader.deserialize(_unpacked(message.data) if packed else message.data, message.kind)
 
     def image(self, message: Message, what: str, size: Size | None = None) -> np.ndarray:
         """The image (H, W) of a message, see `grey_image`."""
-        with naming_recording(self.path):
+        with _one_line(self.path):
             return grey_image(self.read(message), message.kind, what, size)
 
     def first_image(self, topic: str) -> np.ndarray:
@@ -155,34 +156,50 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a recording, and close it in the end; SequenceError for every fault of it, or where rosbags is missing."""
+    """Open a recording, and close it in the end.
+
+    SequenceError for every fault of it, also of what is read meanwhile, or where rosbags is missing.
+    """
     if find_spec("rosbags") is None:
         line = "ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
         raise SequenceError(f"{path}: {line}")
-    with ExitStack() as stack:
-        with naming_recording(path):
-            bag = _opened(path, stack)
-        yield bag
+    with _one_line(path), ExitStack() as stack:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        file = path
+        if path.name.lower().endswith(".zstd"):
+            file = Path(stack.enter_context(TemporaryDirectory())) / path.stem
+            _unpack(path, file)
+        reader = AnyReader([file], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        yield Bag(path, stack.enter_context(reader))
 
 
-def _opened(path: Path, stack: ExitStack) -> Bag:
-    """A recording, of which the stack closes what is open; a compressed file is decompressed as rosbags would."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+def _zstd() -> Any:
+    """The module that decompresses zstd."""
+    try:
+        from compression import zstd  # type: ignore[import-not-found, unused-ignore]
+    except ImportError:  # before Python 3.14
+        from backports import zstd
+    return zstd
 
-    if path.name.lower().endswith(".zstd"):
-        try:
-            from compression import zstd  # type: ignore[import-not-found, unused-ignore]
-        except ImportError:  # before Python 3.14
-            from backports import zstd
 
-        target = Path(stack.enter_context(TemporaryDirectory())) / path.stem
-        with zstd.open(path, "rb") as packed, target.open("wb") as file:
-            shutil.copyfileobj(packed, file)
-        path = target
-    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    stack.enter_context(reader)
-    return Bag(path, reader)
+def _unpacked(data: bytes) -> bytes:
+    """A message, decompressed; SequenceError where it is larger than any image."""
+    unpacked: bytes = _zstd().ZstdDecompressor().decompress(data, max_length=_LARGEST)
+    if len(unpacked) >= _LARGEST:
+        raise SequenceError(f"a message of more than {_LARGEST} bytes")
+    return unpacked
+
+
+def _unpack(packed: Path, target: Path) -> None:
+    """Decompress a file as rosbags would; SequenceError where little becomes very much."""
+    most = max(_LARGEST, _RATIO * packed.stat().st_size)
+    with _zstd().open(packed, "rb") as file, target.open("wb") as unpacked:
+        while part := file.read(_LARGEST // 64):
+            unpacked.write(part)
+            if unpacked.tell() > most:
+                raise SequenceError(f"{packed}: unpacks to more than {_RATIO} times its size")
 
 
 def camera_info(bag: Bag, topic: str) -> dict[str, Entry]:
@@ -232,7 +249,7 @@ def is_rectified(topic: str) -> bool:
     return "rect" in _split(topic)[1]
 
 
-def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
+def choose_topics(bag: Bag, options: Mapping[str, Any]) -> Topics:
     """The topics by the options ``left``, ``right``, ``left_info``, ``right_info``; without them those of a pair.
 
     A pair are two cameras whose messages say so: the same size and focal length of the rectified images, and a baseline
@@ -243,7 +260,7 @@ def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
         CalibrationError: there is no calibration.
         ConfigurationError: one of the two images is named and the other is not.
     """
-    if layout_of(options) is not None:
+    if options.get("layout") is not None:
         images = [topic for topic in _of_kind(bag, _IMAGES) if not _is_depth(bag, topic)]
         if "left" not in options and len(images) != 1:
             there = f"{len(images)} topics of images, where layout=sbs needs one"
@@ -253,6 +270,8 @@ def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
     if ("left" in options) != ("right" in options):
         raise ConfigurationError("name both topics: left=/…&right=/…")
     if "left" in options:
+        if options["left"] == options["right"]:
+            raise ConfigurationError(f"left and right are the same topic, {options['left']}")
         return _with_infos(bag, tuple(_named(bag, options[side], _IMAGES) for side in ("left", "right")), options)
     pairs = list(_pairs_by_name(bag) if "calibration" in options else _pairs_by_messages(bag))
     if len(pairs) == 1:
@@ -269,7 +288,7 @@ def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
     )
 
 
-def _with_infos(bag: Bag, images: tuple[str, ...], options: Mapping[str, str]) -> Topics:
+def _with_infos(bag: Bag, images: tuple[str, ...], options: Mapping[str, Any]) -> Topics:
     """Images with their cameras' messages, named or in the same name space, unless a calibration is named."""
     names = []
     for side, topic in zip(("left", "right"), () if "calibration" in options else images):
