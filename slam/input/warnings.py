@@ -27,6 +27,8 @@ SHORTEST, LONGEST = 1e-3, 10.0
 #: guard: plausible baselines [m]; others are more often a length in another unit.
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
 
+_USUAL = (0.02, 2.0)  # guard: baselines [m] that a unit is proposed for
+
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: successive frames that must show too little before a warning
 _LAST_LOOK = 1024  # guard: last frame at which the stereo pair is checked
@@ -243,10 +245,10 @@ def baseline_doubt(rig: StereoRig) -> str:
     """What is wrong with an implausible baseline; empty if it is plausible."""
     if SHORTEST_BASELINE <= rig.baseline <= LONGEST_BASELINE:
         return ""
-    return (
-        f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres? "
-        "(an OpenCV file in millimetres needs unit=mm)"
-    )
+    metres = {unit: rig.baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
+    likely = [f"unit={unit} makes {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
+    hint = f" ({', '.join(likely)})" if likely else ""
+    return f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres?{hint}"
 
 
 def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:

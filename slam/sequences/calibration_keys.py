@@ -74,6 +74,9 @@ _SHORTEST_FOCAL = 0.04
 #: guard: largest skew as a share of the focal length: a thousandth moves the image's border by half a pixel.
 _SKEW = 1e-3
 
+#: guard: cosine of the widest angle between the optical axes of a stereo pair, 60 degrees.
+_ALIKE = 0.5
+
 Entry = tuple[str, Any]  # an entry's name as written, and its value
 
 
@@ -177,9 +180,12 @@ def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, 
     b = R.T @ t  # h_right = R (h_left + b), paper A, Eq. 6
     if entries.form and b[0] > np.abs(b).max() / 2:
         raise CalibrationError(
-            f"the second camera stands {b[0]:.4f} m to the left of the first one: it is the left one; name the cameras "
-            "of the images, and of the calibration, the other way round"
+            f"the second camera stands {b[0]:.4f} m to the left of the first one: are the cameras swapped? The "
+            "first one of a calibration is the left one"
         )
+    if R[2, 2] < _ALIKE:
+        apart = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))
+        raise CalibrationError(f"the cameras look {apart:.0f} degrees apart: is a rotation in degrees?")
     return StereoRig.side_by_side(cameras[0], cameras[1], R, b)
 
 
@@ -263,9 +269,7 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
         fisheye = fisheye or name in _FISHEYE
     K = _matrix(entries, side)
     if K[0, 0] < _SHORTEST_FOCAL * size[0]:
-        raise CalibrationError(
-            f"a focal length of {K[0, 0]:g} px is none of images {size[0]} px wide: is it in pixels?"
-        )
+        raise CalibrationError(f"a focal length of {K[0, 0]:g} px for images {size[0]} px wide: is it in pixels?")
     D = entries.numbers("D", side, None)
     if D is None:
         names = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS
