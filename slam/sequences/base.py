@@ -19,7 +19,7 @@ from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import sequence_line
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import read_image, recorded_size, size_text
+from slam.sequences.images import halves, read_image, recorded_size, size_text
 
 
 @runtime_checkable
@@ -81,8 +81,8 @@ def is_live(frames: object) -> bool:
 #: An image as it was read, or why it could not be; None where there is none.
 Image = np.ndarray | SequenceError | None
 
-#: The left and the right image of each frame.
-Images = Generator[tuple[Image, Image], None, None]
+#: The left and the right image of each frame, or one that holds both, side by side.
+Images = Generator[tuple[Image, ...], None, None]
 
 #: Of the left and the right camera (H, W) bool, False where the image is not to be used; None for all of it.
 Masks = tuple[np.ndarray | None, np.ndarray | None]
@@ -97,7 +97,7 @@ class FrameSource(Protocol):
         ...
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
-        """Decode the left and right images of frames `start` to `stop`; they may end early, with a fault."""
+        """Decode the images of frames `start` to `stop`; they may end early, with a fault."""
         ...
 
 
@@ -142,7 +142,10 @@ class RecordedSequence:
         A left image that cannot be read costs the frame, a right one itself.
         """
         with FaultLog(self.warnings) as faults, closing(self.source.images(start, stop, faults)) as images:
-            for index, (left, right) in zip(range(start, stop), images):
+            for index, (left, *other) in zip(range(start, stop), images):
+                right = other[0] if other else None
+                if not other and isinstance(left, np.ndarray):
+                    left, right = halves(left, self.name)
                 if isinstance(right, SequenceError) and not isinstance(left, SequenceError):
                     line = f"frame {index} is given without its right image: {right}"
                     faults.report("right images unreadable, frames given without them", line)

@@ -242,21 +242,23 @@ def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:
     found = {name: entries.find(name, side) for name in _PLAIN} | {last: entries.find(last)}
     if not any(found.values()):
         return None
-    values, wrong = {}, []
+    values, wrong = [], []
     for name, entry in found.items():
         try:
-            values[name] = _number(entry or (name, None))
-            if values[name] <= 0 and name not in ("cx", "cy"):
-                wrong.append(f"{name} is {values[name]:g}, which must be positive")
+            values.append(_number(entry or (name, None)))
+            if values[-1] <= 0 and name not in ("cx", "cy"):
+                wrong.append(f"{name} is {values[-1]:g}, which must be positive")
         except CalibrationError as error:
             wrong.append(str(error))
     if wrong:
         raise CalibrationError(f"{'; '.join(wrong)} (a rectified pair needs fx, fy, cx, cy in pixels and baseline)")
     if any(_number(entry) for name in _COEFFICIENTS if (entry := entries.find(name, side)) is not None):
         raise CalibrationError("names distortion, but only one camera: images of five numbers are rectified")
-    fx, fy, cx, cy, length = values.values()
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return StereoRig.from_pinhole(K, size=size, baseline=unit * (length / fx if last == "bf" else length))
+    fx, fy, cx, cy, length = values
+    left, right = (PinholeCamera(fx, fy, cx, cy, *size) for _ in range(2))
+    return StereoRig.side_by_side(
+        left, right, np.eye(3), np.array([-unit * length / (fx if last == "bf" else 1), 0, 0])
+    )
 
 
 def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCamera:

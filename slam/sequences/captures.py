@@ -32,7 +32,6 @@ class VideoPairs:
 
     stamps: Array  # times (N,) [s]: frame number by frame rate
     paths: list[Path]
-    size: Size  # width and height of each camera's images
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode frames `start` to `stop`, in grey; a video that ends too early ends the sequence with a line.
@@ -51,14 +50,15 @@ class VideoPairs:
                 for path, image in zip(self.paths, images):
                     if image is None:
                         faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
-                whole = [image for image in images if image is not None]
-                if len(whole) < len(images):
+                if any(image is None for image in images):
                     return
-                yield halves(whole[0], self.paths[0]) if len(whole) == 1 else (whole[0], whole[1])
+                yield tuple(images)
 
 
-def open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> VideoPairs:
-    """The frame source of two videos, or of one side by side; `rate` [1/s] overrides what they say of themselves.
+def open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> tuple[VideoPairs, Size]:
+    """The frame source of two videos, or of one side by side, and the size of a camera's images.
+
+    `rate` [1/s] overrides what videos say of themselves.
 
     SequenceError where a file is no readable video, frame sizes or rates differ, or the frame rate is not known.
     """
@@ -74,7 +74,7 @@ def open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> Vide
     rate = rate or rates[0]
     if not SLOWEST <= rate <= FASTEST:
         raise SequenceError(f"{paths[0]}: the frame rate is not known, add fps=…")
-    return VideoPairs(np.arange(min(counts)) / rate, paths, (left.shape[1], left.shape[0]))
+    return VideoPairs(np.arange(min(counts)) / rate, paths), (left.shape[1], left.shape[0])
 
 
 def _beginning(path: Path) -> tuple[int, np.ndarray, float]:

@@ -38,14 +38,14 @@ def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSeq
     root = _root(folder)
     left, right = _listings(root, faults)
     pairs = pair_up(left, right, options, faults, told_times(folder, options, faults))
-    source = image_pairs(pairs, left, right)
+    source, size = image_pairs(pairs, left, right)
     own = [root / cam / "sensor.yaml" for cam in _CAMERAS]
     if not any(file.exists() for file in own):
         own = [file for name in _CAMCHAINS if (file := root / name).is_file()][:1]
     missing = f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing (nor is there a Kalibr camchain.yaml)"
     named = "calibration" in options or not own
     files = calibration_files(folder, options, f"{missing}: add calibration=FILE") if named else own
-    rig = read_rig(files, source.size, options)
+    rig = read_rig(files, size, options)
     name = folder.parent.name if folder.name == "mav0" else folder.name
     truth = _ground_truth(root, own, faults)
     return RecordedSequence(name, "euroc", options.get("kind", "handheld"), rig, source, truth, MOCAP_NOISE)

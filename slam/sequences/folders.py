@@ -48,13 +48,11 @@ def _source(sides: list[Side], home: Path, options: Options, faults: FaultLog) -
     if len({own is None for own in names}) > 1:
         raise SequenceError(f"{paths[0]} and {paths[1]}: one is a video and the other is not")
     if names[0] is None:
-        videos = open_videos(paths, options.get("fps"), faults)
-        return videos, videos.size
+        return open_videos(paths, options.get("fps"), faults)
     left, *right = listed(paths, [own or [] for own in names], faults)
     times = told_times(home, options, faults, home / "times.txt", home / "timestamps.txt")
     pairs = pair_up(left, right[0] if right else None, options, faults, times)
-    images = image_pairs(pairs, left, right[0] if right else None)
-    return images, images.size
+    return image_pairs(pairs, left, right[0] if right else None)
 
 
 def _sides(folder: Path, options: Options) -> list[Side]:

@@ -19,21 +19,15 @@ Format = Callable[[Path], str | None]  # of a path
 
 
 def near_name(folder: Path, text: str) -> str:
-    """A world or a folder with a similar name, or the part of the path that is missing first; `text` was asked for."""
+    """A world with a similar name, or the part of the path that is missing first; `text` was asked for."""
     from slam import worlds
 
     name, mark, query = text.partition("?")
     near = None if Path(name).name != name else nearest(name, worlds.names())
     if near:
         return f" (did you mean 'synthetic:{near}{mark}{query}'?)"
-    there = next((parent for parent in folder.parents if parent.is_dir()), None)
-    if there is None:
-        return ""
-    missing = folder.relative_to(there).parts[0]
-    near = nearest(missing, (path.name for path in _inside(there)))
-    if near is not None:
-        return f" (did you mean '{there / near}'?)"
-    return "" if there == folder.parent else f": {there} has no {missing!r}"
+    there = next((parent for parent in folder.parents if parent.is_dir()), folder.parent)
+    return "" if there == folder.parent else f": {there} has no {folder.relative_to(there).parts[0]!r}"
 
 
 def sequences_near(folder: Path, format_of: Format) -> str:

@@ -91,8 +91,8 @@ def _open(folder: Path, where: Layout, options: Options, faults: FaultLog) -> Re
     else:
         times = told_times(folder, options, faults, where.times)
     pairs = pair_up(left, right, options, faults, times, by_number=True)
-    source = image_pairs(pairs, left, right)
-    rig, T_left_reference = _rig(folder, where, source.size, options)
+    source, size = image_pairs(pairs, left, right)
+    rig, T_left_reference = _rig(folder, where, size, options)
     by_number = dict(zip((pairs.rows[:, 0] if left.stamped else pairs.keys).tolist(), pairs.stamps.tolist()))
     try:
         truth = _truth(where, origin, T_left_reference, by_number, faults)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 from urllib.parse import parse_qsl
 
 from slam.errors import ConfigurationError
-from slam.naming import suggestion, unknown
+from slam.naming import suggestion
 
 #: Options of every format whose calibration is in a file that can be named.
 CALIBRATION = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask"})
@@ -22,15 +21,32 @@ SLOWEST, FASTEST = 1e-3, 1e5
 #: Most that the option ``tolerance`` takes [s].
 WIDEST_TOLERANCE = 10.0
 
-#: Metres per unit of length.
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-
 _MOST_OPTIONS = 100
-_YES = {"1": True, "yes": True, "true": True, "0": False, "no": False, "false": False}
+
+_YES_NO = {"yes": True, "no": False}
+_WORDS: dict[str, dict[str, Any]] = {
+    "kind": {"driving": "driving", "handheld": "handheld"},
+    "unit": {"m": 1.0, "cm": 0.01, "mm": 0.001},  # in metres
+    "layout": {"sbs": "sbs"},  # side by side
+    **dict.fromkeys(("rectified", "fisheye", "swap"), _YES_NO),
+}
+_RANGES = {
+    "fps": (SLOWEST, FASTEST),
+    "tolerance": (0.0, WIDEST_TOLERANCE),
+    "wait": (0.0, 86400.0),
+    "width": (1, 100_000),
+    "height": (1, 100_000),
+}
 
 
-def _number(low: float, high: float) -> Callable[[str, str], float]:
-    def read(name: str, text: str) -> float:
+def value_of(name: str, text: str) -> Any:
+    """The value of an option: a word's, a number in its range, or the text; ConfigurationError where it is none."""
+    if name in _WORDS:
+        if text not in _WORDS[name]:
+            raise ConfigurationError(f"{name} must be {' or '.join(_WORDS[name])}, got {text!r}")
+        return _WORDS[name][text]
+    if name in _RANGES:
+        low, high = _RANGES[name]
         try:
             value = float(text)
         except ValueError:
@@ -38,49 +54,7 @@ def _number(low: float, high: float) -> Callable[[str, str], float]:
         if not low <= value <= high:
             raise ConfigurationError(f"{name} must be a number from {low:g} to {high:g}, got {text!r}")
         return value
-
-    return read
-
-
-def _yes_or_no(name: str, text: str) -> bool:
-    if text.lower() not in _YES:
-        raise ConfigurationError(f"{name} must be yes or no, got {text!r}")
-    return _YES[text.lower()]
-
-
-def _kind(name: str, text: str) -> str:
-    if text not in ("driving", "handheld"):
-        raise ConfigurationError(unknown("kind of motion", text, ("driving", "handheld")))
     return text
-
-
-def metres(name: str, text: str) -> float:
-    """Metres in a unit of length."""
-    if text not in METRES:
-        raise ConfigurationError(f"{name} must be one of {', '.join(METRES)}, got {text!r}")
-    return METRES[text]
-
-
-def _layout(name: str, text: str) -> str:
-    if text != "sbs":
-        raise ConfigurationError(f"{name} must be sbs (side by side), got {text!r}")
-    return text
-
-
-#: What options are that are no plain texts.
-_READERS: dict[str, Callable[[str, str], Any]] = {
-    "kind": _kind,
-    "unit": metres,
-    "layout": _layout,
-    "rectified": _yes_or_no,
-    "fisheye": _yes_or_no,
-    "swap": _yes_or_no,
-    "fps": _number(SLOWEST, FASTEST),
-    "tolerance": _number(0.0, WIDEST_TOLERANCE),
-    "wait": _number(0.0, 86400.0),
-    "width": _number(1, 100_000),
-    "height": _number(1, 100_000),
-}
 
 
 class Options(dict[str, Any]):
@@ -96,15 +70,13 @@ class Options(dict[str, Any]):
     """
 
     def __init__(self, query: str, format: str, known: frozenset[str]) -> None:
-        super().__init__()
         self._read = {"kind"}
         texts = read_options(query)
         strange = sorted(set(texts) - known)
         if strange:
             hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"
             raise ConfigurationError(f"unknown option {strange[0]!r} of format {format}{hint}")
-        for name, text in texts.items():
-            self[name] = _READERS[name](name, text) if name in _READERS else text
+        super().__init__({name: value_of(name, text) for name, text in texts.items()})
 
     def __getitem__(self, name: str) -> Any:
         self._read.add(name)
@@ -117,9 +89,8 @@ class Options(dict[str, Any]):
 
     def require_read(self, what: str) -> None:
         """Raise ConfigurationError where an option was not read by anything."""
-        unread = sorted(set(self) - self._read)
-        if unread:
-            raise ConfigurationError(f"option {unread[0]!r} does nothing here: {what}")
+        for name in sorted(set(self) - self._read):
+            raise ConfigurationError(f"option {name!r} does nothing here: {what}")
 
 
 def read_options(query: str) -> dict[str, str]:

@@ -64,17 +64,13 @@ class ImagePairs:
     left: list[Path]  # (N)
     right: list[Path | None]  # None where there is no right image
     size: Size  # width and height that every image must have
-    halves: bool = False  # both images are in the left file, side by side; there are no others
+    single: bool  # both images are in the left file, side by side; there are no others
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode the images of frames `start` to `stop`; an error in place of one that is unreadable."""
-        size = (2 * self.size[0], self.size[1]) if self.halves else self.size
-        for name, partner in zip(self.left[start:stop], self.right[start:stop]):
-            left = _image(name, size)
-            if self.halves:
-                yield (left, None) if isinstance(left, SequenceError) else halves(left, name)
-            else:
-                yield left, None if partner is None else _image(partner, size)
+        for left, right in zip(self.left[start:stop], self.right[start:stop]):
+            image = _image(left, self.size)
+            yield (image,) if self.single else (image, None if right is None else _image(right, self.size))
 
 
 def _image(path: Path, size: Size) -> np.ndarray | SequenceError:
@@ -84,8 +80,10 @@ def _image(path: Path, size: Size) -> np.ndarray | SequenceError:
         return error
 
 
-def image_pairs(pairs: Pairs, left: Listing, right: Listing | None) -> ImagePairs:
-    """The source of pairs of image files; without a right listing both images are in the left files, side by side.
+def image_pairs(pairs: Pairs, left: Listing, right: Listing | None) -> tuple[ImagePairs, Size]:
+    """The source of pairs of image files, and the size of a camera's images.
+
+    Without a right listing both images are in the left files, side by side.
 
     SequenceError where no pair can be read, or the two images of the first one that can differ in size.
     """
@@ -101,7 +99,8 @@ def image_pairs(pairs: Pairs, left: Listing, right: Listing | None) -> ImagePair
                 fault = str(error)
                 continue
             require_same_size(a, b, left_path, right_path)
-            return ImagePairs(pairs.stamps, lefts, rights, (a.shape[1], a.shape[0]), right is None)
+            whole = image.shape[1], image.shape[0]
+            return ImagePairs(pairs.stamps, lefts, rights, whole, right is None), (a.shape[1], a.shape[0])
     raise SequenceError(f"{left.folder}: no pair of images can be read: {fault}")
 
 

@@ -18,7 +18,7 @@ from slam.geometry.se3 import pose
 from slam.sequences.calibration import is_kitti, naming
 from slam.sequences.calibration_keys import read_entries, rig_of
 from slam.sequences.images import Size, recorded_size, size_text
-from slam.sequences.options import metres
+from slam.sequences.options import value_of
 
 _USUAL = (
     *((stem + end,) for stem, end in product(
@@ -59,7 +59,7 @@ def load_rig(
         >>> import slam
         >>> rig = slam.load_rig("calibration.yaml")  # doctest: +SKIP
     """
-    options = {"unit": metres("unit", unit), "rectified": rectified, "fisheye": fisheye}
+    options = {"unit": value_of("unit", unit), "rectified": rectified, "fisheye": fisheye}
     files = [expanded(path, CalibrationError) for path in paths]
     if not files:
         raise CalibrationError("no calibration is named")

@@ -119,9 +119,7 @@ class RosPairs:
                     if place in wanted:
                         ahead[place] = message
                 images = [self._image(bag, ahead.pop(place), place) for place in frame]
-                if len(self.topics) == 1 and isinstance(images[0], np.ndarray):
-                    images = list(halves(images[0], self.topics[0].topic))
-                yield images[0], images[1] if len(images) > 1 else None
+                yield *images, *[None] * (len(self.topics) - len(images))
 
     def _image(self, bag: Bag, message: Message, place: tuple[str, int]) -> np.ndarray | SequenceError:
         try:
