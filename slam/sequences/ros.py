@@ -35,7 +35,7 @@ from slam.sequences.ros_bag import (
 OPTIONS = frozenset({"left_info", "right_info"})
 
 #: Endings of files, in lower case.
-SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+SUFFIXES = (".bag", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 
 _METADATA, _ROS_2, _BEGINNING = "metadata.yaml", b"rosbag2_bagfile_information", 4096
 
@@ -58,7 +58,7 @@ def open_folder(path: Path, options: Options, faults: FaultLog) -> RecordedSeque
     with open_bag(path) as bag:
         topics = choose_topics(bag, options)
         infos = [camera_info(bag, topic) for topic in topics.infos]
-        messages = [_stamps(bag, topic, faults) for topic in dict.fromkeys(topics.images)]
+        messages = [_stamps(bag, topic, faults) for topic in topics.images]
         image = bag.first_image(topics.images[0])
     left, *right = _in_time(messages, faults)
     pairs = pair_up(left, right[0] if right else None, options, faults)

@@ -240,7 +240,7 @@ def rig_by_messages(infos: Sequence[dict[str, Entry]], rectified: bool, unit: fl
 class Topics(NamedTuple):
     """The topics of a stereo rig."""
 
-    images: tuple[str, ...]  # of the left and the right one; the same where they are side by side
+    images: tuple[str, ...]  # of the left and the right one; one where they are side by side
     infos: tuple[str, ...] = ()  # of the cameras' calibrations; none where a file is named in their place
 
 
@@ -258,27 +258,46 @@ def choose_topics(bag: Bag, options: Mapping[str, Any]) -> Topics:
     Raises:
         SequenceError: a topic is not there, or there is not exactly one pair.
         CalibrationError: there is no calibration.
-        ConfigurationError: one of the two images is named and the other is not.
+        ConfigurationError: one of the two images is named and the other is not, or both are the same.
     """
-    if options.get("layout") is not None:
-        images = [topic for topic in _of_kind(bag, _IMAGES) if not _is_depth(bag, topic)]
-        if "left" not in options and len(images) != 1:
-            there = f"{len(images)} topics of images, where layout=sbs needs one"
-            raise SequenceError(f"{bag.path}: {there}: add left=/… of {_listed(images)}")
-        topic = _named(bag, options["left"], _IMAGES) if "left" in options else images[0]
-        return _with_infos(bag, (topic, topic), options)
-    if ("left" in options) != ("right" in options):
-        raise ConfigurationError("name both topics: left=/…&right=/…")
-    if "left" in options:
-        if options["left"] == options["right"]:
-            raise ConfigurationError(f"left and right are the same topic, {options['left']}")
-        return _with_infos(bag, tuple(_named(bag, options[side], _IMAGES) for side in ("left", "right")), options)
-    pairs = list(_pairs_by_name(bag) if "calibration" in options else _pairs_by_messages(bag))
+    sides = ("left",) if options.get("layout") is not None else ("left", "right")
+    if any(side in options for side in sides):
+        if not all(side in options for side in sides):
+            raise ConfigurationError("name both topics: left=/…&right=/…")
+        images = tuple(_named(bag, options[side], _IMAGES) for side in sides)
+        if len(sides) > len(set(images)):
+            raise ConfigurationError(f"left and right are the same topic, {images[0]}")
+    else:
+        images = _only_one(bag, _cameras(bag)) if sides == ("left",) else _only_pair(bag, options)
+    infos = []
+    for side, topic in zip(("left", "right"), () if "calibration" in options else images * (3 - len(images))):
+        usual = f"{_split(topic)[0]}/camera_info"
+        if f"{side}_info" in options:
+            infos.append(_named(bag, options[f"{side}_info"], (_INFO,)))
+        elif bag.kinds.get(usual) == _INFO:
+            infos.append(usual)
+        else:
+            there = f"add {side}_info=/… (there are {_listed(_of_kind(bag, (_INFO,)))}) or calibration=FILE"
+            raise CalibrationError(f"{bag.path}: no {usual} for {topic}: {there}")
+    return Topics(images, tuple(infos))
+
+
+def _only_one(bag: Bag, images: list[str]) -> tuple[str, ...]:
+    """The only topic of images."""
+    if len(images) != 1:
+        there = f"{len(images)} topics of images, where layout=sbs needs one"
+        raise SequenceError(f"{bag.path}: {there}: add left=/… of {_listed(images)}")
+    return (images[0],)
+
+
+def _only_pair(bag: Bag, options: Mapping[str, Any]) -> tuple[str, ...]:
+    """The only pair of topics of images."""
+    pairs = _pairs_by_name(bag) if "calibration" in options else _pairs_by_messages(bag)
     if len(pairs) == 1:
         return pairs[0]
     images = _of_kind(bag, _IMAGES)
     if pairs:
-        found = "; ".join("left={}&right={}".format(*pair.images) for pair in pairs[:3])
+        found = "; ".join("left={}&right={}".format(*pair) for pair in pairs[:3])
         raise SequenceError(f"{bag.path}: several stereo pairs, choose one: {found}")
     if not images:
         raise SequenceError(f"{bag.path}: no images; its topics are {_listed(sorted(bag.kinds))}")
@@ -288,49 +307,37 @@ def choose_topics(bag: Bag, options: Mapping[str, Any]) -> Topics:
     )
 
 
-def _with_infos(bag: Bag, images: tuple[str, ...], options: Mapping[str, Any]) -> Topics:
-    """Images with their cameras' messages, named or in the same name space, unless a calibration is named."""
-    names = []
-    for side, topic in zip(("left", "right"), () if "calibration" in options else images):
-        usual = f"{_split(topic)[0]}/camera_info"
-        if f"{side}_info" in options:
-            names.append(_named(bag, options[f"{side}_info"], (_INFO,)))
-        elif bag.kinds.get(usual) == _INFO:
-            names.append(usual)
-        else:
-            known = _listed(_of_kind(bag, (_INFO,)))
-            raise CalibrationError(
-                f"{bag.path}: no {usual} for {topic}: add {side}_info=/… (there are {known}) or calibration=FILE"
-            )
-    return Topics(images, tuple(names))
-
-
-def _pairs_by_messages(bag: Bag) -> Iterator[Topics]:
-    """All pairs of cameras that say that they are one."""
-    cameras = []
-    for name in _of_kind(bag, (_INFO,)):
-        images = [t for t in _preferred(bag) if _split(t)[0] == _split(name)[0] and not _is_depth(bag, t)]
-        if images and bag.first(name) is not None:
+def _pairs_by_messages(bag: Bag) -> list[tuple[str, ...]]:
+    """All pairs of cameras whose CameraInfo says that they are one."""
+    cameras: dict[str, tuple[object, float]] = {}
+    spaces = set()
+    for topic in _cameras(bag):
+        space = _split(topic)[0]
+        name = f"{space}/camera_info"
+        if space not in spaces and bag.kinds.get(name) == _INFO and bag.first(name) is not None:
+            spaces.add(space)
             info = camera_info(bag, name)
-            P, size = info["projectionmatrix"][1], info["size"][1]
+            P = info["projectionmatrix"][1]
             if P[0, 0] > 0:
-                cameras.append((images[0], name, (size, P[0, 0]), -P[0, 3] / P[0, 0]))
-    for left, left_info, a, left_offset in cameras:
-        for right, right_info, b, right_offset in cameras:
-            if a == b and abs(left_offset) < _SAME_PLACE and right_offset > _SAME_PLACE:
-                yield Topics((left, right), (left_info, right_info))
+                cameras[topic] = (info["size"][1], P[0, 0]), -P[0, 3] / P[0, 0]
+    return [
+        (left, right)
+        for left, (a, left_offset) in cameras.items()
+        for right, (b, right_offset) in cameras.items()
+        if a == b and abs(left_offset) < _SAME_PLACE and right_offset > _SAME_PLACE
+    ]
 
 
-def _pairs_by_name(bag: Bag) -> list[Topics]:
+def _pairs_by_name(bag: Bag) -> list[tuple[str, ...]]:
     """Pairs of topics of images that differ in one of the usual names for left and right, one of each two cameras."""
-    images = _preferred(bag)
-    found: dict[tuple[str, str], Topics] = {}
+    images = _cameras(bag)
+    found: dict[tuple[str, str], tuple[str, ...]] = {}
     for topic in images:
         for names in SIDES:
             other = topic.replace(*names)
-            if other != topic and other in images and not _is_depth(bag, topic):
+            if other != topic and other in images:
                 spaces = _split(topic)[0], _split(other)[0]
-                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), Topics((topic, other)))
+                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), (topic, other))
     return list(found.values())
 
 
@@ -347,22 +354,20 @@ def _of_kind(bag: Bag, kinds: tuple[str, ...]) -> list[str]:
     return sorted(topic for topic, kind in bag.kinds.items() if kind in kinds)
 
 
-def _is_depth(bag: Bag, topic: str) -> bool:
-    """Whether a topic holds depth images, or nothing."""
-    message = bag.first(topic)
-    if message is None or bag.kinds[topic] == COMPRESSED:
-        return message is None or "compressedDepth" in topic
-    return message.encoding in DEPTH
+def _cameras(bag: Bag) -> list[str]:
+    """Topics of images, not of depth, in the order in which they are taken: rectified, raw, and grey ones first."""
 
-
-def _preferred(bag: Bag) -> list[str]:
-    """Topics of images in the order in which they are chosen: rectified, raw before compressed, grey before colour."""
-
-    def key(topic: str) -> Any:
-        _, name = _split(topic)
+    def order(topic: str) -> tuple[bool, ...]:
+        name = _split(topic)[1]
         return "rect" not in name, bag.kinds[topic] == COMPRESSED, "color" in name
 
-    return sorted(_of_kind(bag, _IMAGES), key=key)
+    def depth(topic: str) -> bool:
+        message = bag.first(topic)
+        if message is None or bag.kinds[topic] == COMPRESSED:
+            return message is None or "compressedDepth" in topic
+        return message.encoding in DEPTH
+
+    return sorted((topic for topic in _of_kind(bag, _IMAGES) if not depth(topic)), key=order)
 
 
 def _split(topic: str) -> tuple[str, str]:
