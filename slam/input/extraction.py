@@ -96,9 +96,8 @@ class Extractor:
             raise ConfigurationError("this system has no front end: use process_features")
         if not isinstance(frame, StereoFrame):
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
-        stages, checksum = Stages(), checksum_of(frame)
-        if checksum is not None and checksum[0] == checksum[1]:
-            frame = self._warnings.one_image_twice(frame)
+        stages = Stages()
+        frame, checksum = self._warnings.without_copies(frame, checksum_of(frame))
         with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
             features = outside_masks(documented(frontend.extract(frame), self._rig), frame, self._rig)
         self._warnings.look(frame, features)

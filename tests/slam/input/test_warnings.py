@@ -74,6 +74,27 @@ def test_one_camera_twice_is_refused_and_a_single_frame_loses_its_right_image():
     assert any("frame 2: left and right are one and the same image; it and others" in line for line in system.warnings)
 
 
+def test_a_camera_that_freezes_measures_nothing():
+    """A right image that stays is not used; with a left one that stays the whole frame is a repeated one."""
+    frames = list(slam.open_sequence("synthetic:desk?frames=6"))
+    right = [replace(f, right=frames[2].right if 2 <= f.index < 5 else f.right) for f in frames]
+    system = slam.StereoSlam(RIG, "surf", "ekf")
+    seen = [system.process(frame).features.has_stereo.sum() > 50 for frame in right]
+    assert seen == [True, True, True, False, False, True]
+    assert any("frame 3: the right image is that of the frame before: its camera froze" in w for w in system.warnings)
+    left = [replace(f, left=frames[2].left if 2 <= f.index < 5 else f.left) for f in frames]
+    system = slam.StereoSlam(RIG, "surf", "ekf")
+    before = [system.process(frame).status.value for frame in left]
+    assert before[3:5] == ["predicted"] * 2 and before[5] == "tracked"
+
+
+def test_right_images_that_slip_later_are_named():
+    frames = list(slam.open_sequence("synthetic:desk?frames=80"))[::4]
+    slipped = [replace(b, right=b.right if b.index < 24 else a.right) for a, b in pairwise(frames)]
+    (line,) = lines(slipped)
+    assert "not of one moment, though they were" in line and "a frame too late" in line
+
+
 def test_swapped_cameras_of_an_unrectified_rig():
     turn = cv2.Rodrigues(np.array([0.02, 0.05, -0.03]))[0]
     left = PinholeCamera(250.0, 251.0, 170.0, 110.0, 320, 240, "radtan", (-0.1, 0.02, 0.001, 0.0))
@@ -224,7 +245,7 @@ def test_images_never_rectified_are_named():
     H = RIG.left.K @ turn @ np.linalg.inv(RIG.left.K)
     raw = [replace(f, right=cv2.warpPerspective(f.right, H, (320, 240))) for f in stamped([0.0, 0.1])]
     (line,) = lines(raw)
-    assert "were the images rectified, as this calibration says" in line
+    assert "were they rectified, as this calibration says" in line
 
 
 def test_a_repeated_pattern_is_named_as_the_reason():
