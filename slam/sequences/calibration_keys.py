@@ -83,10 +83,8 @@ Entry = tuple[str, Any]  # an entry's name as written, and its value
 class Entries:
     """The entries of calibration files by their names in lower case, letters and digits only.
 
-    Args:
-        files: entries by such names; of two files of one camera each the first is the left one's.
-        form: whose form it is, as ``"Kalibr's"``; empty where the entries are to tell. OpenCV's, and five plain
-            numbers, stay without: of these alone the unit and the model of the lens may be another one.
+    Of two files of one camera each the first is the left one's. Whose `form` it is, as ``"Kalibr's"``, the entries tell
+    where it is empty. OpenCV's, and five plain numbers, have none: of these alone unit and lens may be another one.
     """
 
     def __init__(self, files: Sequence[Mapping[str, Entry]], form: str = "") -> None:
@@ -144,20 +142,12 @@ def read_entries(paths: Sequence[Path], images: Size | None) -> Entries:
 
 
 def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, fisheye: bool) -> StereoRig:
-    """The rig of calibration files.
+    """The rig of calibration files, lengths in them in units of so many metres.
 
     Taken are two cameras with R and T as ``cv2.stereoCalibrate`` gives them (``h_right = R h_left + T``), with poses on
-    a body, or with rectifications; for rectified images two projections, or the numbers fx, fy, cx, cy and baseline.
-
-    Args:
-        entries: of the files.
-        images: width and height of the images, where the files name none; None where they are not known.
-        unit: metres per unit of T, of the projections' last column, and of the baseline.
-        rectified: take the projections, although camera matrices may be there too.
-        fisheye: the distortion is ``cv2.fisheye``'s; also where the file names such a model.
-
-    Raises:
-        CalibrationError: entries are missing (all are named), or the rig is impossible.
+    a body, or with rectifications; for `rectified` images two projections, or fx, fy, cx, cy and baseline. The size of
+    the images counts where the files name none; `fisheye` distortion is ``cv2.fisheye``'s. CalibrationError where
+    entries are missing, or the rig is impossible.
     """
     sizes = [_size(entries, side) for side in (0, 1)]
     size = sizes[0] or sizes[1] or images
@@ -232,11 +222,7 @@ def _projections(entries: Entries, unit: float) -> tuple[Array, Array]:
 
 
 def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:
-    """A rectified rig of two equal cameras by five numbers; None where none of them is there.
-
-    Raises:
-        CalibrationError: numbers are missing or impossible; all of them are named.
-    """
+    """A rectified rig of two equal cameras by five numbers, of which all that are wrong are named; None for none."""
     side = 0 if entries.find("fx") is None and entries.find("fx", 0) is not None else None
     last = "bf" if entries.find("baseline") is None and entries.find("bf") is not None else "baseline"
     found = {name: entries.find(name, side) for name in _PLAIN} | {last: entries.find(last)}

@@ -47,15 +47,13 @@ class CameraSequence:
     again and again for a while; one that stays silent ends the sequence with an error. `frames` opens it anew: images
     that waited in a queue until then are old.
 
-    Args:
-        text: the address, or two joined by a comma, see `slam.sequences.captures.open_device`; empty where the options
-            ``left`` and ``right`` name them.
-        options: those of `OPTIONS` that are given.
+    Its text is the address, or two joined by a comma, see `slam.sequences.captures.open_device`; empty where the
+    options ``left`` and ``right`` name them.
 
     Raises:
         SequenceError: a camera cannot be opened, gives no image, or one of another size than the calibration is for.
         CalibrationError: the calibration is missing, unreadable or impossible.
-        ConfigurationError: an option has an impossible value; no camera is named, or more than two.
+        ConfigurationError: no camera is named, or more than two.
     """
 
     format = "camera"

@@ -128,12 +128,8 @@ def quiet_libraries() -> Iterator[None]:
 def open_device(address: str, width: float | None = None, height: float | None = None, fps: float | None = None) -> Any:
     """Open a camera as a ``cv2.VideoCapture``; SequenceError where it cannot be opened, or is a file.
 
-    Args:
-        address: a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address
-            of a network.
-        width: asked of the camera [px], as `height`, and `fps` [1/s]; None for its own choice.
-        height: the same.
-        fps: the same.
+    Its address is a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address of a
+    network. Width and height [px] and `fps` [1/s] are asked of it; None for its own choice.
     """
     import cv2
 

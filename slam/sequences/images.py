@@ -34,10 +34,8 @@ def read_image(path: Path, size: Size | None = None) -> np.ndarray:
     """The image (H, W) in grey, uint8 or uint16 as stored; colour is converted, EXIF rotation ignored.
 
     The size is taken from the header before anything is decoded. A file that is cut off, or a PNG with a wrong
-    checksum, is never taken for a partly grey image. With `size` it must have this width and height.
-
-    Raises:
-        SequenceError: the file is missing, cut off, damaged, or no image, or of another size; the message names it.
+    checksum, is never taken for a partly grey image. SequenceError where the file is missing, damaged or no image, or
+    of another `size`.
     """
     return decode_image(read_bytes(path, _LARGEST), str(path), size)
 

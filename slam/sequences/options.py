@@ -58,15 +58,9 @@ def value_of(name: str, text: str) -> Any:
 
 
 class Options(dict[str, Any]):
-    """Options by name, with their values; they remember which of them were read.
+    """Options of a format by name, with their values; they remember which of them were read.
 
-    Args:
-        query: ``key=value&key=value``.
-        format: for which they are, for messages.
-        known: names of the options that the format has.
-
-    Raises:
-        ConfigurationError: an option is not known, or its value is none.
+    ConfigurationError where the query, ``key=value&key=value``, has one that is not `known`, or whose value is none.
     """
 
     def __init__(self, query: str, format: str, known: frozenset[str]) -> None:

@@ -193,10 +193,8 @@ def pair_up(
     what is left out or stands alone is reported. Without a right listing both images are in one file, side by side.
 
     Time is by the file of `times`, else by ``fps``, else by stamps, else by numbers at `RATE`. Rows of the file belong
-    to the left images in order; with `by_number` a row's number is a frame's.
-
-    Raises:
-        SequenceError: nothing pairs, or hardly a frame has a time.
+    to the left images in order; with `by_number` a row's number is a frame's. SequenceError where nothing pairs, or
+    hardly a frame has a time.
     """
     rate = None if times else options.get("fps")
     partner = np.full(len(left), -1)

@@ -69,16 +69,9 @@ def _one_line(path: Path) -> Iterator[None]:
 
 
 def grey_image(message: Any, kind: str, what: str, size: Size | None = None) -> np.ndarray:
-    """The image (H, W) of a message in grey, 8 or 16 bits as sent; sizes are checked before anything is decoded.
+    """The image (H, W) of a message of a `kind`, `RAW` or `COMPRESSED`, in grey, 8 or 16 bits as sent.
 
-    Args:
-        message: as rosbags reads it.
-        kind: its type, `RAW` or `COMPRESSED`.
-        what: where it is from, for the message of an error.
-        size: width and height that the image must have; None for any.
-
-    Raises:
-        SequenceError: it is damaged, or in an unknown encoding, or of another size.
+    SequenceError, which names `what` it is, where it is damaged, in an unknown encoding, or of another size.
     """
     if kind == COMPRESSED:
         return decode_image(bytes(message.data), what, size)
@@ -205,8 +198,7 @@ def _unpack(packed: Path, target: Path) -> None:
 def camera_info(bag: Bag, topic: str) -> dict[str, Entry]:
     """The first CameraInfo message of a topic, of ROS 1, which writes matrices in capitals, or 2, as entries.
 
-    Raises:
-        CalibrationError: there is none, it holds what no calibration holds, or only a part of the image is given.
+    CalibrationError where there is none, it holds what no calibration holds, or only a part of the image is given.
     """
     message = bag.first(topic)
     if message is None:
@@ -225,8 +217,7 @@ def camera_info(bag: Bag, topic: str) -> dict[str, Entry]:
 def rig_by_messages(infos: Sequence[dict[str, Entry]], rectified: bool, unit: float = 1.0) -> StereoRig:
     """The rig of the rectified or of the raw images; the baseline in ``P`` is in units of so many metres.
 
-    Raises:
-        CalibrationError: a camera is not calibrated, or not as one of a pair; or the rig is impossible.
+    CalibrationError where a camera is not calibrated, or not as one of a pair; or the rig is impossible.
     """
     for side, info in zip(("left", "right"), infos):
         if not (info["projectionmatrix"][1][0, 0] > 0 and info["cameramatrix"][1][0, 0] > 0):
@@ -268,7 +259,10 @@ def choose_topics(bag: Bag, options: Mapping[str, Any]) -> Topics:
         if len(sides) > len(set(images)):
             raise ConfigurationError(f"left and right are the same topic, {images[0]}")
     else:
-        images = _only_one(bag, _cameras(bag)) if sides == ("left",) else _only_pair(bag, options)
+        images = tuple(_cameras(bag)) if sides == ("left",) else _only_pair(bag, options)
+        if sides == ("left",) and len(images) != 1:
+            there = f"{len(images)} topics of images, where layout=sbs needs one"
+            raise SequenceError(f"{bag.path}: {there}: add left=/… of {_listed(list(images))}")
     infos = []
     for side, topic in zip(("left", "right"), () if "calibration" in options else images * (3 - len(images))):
         usual = f"{_split(topic)[0]}/camera_info"
@@ -280,14 +274,6 @@ def choose_topics(bag: Bag, options: Mapping[str, Any]) -> Topics:
             there = f"add {side}_info=/… (there are {_listed(_of_kind(bag, (_INFO,)))}) or calibration=FILE"
             raise CalibrationError(f"{bag.path}: no {usual} for {topic}: {there}")
     return Topics(images, tuple(infos))
-
-
-def _only_one(bag: Bag, images: list[str]) -> tuple[str, ...]:
-    """The only topic of images."""
-    if len(images) != 1:
-        there = f"{len(images)} topics of images, where layout=sbs needs one"
-        raise SequenceError(f"{bag.path}: {there}: add left=/… of {_listed(images)}")
-    return (images[0],)
 
 
 def _only_pair(bag: Bag, options: Mapping[str, Any]) -> tuple[str, ...]:

@@ -33,12 +33,8 @@ _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASC
 def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T | None]:
     """The rows of a text file; blank lines and ``#`` comments do not count.
 
-    A row that `parse` refuses with a ValueError is reported to `faults` and stands as None, so that row numbers keep
-    their meaning.
-
-    Raises:
-        SequenceError: the file cannot be read or holds no row, or more than half of its rows are refused (the
-            message names the first of them).
+    A row that `parse` refuses with a ValueError is reported and stands as None, so that row numbers keep their meaning.
+    SequenceError where the file cannot be read or holds no row, or where more than half of its rows are refused.
     """
     rows: list[T | None] = []
     refused: list[str] = []
@@ -120,11 +116,10 @@ def shorten(text: str, length: int = 40) -> str:
 
 
 def require_truth(path: Trajectory, source: Path) -> Trajectory:
-    """The true path of a file, where every pose is a rigid motion, and the whole path not all zeros.
+    """The true path of a file.
 
-    Raises:
-        TrajectoryError: a rotation is none (a matrix of zeros, a reflection), a position is beyond the Earth, or every
-            position is exactly zero: errors against such a path would mean nothing.
+    TrajectoryError where a rotation is none (a matrix of zeros, a reflection), a position beyond the Earth, or every
+    position exactly zero: errors against such a path would mean nothing.
     """
     if not len(path):
         raise TrajectoryError(f"{source}: no pose is left")
