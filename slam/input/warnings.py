@@ -252,9 +252,7 @@ def _the_same(found: PairGeometry, rig: StereoRig) -> str:
 def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
     if rig.is_rectified:
-        cause = (
-            "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
-        )
+        cause = "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
     elif 2 * found.raw_offset < found.row_offset:
         cause = (
             f"as they are they agree to {found.raw_offset:.1f} px: they were rectified before, and the calibration "

@@ -8,8 +8,6 @@ from itertools import islice
 from pathlib import Path
 
 from slam.naming import nearest
-from slam.sequences.captures import VIDEO_SUFFIXES
-from slam.sequences.images import IMAGE_SUFFIXES
 
 _LOOKED_AT = 500  # entries of a folder, and folders below one that is no sequence
 _LEVELS = 3  # folders above and below one that is no sequence: mav0/cam0/data, data_2d_raw/drive
@@ -31,16 +29,15 @@ def near_name(folder: Path, text: str) -> str:
 
 
 def sequences_near(folder: Path, format_of: Format) -> str:
-    """Which of the folders in a folder may be the cameras, and which sequences lie below it, or it is a part of."""
-    cameras = _two_cameras(folder)
+    """Which sequences lie below a folder, or it is a part of; else how to name the two cameras in it."""
     below = sorted(str(path.relative_to(folder)) for path in _below(folder, format_of))
     if below:
         more = f", … ({len(below)})" if len(below) > _LISTED else ""
-        return f"{cameras}; below it are {', '.join(below[:_LISTED])}{more}: give one of them"
-    for parent in () if cameras else islice(folder.parents, _LEVELS):
+        return f"; below it are {', '.join(below[:_LISTED])}{more}: give one of them"
+    for parent in islice(folder.parents, _LEVELS):
         if (name := _format(parent, format_of)) is not None:
             return f"; it is a part of one: give {parent} (format {name})"
-    return cameras
+    return f"; where two cameras are in it by other names: '{folder.name}?left=…&right=…'"
 
 
 def _below(folder: Path, format_of: Format) -> list[Path]:
@@ -67,14 +64,3 @@ def _inside(folder: Path) -> list[Path]:
     with suppress(OSError):
         return list(islice(folder.iterdir(), _LOOKED_AT))
     return []
-
-
-def _two_cameras(folder: Path) -> str:
-    """How to name the cameras where the folder has two folders of images, or two videos, by other names."""
-    names: list[str] = []
-    for path in sorted(_inside(folder)):
-        images = sum(p.suffix.lower() in IMAGE_SUFFIXES for p in _inside(path))
-        if path.suffix.lower() in VIDEO_SUFFIXES or images > 1:
-            names.append(path.name)
-    two = names if len(names) == 2 else [name for name in names if not Path(name).suffix]
-    return f"; say which is which: '{folder.name}?left={two[0]}&right={two[1]}'" if len(two) == 2 else ""

@@ -147,12 +147,8 @@ def _choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str,
     for left, right in pairs:
         if all((folder / f"image_{c}").is_dir() for c in (left, right)):
             return left, right
-    there = [path for pair in pairs for camera in pair if (path := folder / f"image_{camera}").exists()]
-    if files := [path for path in there if not path.is_dir()]:
-        raise SequenceError(f"{files[0]}: a file where a folder of images should be")
-    found = f"only {', '.join(path.name for path in there)} is there" if there else "no folder of images is there"
-    wanted = " or ".join(f"image_{a} and image_{c}" for a, c in pairs)
-    raise SequenceError(f"{folder}: two cameras are needed ({wanted}), {found}")
+    wanted = " or ".join(f"folders image_{a} and image_{c}" for a, c in pairs)
+    raise SequenceError(f"{folder}: two cameras are needed, {wanted}")
 
 
 def _rig(folder: Path, where: Layout, size: Size, options: Options) -> tuple[StereoRig, Array]:

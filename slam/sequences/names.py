@@ -71,8 +71,9 @@ def odd_ones(names: Sequence[str]) -> set[str]:
 def of_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
     """The left and the right ones of some names by words such as left and right in them; None for neither."""
     for words in (*SIDES, ("l", "r")):
-        ends = (rf"(?<![a-z]){word}(?![{'0-9' if word[-1].isdigit() else 'a-z'}])" for word in words)
-        left, right = ([n for n in names if re.search(end, n, re.IGNORECASE)] for end in ends)
+        around = "A-Za-z" if words == ("l", "r") else "a-z"
+        ends = (rf"(?<![{around}])(?i:{word})(?![{'0-9' if word[-1].isdigit() else around}])" for word in words)
+        left, right = ([n for n in names if re.search(end, n)] for end in ends)
         if left and right and not set(left) & set(right):
             return left, right
     return None

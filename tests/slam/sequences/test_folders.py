@@ -131,7 +131,8 @@ def test_words_for_left_and_right() -> None:
     assert of_sides(["left_01.png", "right_01.png"]) == (["left_01.png"], ["right_01.png"])
     assert of_sides(["0_cam0.png", "0_cam1.png", "0_cam10.png"]) == (["0_cam0.png"], ["0_cam1.png"])
     assert of_sides(["L01.png", "R01.png"]) == (["L01.png"], ["R01.png"])
-    assert of_sides(["brightness.png", "leftover.png"]) is None
+    assert of_sides(["a_leftImg8bit.png", "a_rightImg8bit.png"]) == (["a_leftImg8bit.png"], ["a_rightImg8bit.png"])
+    assert of_sides(["brightness.png", "leftover.png"]) is of_sides(["HALL_1.png", "DOOR_1.png"]) is None
     assert keys_of([["a.png", "b.png"]]) is None
 
 

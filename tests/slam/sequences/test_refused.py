@@ -51,7 +51,7 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
         "text/a.txt": r"a\.txt: a file where the sequence's folder should be$",
         "both.mp4": r"folder should be; a video .* is .*both\.mp4\?layout=sbs",
         "garden/left": f"{here} has no 'garden'",
-        "pair": r"say which is which: 'pair\?left=port&right=starboard'$",
+        "pair": r"by other names: 'pair\?left=…&right=…'$",
         kitti / "image_0": rf"give {kitti} .format kitti",
         euroc / "mav0/cam0/data": rf"give {euroc}(/mav0)? .format euroc",
         kitti.parent.parent: r"no sequence of a known format .*; below it are sequences.03: give one of them$",
