@@ -26,7 +26,7 @@ class Side(NamedTuple):
 
 def matches_folder(folder: Path) -> bool:
     """Whether a folder holds two cameras by one of the usual names, as folders, videos or images; or one of them."""
-    return folder.is_dir() and (two_cameras(folder) is not None or any(_called(folder, side) for side in (0, 1)))
+    return folder.is_dir() and (_two_cameras(folder) is not None or any(_called(folder, side) for side in (0, 1)))
 
 
 def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
@@ -58,14 +58,14 @@ def _source(sides: list[Side], home: Path, options: Options, faults: FaultLog) -
 def _sides(folder: Path, options: Options) -> list[Side]:
     """Both cameras, or the one place where both are side by side."""
     if options.get("layout") is None:
-        if not options.keys() & {"left", "right"} and (both := two_cameras(folder)):
-            return both
+        if not options.keys() & {"left", "right"} and (both := _two_cameras(folder)):
+            return [side if side.names else _found(side.path) for side in both]
         sides = []
         for at, name in enumerate(("left", "right")):
-            side = _found(folder / expanded(options[name])) if name in options else _called(folder, at)
-            if side is None:
+            path = folder / expanded(options[name]) if name in options else _called(folder, at)
+            if path is None:
                 raise SequenceError(f"{folder}: two cameras are needed, but there is no {name} one: add {name}=…")
-            sides.append(side)
+            sides.append(_found(path))
         return sides
     if folder.is_file():
         return [Side(folder)]
@@ -92,26 +92,26 @@ def _found(path: Path) -> Side:
     return Side(path) if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES else Side(path, image_names(path))
 
 
-def two_cameras(folder: Path) -> list[Side] | None:
-    """Two folders, two videos, or the images of one folder, by words such as left and right in their names."""
+def _two_cameras(folder: Path) -> list[Side] | None:
+    """Two folders or videos, or the images of one folder, by words such as left and right in their names."""
     inside = _inside(folder)
     places = [p.name for p in inside if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES]
     for words in SIDES:  # these alone, before names that hold them
         exact = [[name for name in places if name.lower().partition(".")[0] == word] for word in words]
         if all(exact):
-            return [_found(folder / min(names)) for names in exact]
+            return [Side(folder / min(names)) for names in exact]
     found = of_sides(places)
     if found and len(found[0]) == len(found[1]) == 1:
-        return [_found(folder / names[0]) for names in found]
+        return [Side(folder / names[0]) for names in found]
     images = of_sides([p.name for p in inside if p.suffix.lower() in IMAGE_SUFFIXES])
     return None if images is None else [Side(folder, sorted(names, key=natural)) for names in images]
 
 
-def _called(folder: Path, side: int) -> Side | None:
+def _called(folder: Path, side: int) -> Path | None:
     """What is called as the cameras of one side usually are, though the other side is missing."""
     names = {words[side] for words in SIDES} - {words[1 - side] for words in SIDES}
     usual = (path for path in sorted(_inside(folder)) if path.stem.lower() in names)
-    return next((_found(path) for path in usual if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES), None)
+    return next((path for path in usual if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES), None)
 
 
 def _inside(folder: Path) -> list[Path]:

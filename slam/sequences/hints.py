@@ -7,6 +7,7 @@ from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
+from slam.errors import SequenceError
 from slam.naming import nearest
 
 _LOOKED_AT = 500  # entries of a folder, and folders below one that is no sequence
@@ -54,7 +55,7 @@ def _below(folder: Path, format_of: Format) -> list[Path]:
 
 
 def _format(path: Path, format_of: Format) -> str | None:
-    with suppress(OSError):
+    with suppress(OSError, SequenceError):
         return format_of(path)
     return None
 

@@ -138,17 +138,19 @@ def _in_time(topics: list[Messages], faults: FaultLog) -> list[Listing]:
     for topic, taken, recorded in topics:
         rows = np.arange(len(taken))
         steps = np.abs(np.diff(taken))
-        usual = np.array([_usual(recorded - taken, row - _AROUND // 2) for row in rows.tolist()])
-        rows = rows[np.abs(recorded - taken - usual) <= max(_LATEST, _AROUND * (np.median(steps) if len(steps) else 0))]
-        stamps, found = taken[rows], list[int]()
+        ahead = recorded - taken
+        usual = np.array([_usual(ahead, row - _AROUND // 2) for row in rows.tolist()])
+        rows = rows[np.abs(ahead - usual) <= max(_LATEST, _AROUND * (np.median(steps) if len(steps) else 0))]
+        stamps, ahead, found = taken[rows], ahead[rows], list[int]()
+        latest, start = -np.inf, 0
         for at in (np.flatnonzero(np.diff(stamps) < 0) + 1).tolist():
-            ahead = recorded[rows] - stamps
+            latest, start = max(latest, stamps[start:at].max()), at
             shift = round(_usual(ahead, at) - _usual(ahead, at - _AROUND))
-            behind = stamps[:at].max() - stamps[at]
-            if 2 * shift > behind > 0 and (len(rows) - at > _AROUND // 2 or shift > _LATEST):
+            if 2 * shift > latest - stamps[at] > 0 and (len(rows) - at > _AROUND // 2 or shift > _LATEST):
                 found.append(shift)
                 shift = shifts[len(found) - 1] if len(found) <= len(shifts) else shift
                 stamps[at:] += shift
+                ahead[at:] -= shift
                 line = f"{topic}: the clock was set back by {1e-9 * shift:.3f} s at message {rows[at]}"
                 faults.report("clock", f"{line}; time goes on by the clock of the recording")
         shifts = shifts or found
