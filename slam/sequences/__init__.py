@@ -94,8 +94,10 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
     with FaultLog(lines, at_the_end=True) as faults:
         found: RecordedSequence = getattr(module, f"open_{_FORMATS[name][1]}")(folder, options, faults)
         masks = read_masks(options.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
+        swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
-    return replace(found, ground_truth=turned(found.ground_truth, found.rig), masks=masks, warnings=lines)
+    truth = turned(found.ground_truth, found.rig)
+    return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
 
 def _open_world(text: str) -> Sequence:

@@ -114,6 +114,7 @@ class RecordedSequence:
     truth_noise: TruthNoise = field(default_factory=TruthNoise)  # how well the ground truth is known
     warnings: list[str] = field(default_factory=list)
     masks: Masks = (None, None)  # where the images of both cameras may be used
+    swap: bool = False  # what the source gives as left is the right camera's
 
     @property
     def stamps(self) -> Array:
@@ -146,6 +147,8 @@ class RecordedSequence:
                 right = other[0] if other else None
                 if not other and isinstance(left, np.ndarray):
                     left, right = halves(left, self.name)
+                if self.swap:
+                    left, right = right, left
                 if isinstance(right, SequenceError) and not isinstance(left, SequenceError):
                     line = f"frame {index} is given without its right image: {right}"
                     faults.report("right images unreadable, frames given without them", line)

@@ -21,7 +21,7 @@ from slam.sequences.images import halves, recorded_size, require_same_size, size
 from slam.sequences.options import CALIBRATION, Options, read_options
 from slam.sequences.rigs import calibration_files, read_rig
 
-OPTIONS = CALIBRATION | {"left", "right", "swap", "width", "height", "fps", "wait"}
+OPTIONS = CALIBRATION | {"left", "right", "width", "height", "fps", "wait"}
 
 #: How long frames are waited for where a camera gives none [s].
 WAIT = 10.0

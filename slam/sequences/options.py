@@ -10,7 +10,7 @@ from slam.errors import ConfigurationError
 from slam.naming import suggestion
 
 #: Options of every format whose calibration is in a file that can be named.
-CALIBRATION = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask"})
+CALIBRATION = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask", "swap"})
 
 #: Options that every recorded format knows; which of them mean something depends on what is found in the folder.
 RECORDED = CALIBRATION | {"tolerance", "times", "fps", "left", "right", "layout"}

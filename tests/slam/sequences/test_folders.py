@@ -197,6 +197,7 @@ def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str])
     for usual, name in zip(("left", "right"), names):
         (two_folders / usual).rename(two_folders / name)
     assert seeds(open_sequence(two_folders)) == PAIRS
+    assert seeds(open_sequence(f"{two_folders}?swap=yes")) == [(b, a) for a, b in PAIRS]
 
 
 def test_one_folder_with_both_cameras_in_it_and_patterns(two_folders: Path) -> None:
@@ -229,6 +230,7 @@ def test_images_and_videos_side_by_side(two_folders: Path, tmp_path: Path, build
         assert seeds(sequence) == PAIRS
         assert (sequence.name, len(sequence), sequence.rig.width) == (name, 6, 64)
         assert np.allclose(sequence.stamps, step * np.arange(6))
+    assert seeds(open_sequence(f"{folder}?layout=sbs&swap=yes")) == [(b, a) for a, b in PAIRS]
     build.write_image(folder / "3.png", 3, 131)
     assert [f.index for f in open_sequence(f"{folder}?layout=sbs")] == [0, 1, 2, 4, 5]
 
