@@ -31,8 +31,8 @@ def test_choosing_ekf_leaves_gtsam_unloaded():
         "rig = slam.StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)\n"
         "system = slam.StereoSlam(rig, 'surf', 'ekf')\n"
         "image = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)\n"
-        "system.process(slam.StereoFrame(0, 0.0, image, image))\n"
-        "system.process(slam.StereoFrame(1, 0.1, image, image))\n"
+        "system.process(slam.StereoFrame(0, 0.0, image, image[:, ::-1]))\n"
+        "system.process(slam.StereoFrame(1, 0.1, image, image[:, ::-1]))\n"
     )
     assert not {m for m in modules_after(code) if m.startswith("gtsam")}
 

@@ -89,6 +89,7 @@ class Extractor:
         Raises:
             ConfigurationError: there is no front end.
             MeasurementError: this is no frame, or the features are not as documented.
+            SequenceError: left and right are one image, or exchanged, see `InputWarnings`.
             SlamError: another thread is extracting; or the front end failed (`PartError`).
         """
         if frontend is None:
@@ -96,7 +97,8 @@ class Extractor:
         if not isinstance(frame, StereoFrame):
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
+        frame, checksum = self._warnings.without_copies(frame, checksum_of(frame))
         with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
             features = outside_masks(documented(frontend.extract(frame), self._rig), frame, self._rig)
         self._warnings.look(frame, features)
-        return Extracted(frame, features, stages.milliseconds, checksum_of(frame))
+        return Extracted(frame, features, stages.milliseconds, checksum)

@@ -34,7 +34,7 @@ class PairGeometry:
     conclusive: bool = False  # there are more than wrong ones would give by chance; else the other numbers are zero
     as_given: int = 0  # in the same row and with positive disparity, as they must be
     as_swapped: int = 0  # likewise with left and right image exchanged
-    without_disparity: int = 0  # in the same row without disparity
+    at_same_place: int = 0  # at one and the same pixel of both images, as they are, not rectified
     off_rows: int = 0  # whose rows differ, by more than the front end finds reliably
     row_offset: float = 0.0  # median difference of their rows [px]
     raw_offset: float = 0.0  # the same of the images as they are, not rectified [px]
@@ -47,7 +47,7 @@ class PairGeometry:
     @property
     def same(self) -> bool:
         """Most matches are at the same place in both images."""
-        return self.conclusive and most(self.without_disparity, self.matches - self.without_disparity)
+        return self.conclusive and most(self.at_same_place, self.matches - self.at_same_place)
 
     @property
     def rows_differ(self) -> bool:
@@ -82,7 +82,7 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         True,
         int(((shift > _TOLERANCE) & (np.abs(offset) <= band)).sum()),
         int(((shift_swapped > _TOLERANCE) & (np.abs(offset_swapped) <= band)).sum()),
-        int(((np.abs(shift) <= _TOLERANCE) & (np.abs(offset) <= band)).sum()),
+        int((np.abs(b - a).max(axis=1) <= _TOLERANCE).sum()),
         int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
         float(np.median(np.abs(b[:, 1] - a[:, 1]))),

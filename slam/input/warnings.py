@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
-from slam.errors import CalibrationError
+from slam.errors import CalibrationError, SequenceError
 from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
@@ -26,10 +27,16 @@ SHORTEST, LONGEST = 1e-3, 10.0
 #: guard: plausible baselines [m]; others are more often a length in another unit.
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
 
+_USUAL = (0.02, 2.0)  # guard: baselines [m] that a unit is proposed for
+
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: successive frames that must show too little before a warning
 _LAST_LOOK = 1024  # guard: last frame at which the stereo pair is checked
 _ALIKE = 0.2  # guard: distance of descriptors of which there is hardly a pair in an image without repeated patterns
+_FITS = 0.95  # guard: share of the matches that fit the rig, below which other frames' images are looked at again
+
+Checksum = tuple[int, int]  # of the bytes of the left and the right image
+
 _UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 
 
@@ -53,14 +60,23 @@ class InputWarnings:
         self._farthest = farthest_apart(rig, models)
         self._stamps: list[float] = []
         self._count = self._poor = self._unpaired = 0
-        self._pair_is_known = self._texture_is_known = self._partners_are_known = self._moment_is_known = False
+        self._pair_is_named = self._pair_is_known = self._moment_is_known = False  # as wrong; as right
+        self._texture_is_known = self._partners_are_known = False
+        self._two_images = self._copied = False  # a pair of different images was seen, a copy was named
+        self._last: Checksum | None = None  # of the frame before
         self._before: StereoFrame | None = None
         self._fits = np.zeros(3, int)  # matches with the right image of this frame, the next one and the one before
         for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig.left, rig.right))):
             self._warn(unlikely)
+            self._pair_is_named = self._partners_are_known = True  # and what follows from it is not
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
-        """Check a frame and the features found in it, which are as documented."""
+        """Check a frame and the features found in it, which are as documented.
+
+        Raises:
+            SequenceError: left and right are exchanged, for certain: no pair before was right, features fit the rig
+                the other way round, and hardly any has a right match as it is.
+        """
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
@@ -68,7 +84,7 @@ class InputWarnings:
         if not self._texture_is_known:
             self._check_texture(frame.left, len(features))
         if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK:  # a power of two
-            self._check_pair(frame)
+            self._check_pair(frame, 10 * int(features.has_stereo.sum()) < len(features))
         if not self._partners_are_known and frame.right is not None:
             self._check_partners(features)
         self._before = frame
@@ -116,19 +132,19 @@ class InputWarnings:
         found = f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image"
         self._warn(found + cause)
 
-    def _check_pair(self, frame: StereoFrame) -> None:
+    def _check_pair(self, frame: StereoFrame, unpaired: bool) -> None:
         """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
-        if self._pair_is_known and self._moment_is_known:
-            return
-        own = self._geometry(frame, frame)
+        own = None if self._pair_is_named else self._geometry(frame, frame)
         if own is None:
             return
         if not self._pair_is_known and (own.swapped or own.same):
-            self._pair_is_known = self._moment_is_known = True
+            self._pair_is_named = True
+            if own.swapped and unpaired:
+                raise SequenceError(_swapped(own))
             self._warn(_swapped(own) if own.swapped else _the_same(own, self._rig))
-        elif not self._moment_is_known and self._before is not None:
+        elif self._before is not None and (not self._moment_is_known or own.as_given < _FITS * own.matches):
             self._check_moment(frame, own)
-        self._partners_are_known |= self._pair_is_known and bool(self.lines)  # the reason is known then
+        self._partners_are_known |= self._pair_is_named  # the reason is known then
 
     def _check_moment(self, frame: StereoFrame, own: PairGeometry) -> None:
         """Warn if left images fit the right ones of other frames, or else if rows do not match."""
@@ -138,18 +154,22 @@ class InputWarnings:
             self._fits += [own.as_given, neighbours[0].as_given, neighbours[1].as_given]
         fit, *others = self._fits.tolist()
         if most(max(others), fit):
-            self._pair_is_known = self._moment_is_known = True
+            self._pair_is_named = True
             which, wrong = ("before", "late") if others[0] >= others[1] else ("after", "early")
+            since = "left and right image are not of one moment" + ", though they were" * self._moment_is_known
             self._warn(
-                f"left and right image are not of one moment: {max(others)} features fit the rig with the left image "
-                f"of the frame {which}, {fit} with that of the same frame; the right images are a frame too {wrong}: "
-                "pair them by their times, or shift their numbers by one"
+                f"{since}: {max(others)} features fit the rig with the left image of the frame {which}, {fit} with "
+                f"that of the same frame, {self._count}; the right images are a frame too {wrong}: pair them by their "
+                "times, or shift their numbers by one"
             )
             return
-        self._moment_is_known = all(most(fit, other) for other in others)
+        if all(most(fit, other) for other in others):
+            self._moment_is_known = True
+            self._fits[:] = 0  # what comes later is counted anew
         if own.conclusive and not self._pair_is_known:
             self._pair_is_known = True
             if own.rows_differ:
+                self._pair_is_named = True
                 self._warn(_rows_differ(own, self._rig))
 
     def _geometry(self, left: StereoFrame, right: StereoFrame) -> PairGeometry | None:
@@ -159,8 +179,39 @@ class InputWarnings:
         try:
             return pair_geometry(self._rig, _eight_bits(left.left), _eight_bits(np.asarray(right.right)), self._rows)
         except CalibrationError:  # the rig cannot be rectified: a front end may not need that
-            self._pair_is_known = self._moment_is_known = True
+            self._pair_is_named = True
             return None
+
+    def without_copies(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[StereoFrame, Checksum | None]:
+        """A frame, and its checksum, without a right image that is a copy, which measures nothing.
+
+        That is one equal, byte for byte, to the left image, or to the right one of the frame before. A left image that
+        is that of the frame before makes the frame a repeated one, whatever the right one is.
+
+        Raises:
+            SequenceError: left and right are equal, and there was no pair of two images before: it is one camera twice.
+        """
+        last, self._last = self._last, checksum
+        if checksum is None or frame.right is None or frame.right.min() == frame.right.max():
+            return frame, checksum
+        copy = ""
+        if checksum[0] == checksum[1]:
+            copy = "left and right are one and the same image"
+            if not self._two_images:
+                raise SequenceError(f"frame {frame.index}: {copy}: two cameras are needed (see left=… and right=…)")
+        elif last is not None and checksum != last:
+            if checksum[0] == last[0]:
+                self._last = last
+                return frame, last
+            if checksum[1] == last[1]:
+                copy = "the right image is that of the frame before: its camera froze, or has a lower frame rate"
+        self._two_images = True
+        if not copy:
+            return frame, checksum
+        if not self._copied:
+            self._copied = True
+            self._warn(f"frame {frame.index}: {copy}; it and others like it are used without the right image")
+        return replace(frame, right=None), checksum
 
     def note_repeated(self, number: int) -> None:
         """Warn of a frame with the images of the frame before, by its number in its sequence."""
@@ -186,14 +237,14 @@ def look_alikes(features: StereoFeatures) -> int:
 def _swapped(found: PairGeometry) -> str:
     return (
         f"left and right look swapped: {found.as_swapped} of {found.matches} features fit the cameras when the images "
-        f"are exchanged, {found.as_given} as they are; exchange them (left=…&right=… of a folder, swap=yes of a camera)"
+        f"are exchanged, {found.as_given} as they are; exchange them with the option swap=yes"
     )
 
 
 def _the_same(found: PairGeometry, rig: StereoRig) -> str:
     horizon = rig.rectified.rig.left.fu * rig.baseline / NO_DISPARITY
     return (
-        f"left and right image show the same: {found.without_disparity} of {found.matches} features have no "
+        f"left and right image show the same: {found.at_same_place} of {found.matches} features have no "
         f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
     )
 
@@ -201,7 +252,7 @@ def _the_same(found: PairGeometry, rig: StereoRig) -> str:
 def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
     if rig.is_rectified:
-        cause = "were the images rectified, as this calibration says (no distortion, no rotation)?"
+        cause = "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
     elif 2 * found.raw_offset < found.row_offset:
         cause = (
             f"as they are they agree to {found.raw_offset:.1f} px: they were rectified before, and the calibration "
@@ -219,10 +270,10 @@ def baseline_doubt(rig: StereoRig) -> str:
     """What is wrong with an implausible baseline; empty if it is plausible."""
     if SHORTEST_BASELINE <= rig.baseline <= LONGEST_BASELINE:
         return ""
-    return (
-        f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres? "
-        "(an OpenCV file in millimetres needs unit=mm)"
-    )
+    metres = {unit: rig.baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
+    likely = [f"unit={unit} makes {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
+    hint = f" ({', '.join(likely)})" if likely else ""
+    return f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres?{hint}"
 
 
 def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:

@@ -16,23 +16,22 @@ from slam.files import expanded, note_input, reason
 from slam.naming import unknown
 from slam.sequences import hints
 from slam.sequences.base import RecordedSequence, Sequence, is_live, read_masks, turned
+from slam.sequences.captures import VIDEO_SUFFIXES
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import OPTIONS, Given, check_options, read_options
+from slam.sequences.options import RECORDED, Options, read_options
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
 #: Formats on disk, in the order in which they are tried: module, the end of its functions' names, and description.
 _FORMATS = {
-    "euroc": ("slam.sequences.euroc", "folder", "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
-    "kitti-raw": ("slam.sequences.kitti", "drive", "KITTI raw drives: image_00/data, image_01/data"),
-    "kitti": ("slam.sequences.kitti", "folder", "KITTI odometry sequences: image_0, image_1, calib.txt"),
-    "ros": ("slam.sequences.ros", "folder", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
+    "ros": ("ros", "folder", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
+    "euroc": ("euroc", "folder", "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
+    "kitti-raw": ("kitti", "drive", "KITTI raw drives: image_00/data, image_01/data"),
+    "kitti": ("kitti", "folder", "KITTI odometry sequences: image_0, image_1, calib.txt"),
     "folders": (
-        "slam.sequences.folders",
-        "folder",
-        "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
+        "folders", "folder", "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
     ),
-}
+}  # fmt: skip
 
 
 def formats() -> dict[str, str]:
@@ -66,7 +65,9 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
     if "synthetic" in (scheme, format):
         return _open_world(text.removeprefix("synthetic:"))
     if "camera" in (scheme, format):
-        return _open_camera(text.removeprefix("camera:"))
+        from slam.sequences.camera import open_camera
+
+        return open_camera(text.removeprefix("camera:"))
     try:
         return _open_folder(text, format)
     except OSError as error:  # no permission, too long a name, a folder that is not what it seems (/proc)
@@ -76,26 +77,27 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
 def _open_folder(text: str, format: str | None) -> RecordedSequence:
     """A sequence on disk; what is wrong with its options is said before what is wrong with its files."""
     name, mark, query = text.rpartition("?")
-    folder, options = expanded(text).absolute(), dict[str, str]()
-    if mark and not _exists(text):
-        folder, options = expanded(name).absolute(), read_options(query)
-    like = _format(folder, options, text)
-    name = like if format is None else format
+    if not mark or _exists(text):
+        name, query = text, ""
+    folder = expanded(name).absolute()
+    like = _format(folder, query, text)
+    name = format or like or ""
     if not name:
-        hint = hints.of_sequences_near(folder, _format_of)
+        hint = hints.sequences_near(folder, _format_of)
         raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
     if name not in _FORMATS:
         raise UnknownNameError(unknown("format", name, formats()))
-    module_name, end, _ = _FORMATS[name]
-    module = import_module(module_name)
-    check_options(name, options, OPTIONS | getattr(module, "OPTIONS", frozenset()))
+    module = _module(name)
+    options = Options(query, name, RECORDED | getattr(module, "OPTIONS", frozenset()))
     note_input(folder)
-    given, lines = Given(options), list[str]()
+    lines: list[str] = []
     with FaultLog(lines, at_the_end=True) as faults:
-        found: RecordedSequence = getattr(module, f"open_{end}")(folder, given, faults)
-        masks = read_masks(given.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
-        given.require_read(f"{folder} is read as {name}")
-    return replace(found, ground_truth=turned(found.ground_truth, found.rig), masks=masks, warnings=lines)
+        found: RecordedSequence = getattr(module, f"open_{_FORMATS[name][1]}")(folder, options, faults)
+        masks = read_masks(options.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
+        swap = options.get("swap", False)
+        options.require_read(f"{folder} is read as {name}")
+    truth = turned(found.ground_truth, found.rig)
+    return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
 
 def _open_world(text: str) -> Sequence:
@@ -121,18 +123,6 @@ def with_mask(text: str, mask: str | None) -> str:
     return f"{text}{mark}mask={quote(names, safe='/,')}"
 
 
-def _open_camera(text: str) -> Sequence:
-    """A camera by its text, ``camera:`` left out; a question mark may be part of an address in a network."""
-    from slam.sequences import camera
-
-    name, mark, query = text.rpartition("?")
-    options = read_options(query) if mark else {}
-    if not mark or ("://" in name and not set(options) <= camera.OPTIONS):
-        name, options = text, {}
-    check_options("camera", options, camera.OPTIONS)
-    return camera.CameraSequence(name, options)
-
-
 def _exists(text: str) -> bool:
     """Whether a whole text, question mark and all, is a folder's name; options may make it too long for one."""
     try:
@@ -141,28 +131,35 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _format(folder: Path, options: dict[str, str], text: str) -> str:
+def _format(folder: Path, query: str, text: str) -> str | None:
     """The first format that a folder looks like; told where left and right are, it needs not look.
 
     What is neither a folder with something in it nor a recording is refused; `text` is what was asked for.
     """
+    named = read_options(query).keys()
     if _matches("ros", folder):
         return "ros"
     if not folder.exists():
         what = "file or folder" if folder.suffix else "folder"
         raise SequenceError(f"{folder}: there is no such {what}{hints.near_name(folder, text)}")
-    if not folder.is_dir() and "layout" not in options:
-        raise SequenceError(f"{folder}: a file where the sequence's folder should be{hints.of_video(folder)}")
+    if not folder.is_dir() and "layout" not in named:
+        hint, film = "", folder.suffix.lower() in VIDEO_SUFFIXES
+        if film:
+            hint = f"; a video with both images side by side is {folder}?layout=sbs, two are {folder.parent}"
+        raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}{'?left=…&right=…' * film}")
     if folder.is_dir() and not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")
-    return "folders" if options.keys() & {"left", "right", "layout"} else _format_of(folder) or ""
+    return "folders" if named & {"left", "right", "layout"} else _format_of(folder)
 
 
 def _format_of(folder: Path) -> str | None:
-    """The first format that a folder or file looks like, a ROS recording before all; None for no sequence."""
-    return next((name for name in ("ros", *_FORMATS) if _matches(name, folder)), None)
+    """The first format that a folder or file looks like; None for no sequence."""
+    return next((name for name in _FORMATS if _matches(name, folder)), None)
+
+
+def _module(name: str) -> object:
+    return import_module(f"slam.sequences.{_FORMATS[name][0]}")
 
 
 def _matches(name: str, folder: Path) -> bool:
-    module, end, _ = _FORMATS[name]
-    return bool(getattr(import_module(module), f"matches_{end}")(folder))
+    return bool(getattr(_module(name), f"matches_{_FORMATS[name][1]}")(folder))

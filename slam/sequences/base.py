@@ -19,14 +19,15 @@ from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import sequence_line
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import read_image, recorded_size, size_text
+from slam.sequences.images import halves, read_image, recorded_size, size_text
 
 
 @runtime_checkable
 class Sequence(Protocol):
     """A stereo recording of any length: iterating it decodes one frame at a time, in constant memory.
 
-    Recorded sequences keep this protocol, and so do the synthetic worlds.
+    Recorded sequences keep this protocol, and so do the synthetic worlds. Its length is the number of listed frames;
+    iterating yields fewer where left images turn out to be unreadable.
     """
 
     @property
@@ -59,16 +60,12 @@ class Sequence(Protocol):
         """What was found wrong so far, one line each; what iterating finds is added."""
         ...
 
-    def __len__(self) -> int:
-        """Number of listed frames; iterating yields fewer where left images turn out to be unreadable."""
-        ...
+    def __len__(self) -> int: ...
 
-    def __iter__(self) -> Iterator[StereoFrame]:
-        """All frames in order of time."""
-        ...
+    def __iter__(self) -> Iterator[StereoFrame]: ...
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
-        """Frames `start` up to, but without, `stop`; frames outside are not decoded.
+        """Frames `start` up to, but without, `stop`, in order of time; frames outside are not decoded.
 
         Raises:
             SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
@@ -84,8 +81,8 @@ def is_live(frames: object) -> bool:
 #: An image as it was read, or why it could not be; None where there is none.
 Image = np.ndarray | SequenceError | None
 
-#: The left and the right image of each frame.
-Images = Generator[tuple[Image, Image], None, None]
+#: The left and the right image of each frame, or one that holds both, side by side.
+Images = Generator[tuple[Image, ...], None, None]
 
 #: Of the left and the right camera (H, W) bool, False where the image is not to be used; None for all of it.
 Masks = tuple[np.ndarray | None, np.ndarray | None]
@@ -100,7 +97,7 @@ class FrameSource(Protocol):
         ...
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
-        """Decode the left and right images of frames `start` to `stop`; they may end early, with a fault."""
+        """Decode the images of frames `start` to `stop`; they may end early, with a fault."""
         ...
 
 
@@ -117,6 +114,7 @@ class RecordedSequence:
     truth_noise: TruthNoise = field(default_factory=TruthNoise)  # how well the ground truth is known
     warnings: list[str] = field(default_factory=list)
     masks: Masks = (None, None)  # where the images of both cameras may be used
+    swap: bool = False  # what the source gives as left is the right camera's
 
     @property
     def stamps(self) -> Array:
@@ -145,7 +143,12 @@ class RecordedSequence:
         A left image that cannot be read costs the frame, a right one itself.
         """
         with FaultLog(self.warnings) as faults, closing(self.source.images(start, stop, faults)) as images:
-            for index, (left, right) in zip(range(start, stop), images):
+            for index, (left, *other) in zip(range(start, stop), images):
+                right = other[0] if other else None
+                if not other and isinstance(left, np.ndarray):
+                    left, right = halves(left, self.name)
+                if self.swap:
+                    left, right = right, left
                 if isinstance(right, SequenceError) and not isinstance(left, SequenceError):
                     line = f"frame {index} is given without its right image: {right}"
                     faults.report("right images unreadable, frames given without them", line)

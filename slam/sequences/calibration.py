@@ -130,10 +130,13 @@ def read_form(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
     if "residual_scale" in root or "self_calibration" in root:
         what = "errors of a rig, as `slam calibrate` or a run found them, not a rig: see --calibration"
         raise CalibrationError(f"{path}: {what}")
-    if "cameraData" not in root:
-        return root, ""
-    with naming(path):
-        return _read_depthai(root), "depthai's"
+    if "cameraData" in root:
+        with naming(path):
+            return _read_depthai(root), "depthai's"
+    cameras = {side: path.parent / str(root.get(f"cam{at}_calib", "")) for at, side in enumerate(("left", "right"))}
+    if all(file.is_file() for file in cameras.values()):  # VINS-Fusion's, with a file for each camera
+        return {**root, **{side: read_yaml(file) for side, file in cameras.items()}}, ""
+    return root, ""
 
 
 def is_kitti(path: Path) -> bool:

@@ -26,7 +26,7 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
     "D": ("d", "distcoeffs", "dist", "distortion", "distortioncoeffs", "distortioncoefficients", "distortioncoeff"),
     "P": ("p", "projectionmatrix", "projection"),
     "R_rect": ("r", "rectificationmatrix"),
-    "T_BS": ("tbs", "timucam"),
+    "T_BS": ("tbs", "timucam", "bodyt"),
     "T_cam_imu": ("tcamimu",),
     "R": ("r", "rot", "rotation", "rotationmatrix", "stereor", "rstereo"),
     "T": ("t", "trans", "translation", "translationvector", "stereot", "tstereo"),
@@ -37,8 +37,10 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
     "size": ("imagesize", "size", "imgsize", "resolution"),
     "baseline": ("baseline", "stereob"),
     "bf": ("bf", "focalxbaseline"),
+    "cx": ("cx", "ppx"),
+    "cy": ("cy", "ppy"),
     "distortion model": ("distortionmodel",),
-    "camera model": ("cameramodel", "model", "cameratype"),
+    "camera model": ("cameramodel", "model", "cameratype", "modeltype"),
 }
 _FISHEYE = ("equidistant", "fisheye", "kannalabrandt8", "kannalabrandt")
 _PINHOLE = ("", "none", "radialtangential", "radtan", "plumbbob", "rationalpolynomial", "pinhole", "perspective",
@@ -48,14 +50,32 @@ _FROM_ZERO = ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx")  # one of th
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PLAIN = ("fx", "fy", "cx", "cy")
 
-#: Whose a form is, by entries that only it has.
+#: Whose a form is: entries that only it has, and what a complete file of it holds.
 _FORMS = {
-    "Kalibr's": ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel"),
-    "EuRoC's": ("lefttbs",),
-    "ROS's": ("leftcameramatrix",),
-    "ORB-SLAM's": ("camerabf", "stereotc1c2", "stereob", "camera1fx"),
-    "stella_vslam's": ("camerafocalxbaseline",),
+    "Kalibr's": (
+        ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel", "cam1cameramodel"),
+        "cam0 and cam1, each with intrinsics and resolution, and T_cn_cnm1 in cam1",
+    ),
+    "EuRoC's": (("lefttbs",), "intrinsics, resolution and T_BS, in two files"),
+    "ROS's": (("leftcameramatrix",), "camera_matrix, rectification_matrix and projection_matrix, in two files"),
+    "ORB-SLAM's": (
+        ("camerabf", "stereotc1c2", "stereob", "camera1fx"),
+        "Camera.bf for rectified images, LEFT.K … and RIGHT.K …, or Camera1.fx …, Camera2.fx … and Stereo.T_c1_c2",
+    ),
+    "stella_vslam's": (("camerafocalxbaseline",), "Camera.fx … and Camera.focal_x_baseline"),
+    "VINS-Fusion's": (("bodytcam0",), "cam0_calib and cam1_calib, files that are there, body_T_cam0 and body_T_cam1"),
+    "Basalt's": (("value0intrinsics",), "other entries than are read here: write it in another form"),
 }
+_COMPLETE = "K1, D1, K2, D2, R and T; one of rectified images P1 and P2, or fx, fy, cx, cy and baseline"
+
+#: guard: shortest focal length as a share of the image's width: a pinhole camera of 170 degrees has 0.044.
+_SHORTEST_FOCAL = 0.04
+
+#: guard: largest skew as a share of the focal length: a thousandth moves the image's border by half a pixel.
+_SKEW = 1e-3
+
+#: guard: cosine of the widest angle between the optical axes of a stereo pair, 60 degrees.
+_ALIKE = 0.5
 
 Entry = tuple[str, Any]  # an entry's name as written, and its value
 
@@ -63,10 +83,8 @@ Entry = tuple[str, Any]  # an entry's name as written, and its value
 class Entries:
     """The entries of calibration files by their names in lower case, letters and digits only.
 
-    Args:
-        files: entries by such names; of two files of one camera each the first is the left one's.
-        form: whose form it is, as ``"Kalibr's"``; empty where the entries are to tell. OpenCV's, and five plain
-            numbers, stay without: of these alone the unit and the model of the lens may be another one.
+    Of two files of one camera each the first is the left one's. Whose `form` it is, as ``"Kalibr's"``, the entries tell
+    where it is empty. OpenCV's, and five plain numbers, have none: of these alone unit and lens may be another one.
     """
 
     def __init__(self, files: Sequence[Mapping[str, Entry]], form: str = "") -> None:
@@ -74,7 +92,7 @@ class Entries:
         single = len(files) == 2 and any(all(n in f for f in files) for n in _OF_ONE)
         for side, file in zip(("left", "right"), files):
             self._values |= {(side + name if single else name): entry for name, entry in file.items()}
-        found = (known for known, names in _FORMS.items() if any(name in self._values for name in names))
+        found = (known for known, (names, _) in _FORMS.items() if any(name in self._values for name in names))
         self.form = form or next(found, "")
         counts = ("0", "1") if any(name in self._values for name in _FROM_ZERO) else ("1", "2")
         self._sides = [
@@ -84,7 +102,7 @@ class Entries:
 
     def find(self, role: str, side: int | None = None) -> Entry | None:
         """An entry, of a camera (0 left, 1 right) or of the pair; None where there is none."""
-        spellings = _SPELLINGS.get(role, (role,))
+        spellings = (*_SPELLINGS.get(role, (role,)), f"projectionparameters{role}", f"distortionparameters{role}")
         if side is None:
             names = [*spellings, *(f"camera{s}" for s in spellings)]
         else:
@@ -101,9 +119,16 @@ class Entries:
         found = self.find(role, side)
         return None if found is None else array(found[1], found[0], shape)
 
-    def names(self) -> str:
-        """All entries as they are written."""
-        return ", ".join(sorted(name for name, _ in self._values.values())) or "nothing"
+    def incomplete(self, missing: Sequence[str], by_form: bool = True) -> CalibrationError:
+        """The error where roles are missing, in the words of the form; all entries are named as they are written."""
+        there = f"in it: {', '.join(sorted(name for name, _ in self._values.values())) or 'nothing'}"
+        if by_form and self.form in _FORMS:
+            return CalibrationError(f"it looks like {self.form}, which has {_FORMS[self.form][1]}; {there}")
+        one = " (it is one camera's: name both files, calibration=LEFT,RIGHT)" * (self.find("cameramatrix") is not None)
+        verb = "is" if len(missing) == 1 else "are"
+        return CalibrationError(
+            f"{', '.join(missing)} {verb} missing{one}; {there}. A stereo calibration has {_COMPLETE}"
+        )
 
 
 def read_entries(paths: Sequence[Path], images: Size | None) -> Entries:
@@ -117,20 +142,12 @@ def read_entries(paths: Sequence[Path], images: Size | None) -> Entries:
 
 
 def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, fisheye: bool) -> StereoRig:
-    """The rig of calibration files.
+    """The rig of calibration files, lengths in them in units of so many metres.
 
     Taken are two cameras with R and T as ``cv2.stereoCalibrate`` gives them (``h_right = R h_left + T``), with poses on
-    a body, or with rectifications; for rectified images two projections, or the numbers fx, fy, cx, cy and baseline.
-
-    Args:
-        entries: of the files.
-        images: width and height of the images, where the files name none; None where they are not known.
-        unit: metres per unit of T, of the projections' last column, and of the baseline.
-        rectified: take the projections, although camera matrices may be there too.
-        fisheye: the distortion is ``cv2.fisheye``'s; also where the file names such a model.
-
-    Raises:
-        CalibrationError: entries are missing (all are named), or the rig is impossible.
+    a body, or with rectifications; for `rectified` images two projections, or fx, fy, cx, cy and baseline. The size of
+    the images counts where the files name none; `fisheye` distortion is ``cv2.fisheye``'s. CalibrationError where
+    entries are missing, or the rig is impossible.
     """
     sizes = [_size(entries, side) for side in (0, 1)]
     size = sizes[0] or sizes[1] or images
@@ -138,18 +155,28 @@ def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, 
         raise CalibrationError("names no image size: give size=(width, height)")
     P, K, scalars = ([entries.find(role, side) is not None for side in (0, 1)] for role in ("P", "K", "fx"))
     if rectified or (any(P) and not K[0] and not scalars[0]):
-        _require(entries, {"P1": P[0], "P2": P[1]})
+        if not all(P):
+            raise entries.incomplete([f"P{side + 1}" for side in (0, 1) if not P[side]], by_form=False)
         return rig_from_projections(*_projections(entries, unit), size)
     T_right_left = _extrinsics(entries, unit)
     if T_right_left is None and not any(K) and (plain := _plain(entries, size, unit)) is not None:
         return plain
-    there = {"K1": K[0] or scalars[0], "K2": K[1] or scalars[1]}
-    there |= {role: T_right_left is not None or entries.find(role) is not None for role in ("R", "T")}
-    _require(entries, there)
-    assert T_right_left is not None  # `_require` has seen it
+    missing = [f"K{side + 1}" for side in (0, 1) if not (K[side] or scalars[side])]
+    missing += [role for role in ("R", "T") if T_right_left is None and entries.find(role) is None]
+    if missing or T_right_left is None:
+        raise entries.incomplete(missing)
     cameras = [_camera(entries, side, sizes[side] or size, fisheye) for side in (0, 1)]
     R, t = T_right_left[:3, :3], T_right_left[:3, 3]
-    return StereoRig.side_by_side(cameras[0], cameras[1], R, R.T @ t)  # h_right = R (h_left + b), paper A, Eq. 6
+    b = R.T @ t  # h_right = R (h_left + b), paper A, Eq. 6
+    if entries.form and b[0] > np.abs(b).max() / 2:
+        raise CalibrationError(
+            f"the second camera stands {b[0]:.4f} m to the left of the first one: are the cameras swapped? The "
+            "first one of a calibration is the left one"
+        )
+    if R[2, 2] < _ALIKE:
+        apart = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))
+        raise CalibrationError(f"the cameras look {apart:.0f} degrees apart: is a rotation in degrees?")
+    return StereoRig.side_by_side(cameras[0], cameras[1], R, b)
 
 
 def body_pose(entries: Entries, side: int) -> Array:
@@ -159,20 +186,6 @@ def body_pose(entries: Entries, side: int) -> Array:
         return rigid(found, "T_BS")
     found = entries.numbers("T_cam_imu", side, (4, 4))
     return np.eye(4) if found is None else inverse(rigid(found, "T_cam_imu"))
-
-
-def _require(entries: Entries, there: Mapping[str, bool]) -> None:
-    """Raise CalibrationError with the names of all that is not there, and of the entries that are."""
-    missing = [name for name, found in there.items() if not found]
-    if missing:
-        verb = "is" if len(missing) == 1 else "are"
-        whose = f" (it looks like {entries.form})" if entries.form else ""
-        if entries.find("cameramatrix") is not None:
-            whose = " (it is one camera's: name both files, calibration=LEFT,RIGHT)"
-        raise CalibrationError(
-            f"{', '.join(missing)} {verb} missing{whose}; in it: {entries.names()}. A stereo calibration "
-            "has K1, D1, K2, D2, R and T; one of rectified images P1 and P2, or fx, fy, cx, cy and baseline"
-        )
 
 
 def _extrinsics(entries: Entries, unit: float) -> Array | None:
@@ -209,31 +222,29 @@ def _projections(entries: Entries, unit: float) -> tuple[Array, Array]:
 
 
 def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:
-    """A rectified rig of two equal cameras by five numbers; None where none of them is there.
-
-    Raises:
-        CalibrationError: numbers are missing or impossible; all of them are named.
-    """
+    """A rectified rig of two equal cameras by five numbers, of which all that are wrong are named; None for none."""
     side = 0 if entries.find("fx") is None and entries.find("fx", 0) is not None else None
     last = "bf" if entries.find("baseline") is None and entries.find("bf") is not None else "baseline"
     found = {name: entries.find(name, side) for name in _PLAIN} | {last: entries.find(last)}
     if not any(found.values()):
         return None
-    values, wrong = {}, []
+    values, wrong = [], []
     for name, entry in found.items():
         try:
-            values[name] = _number(entry or (name, None))
-            if values[name] <= 0 and name not in ("cx", "cy"):
-                wrong.append(f"{name} is {values[name]:g}, which must be positive")
+            values.append(_number(entry or (name, None)))
+            if values[-1] <= 0 and name not in ("cx", "cy"):
+                wrong.append(f"{name} is {values[-1]:g}, which must be positive")
         except CalibrationError as error:
             wrong.append(str(error))
     if wrong:
         raise CalibrationError(f"{'; '.join(wrong)} (a rectified pair needs fx, fy, cx, cy in pixels and baseline)")
     if any(_number(entry) for name in _COEFFICIENTS if (entry := entries.find(name, side)) is not None):
         raise CalibrationError("names distortion, but only one camera: images of five numbers are rectified")
-    fx, fy, cx, cy, length = values.values()
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return StereoRig.from_pinhole(K, size=size, baseline=unit * (length / fx if last == "bf" else length))
+    fx, fy, cx, cy, length = values
+    left, right = (PinholeCamera(fx, fy, cx, cy, *size) for _ in range(2))
+    return StereoRig.side_by_side(
+        left, right, np.eye(3), np.array([-unit * length / (fx if last == "bf" else 1), 0, 0])
+    )
 
 
 def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCamera:
@@ -244,11 +255,9 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
         if name not in _FISHEYE + _PINHOLE and (entries.form or role == "distortion model"):
             raise CalibrationError(f"{role} {model[1]!r} is not supported")
         fisheye = fisheye or name in _FISHEYE
-    found = entries.find("K", side)
-    if found is None:
-        values = [_number(entries.find(name, side) or (name, None)) for name in _PLAIN]
-    elif len(values := array(found[1], found[0], None).tolist()) != 4:
-        values = array(found[1], found[0], (3, 3))[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    K = _matrix(entries, side)
+    if K[0, 0] < _SHORTEST_FOCAL * size[0]:
+        raise CalibrationError(f"a focal length of {K[0, 0]:g} px for images {size[0]} px wide: is it in pixels?")
     D = entries.numbers("D", side, None)
     if D is None:
         names = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS
@@ -256,9 +265,24 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
     D = D[:4] if fisheye else D
     if 0 < len(D) < 4:
         raise CalibrationError(f"distortion model takes 4 coefficients or more, got {len(D)}")
-    fx, fy, cx, cy = values
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
     return PinholeCamera.from_matrix(K, D if D.any() or fisheye else None, size, fisheye)
+
+
+def _matrix(entries: Entries, side: int) -> Array:
+    """A camera matrix (3, 3), by its own entry or by four numbers."""
+    found = entries.find("K", side)
+    values = [_number(entries.find(name, side) or (name, None)) for name in _PLAIN] if found is None else []
+    if found is not None:
+        values = array(found[1], found[0], None).tolist()
+        if len(values) not in (4, 9):
+            raise CalibrationError(f"{found[0]} has {len(values)} numbers; it has fx, fy, cx, cy, or 3 rows of 3")
+    if len(values) == 4:
+        fx, fy, cx, cy = values
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
+    K = np.reshape(values, (3, 3))
+    if abs(K[0, 1]) > _SKEW * abs(K[0, 0]) or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
+        raise CalibrationError(f"{found and found[0]} is no camera matrix [fx 0 cx; 0 fy cy; 0 0 1]: {K.tolist()}")
+    return np.asarray(K)
 
 
 def _size(entries: Entries, side: int) -> Size | None:

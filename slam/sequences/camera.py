@@ -17,21 +17,27 @@ from slam.geometry.trajectory import Trajectory
 from slam.sequences import captures as devices
 from slam.sequences.base import as_used, read_masks
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import CALIBRATION_OPTIONS, FASTEST, SLOWEST, flag, number
 from slam.sequences.images import halves, recorded_size, require_same_size, size_text
+from slam.sequences.options import CALIBRATION, Options, read_options
 from slam.sequences.rigs import calibration_files, read_rig
 
-OPTIONS = CALIBRATION_OPTIONS | {"left", "right", "swap", "width", "height", "fps", "wait"}
+OPTIONS = CALIBRATION | {"left", "right", "width", "height", "fps", "wait"}
 
 #: How long frames are waited for where a camera gives none [s].
 WAIT = 10.0
 
 _AGAIN = 0.25  # [s] between two attempts to get an image
-_LONGEST_WAIT = 86400.0
-_WIDEST = 100_000
 
 Pair = tuple[float, np.ndarray, np.ndarray]  # stamp [s], left and right image
 T = TypeVar("T")
+
+
+def open_camera(text: str) -> CameraSequence:
+    """A camera by its text, ``camera:`` left out; a question mark may be part of an address in a network."""
+    name, mark, query = text.rpartition("?")
+    if not mark or ("://" in name and not set(read_options(query)) <= OPTIONS):
+        name, query = text, ""
+    return CameraSequence(name, Options(query, "camera", OPTIONS))
 
 
 class CameraSequence:
@@ -41,22 +47,20 @@ class CameraSequence:
     again and again for a while; one that stays silent ends the sequence with an error. `frames` opens it anew: images
     that waited in a queue until then are old.
 
-    Args:
-        text: the address, or two joined by a comma, see `slam.sequences.captures.open_device`; empty where the options
-            ``left`` and ``right`` name them.
-        options: those of `OPTIONS` that are given.
+    Its text is the address, or two joined by a comma, see `slam.sequences.captures.open_device`; empty where the
+    options ``left`` and ``right`` name them.
 
     Raises:
         SequenceError: a camera cannot be opened, gives no image, or one of another size than the calibration is for.
         CalibrationError: the calibration is missing, unreadable or impossible.
-        ConfigurationError: an option has an impossible value; no camera is named, or more than two.
+        ConfigurationError: no camera is named, or more than two.
     """
 
     format = "camera"
     ground_truth: Trajectory | None = None
     live = True
 
-    def __init__(self, text: str, options: Mapping[str, str]) -> None:
+    def __init__(self, text: str, options: Mapping[str, Any]) -> None:
         addresses = [text] if "!" in text else [part.strip() for part in text.split(",")]
         if "left" in options or "right" in options:
             if text or not ("left" in options and "right" in options):
@@ -69,11 +73,9 @@ class CameraSequence:
         self.name = "camera:" + ",".join(devices.without_password(a) for a in addresses)
         self.kind = options.get("kind", "handheld")
         self.warnings: list[str] = []
-        self._addresses, self._swap = addresses, flag(options, "swap")
-        wanted = [number(options, name, 1, _WIDEST) for name in ("width", "height")]
-        self._wanted = *wanted, number(options, "fps", SLOWEST, FASTEST)
-        wait = number(options, "wait", 0.0, _LONGEST_WAIT)
-        self._wait = WAIT if wait is None else wait
+        self._addresses, self._swap = addresses, options.get("swap", False)
+        self._wanted = [options.get(name) for name in ("width", "height", "fps")]
+        self._wait = options.get("wait", WAIT)
         self._origin = time.time() - time.monotonic()  # since 1970 when the monotonic clock was zero [s]
         opened = self._open()
         try:
@@ -170,7 +172,7 @@ class CameraSequence:
         if len(images) < len(opened):
             return None
         left, right = halves(images[0], self.name) if len(images) == 1 else images
-        require_same_size(left.shape[::-1], right.shape[::-1], f"{self.name}, left", f"{self.name}, right")
+        require_same_size(left, right, f"{self.name}, left", f"{self.name}, right")
         return (stamp, right, left) if self._swap else (stamp, left, right)
 
 

@@ -16,8 +16,8 @@ from slam.files import require_content
 from slam.geometry.se3 import Array
 from slam.sequences.base import Images
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import FASTEST, SLOWEST
 from slam.sequences.images import MOST_PIXELS, Size, halves, require_same_size
+from slam.sequences.options import FASTEST, SLOWEST
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -32,7 +32,6 @@ class VideoPairs:
 
     stamps: Array  # times (N,) [s]: frame number by frame rate
     paths: list[Path]
-    size: Size  # width and height of each camera's images
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode frames `start` to `stop`, in grey; a video that ends too early ends the sequence with a line.
@@ -51,42 +50,46 @@ class VideoPairs:
                 for path, image in zip(self.paths, images):
                     if image is None:
                         faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
-                whole = [image for image in images if image is not None]
-                if len(whole) < len(images):
+                if any(image is None for image in images):
                     return
-                yield halves(whole[0], self.paths[0]) if len(whole) == 1 else (whole[0], whole[1])
+                yield tuple(images)
 
 
-def open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> VideoPairs:
-    """The frame source of two videos, or of one side by side; `rate` [1/s] overrides what the left one says of itself.
+def open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> tuple[VideoPairs, Size]:
+    """The frame source of two videos, or of one side by side, and the size of a camera's images.
 
-    SequenceError where a file is no readable video, the frame sizes differ, or the frame rate is not known.
+    `rate` [1/s] overrides what videos say of themselves.
+
+    SequenceError where a file is no readable video, frame sizes or rates differ, or the frame rate is not known.
     """
-    import cv2
-
-    counts, images, rates = list[int](), list[np.ndarray](), list[float]()
-    for path in paths:
-        with _open(path) as video:
-            claimed = video.get(cv2.CAP_PROP_FRAME_COUNT)
-            rates.append(float(video.get(cv2.CAP_PROP_FPS)))
-            first = read_image(video) if video.grab() else None
-            if first is None:
-                raise SequenceError(f"{path}: no frame of the video can be decoded")
-            images.append(first)
-            counts.append(int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 1)
-            with quiet_libraries():
-                while claimed <= 0 and counts[-1] < _MOST_FRAMES and video.grab():  # it does not say
-                    counts[-1] += 1
-    images = list(halves(images[0], paths[0])) if len(paths) == 1 else images
-    size = images[0].shape[1], images[0].shape[0]
-    require_same_size(size, images[1].shape[::-1], *paths)
+    counts, images, rates = zip(*(_beginning(path) for path in paths))
+    left, right = halves(images[0], paths[0]) if len(paths) == 1 else images
+    require_same_size(left, right, *paths)
+    if rate is None and abs(rates[0] - rates[-1]) * min(counts) > 0.5 * rates[0]:  # more than half a frame in the end
+        said = f"{paths[0]} has {rates[0]:.6g} frames per second, {paths[1]} has {rates[1]:.6g}"
+        raise SequenceError(f"{said}: frames of one number are not of one moment; where they are, add fps=…")
     if counts[0] != counts[-1]:
         line = f"{paths[0]} has {counts[0]} frames, {paths[1]} has {counts[1]}: the surplus is left out"
         faults.report("videos", line)
     rate = rate or rates[0]
     if not SLOWEST <= rate <= FASTEST:
         raise SequenceError(f"{paths[0]}: the frame rate is not known, add fps=…")
-    return VideoPairs(np.arange(min(counts)) / rate, paths, size)
+    return VideoPairs(np.arange(min(counts)) / rate, paths), (left.shape[1], left.shape[0])
+
+
+def _beginning(path: Path) -> tuple[int, np.ndarray, float]:
+    """A video's number of frames, its first image, and its frame rate [1/s]."""
+    import cv2
+
+    with _open(path) as video, quiet_libraries():
+        claimed, rate = video.get(cv2.CAP_PROP_FRAME_COUNT), float(video.get(cv2.CAP_PROP_FPS))
+        first = read_image(video) if video.grab() else None
+        if first is None:
+            raise SequenceError(f"{path}: no frame of the video can be decoded")
+        count = int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 1
+        while claimed <= 0 and count < _MOST_FRAMES and video.grab():  # it does not say
+            count += 1
+        return count, first, rate
 
 
 @contextmanager
@@ -125,12 +128,8 @@ def quiet_libraries() -> Iterator[None]:
 def open_device(address: str, width: float | None = None, height: float | None = None, fps: float | None = None) -> Any:
     """Open a camera as a ``cv2.VideoCapture``; SequenceError where it cannot be opened, or is a file.
 
-    Args:
-        address: a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address
-            of a network.
-        width: asked of the camera [px], as `height`, and `fps` [1/s]; None for its own choice.
-        height: the same.
-        fps: the same.
+    Its address is a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address of a
+    network. Width and height [px] and `fps` [1/s] are asked of it; None for its own choice.
     """
     import cv2
 

@@ -12,18 +12,9 @@ from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import naming
 from slam.sequences.calibration_keys import body_pose, read_entries
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import Given
-from slam.sequences.pairs import (
-    Listing,
-    by_names,
-    image_names,
-    image_pairs,
-    in_order,
-    number_of,
-    present,
-    read_times,
-    timed,
-)  # fmt: skip
+from slam.sequences.names import stem
+from slam.sequences.options import Options
+from slam.sequences.pairs import Listing, image_names, image_pairs, in_order, listed, pair_up, told_times
 from slam.sequences.rigs import calibration_files, read_rig
 from slam.sequences.tables import MOST_NANOSECONDS, read_rows, require_truth, shorten
 
@@ -42,18 +33,19 @@ def matches_folder(folder: Path) -> bool:
     return any((_root(folder) / cam / part).exists() for cam in _CAMERAS for part in ("data", "data.csv"))
 
 
-def open_folder(folder: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
     """Open a sequence in EuRoC's format; `folder` holds ``mav0`` or is it."""
     root = _root(folder)
     left, right = _listings(root, faults)
-    source = image_pairs(timed(left, right, options, faults, read_times(folder, options, faults)), right.folder)
+    pairs = pair_up(left, right, options, faults, told_times(folder, options, faults))
+    source, size = image_pairs(pairs, left, right)
     own = [root / cam / "sensor.yaml" for cam in _CAMERAS]
     if not any(file.exists() for file in own):
         own = [file for name in _CAMCHAINS if (file := root / name).is_file()][:1]
     missing = f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing (nor is there a Kalibr camchain.yaml)"
     named = "calibration" in options or not own
     files = calibration_files(folder, options, f"{missing}: add calibration=FILE") if named else own
-    rig = read_rig(files, source.size, options)
+    rig = read_rig(files, size, options)
     name = folder.parent.name if folder.name == "mav0" else folder.name
     truth = _ground_truth(root, own, faults)
     return RecordedSequence(name, "euroc", options.get("kind", "handheld"), rig, source, truth, MOCAP_NOISE)
@@ -71,22 +63,28 @@ def _listings(root: Path, faults: FaultLog) -> list[Listing]:
         if not camera.is_dir():
             reason = "a file where a folder should be" if camera.exists() else "missing, two cameras are needed"
             raise SequenceError(f"{camera}: {reason}")
-    tables = [camera / "data.csv" for camera in cameras]
-    if all(table.exists() for table in tables):
-        return [_listed(table, faults) for table in tables]
+    if all((camera / "data.csv").exists() for camera in cameras):
+        return [_table(camera / "data.csv", faults) for camera in cameras]
     folders = [camera / "data" for camera in cameras]
-    names = [[name for name in image_names(folder) if number_of(name) is not None] for folder in folders]
-    for camera, own in zip(cameras, names):
-        if not own:
-            raise SequenceError(f"{camera}: no data.csv, and no images named by their stamps in data")
-    return by_names(folders, names, faults)
+    return listed(folders, [image_names(folder) for folder in folders], faults)
 
 
-def _listed(table: Path, faults: FaultLog) -> Listing:
-    """The images that a ``data.csv`` lists."""
+def _table(table: Path, faults: FaultLog) -> Listing:
+    """The images that a ``data.csv`` lists and that exist; another ending (``.jpg`` for ``.png``) is accepted."""
     rows = [row for row in read_rows(table, _stamp_and_name, faults) if row is not None]
-    listing = Listing(table.parent / "data", np.array([s for s, _ in rows], np.int64), [n for _, n in rows], True)
-    return present(in_order(listing, str(table), faults), str(table), faults)
+    folder = table.parent / "data"
+    listing = Listing(folder, np.array([s for s, _ in rows], np.int64), [n for _, n in rows], True)
+    listing = in_order(listing, str(table), faults)
+    there = image_names(folder)
+    known = {stem(name): name for name in there} | {name: name for name in there}
+    names = [known.get(name) or known.get(stem(name), "") for name in listing.names]
+    missing = [wanted for wanted, found in zip(listing.names, names) if not found]
+    if len(missing) == len(names):
+        raise SequenceError(f"{folder}: none of the {len(names)} images listed in {table} is there")
+    if missing:
+        line = f"{table}: {len(missing)} of {len(names)} listed images are missing (first: {missing[0]})"
+        faults.report("listed images", line)
+    return Listing(folder, listing.keys, names, True).select(np.flatnonzero([bool(name) for name in names]))
 
 
 def _stamp_and_name(text: str) -> tuple[int, str]:

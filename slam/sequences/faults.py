@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
 
-from slam.errors import ConfigurationError, one_line
+from slam.errors import one_line
 
 logger = logging.getLogger("slam.sequences")
 
@@ -27,24 +27,19 @@ class FaultLog:
 
     Args:
         lines: where lines are kept.
-        at_the_end: log them when the log is closed, and not at all where an option turns out to be wrong.
+        at_the_end: log them when the log is closed, and not at all above an error, which is said alone.
     """
 
     def __init__(self, lines: list[str], at_the_end: bool = False) -> None:
         self._lines, self._at_the_end = lines, at_the_end
         self._counts: Counter[str] = Counter()
         self._waiting: list[str] = []
-        self._assumptions: list[str] = []
 
     def report(self, kind: str, line: str) -> None:
         """Report one fault; faults of the same `kind` are counted together."""
         self._counts[kind] += 1
         if self._counts[kind] <= _LINES_PER_KIND:
             self._keep(line)
-
-    def assume(self, line: str) -> None:
-        """Report what is assumed for want of better, at the end, and not at all where an error ends the work."""
-        self._assumptions.append(line)
 
     def _keep(self, line: str) -> None:
         line = one_line(line)
@@ -65,12 +60,10 @@ class FaultLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for line in self._assumptions if kind is None else ():
-            self._keep(line)
         for what, count in self._counts.items():
             if count > _LINES_PER_KIND:
                 self._keep(f"{what}: {count} in all, {count - _LINES_PER_KIND} not listed")
-        if not isinstance(error, ConfigurationError):
+        if error is None:
             self._log()
 
 

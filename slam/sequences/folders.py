@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,17 +10,14 @@ from slam.files import expanded
 from slam.sequences.base import FrameSource, RecordedSequence
 from slam.sequences.captures import VIDEO_SUFFIXES, open_videos
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import Given, layout_of
 from slam.sequences.images import IMAGE_SUFFIXES, Size
-from slam.sequences.names import SIDES, of_sides
-from slam.sequences.pairs import by_names, image_names, image_pairs, read_times, timed
+from slam.sequences.names import SIDES, natural, of_sides
+from slam.sequences.options import Options
+from slam.sequences.pairs import image_names, image_pairs, listed, pair_up, told_times
 from slam.sequences.rigs import calibration_files, read_rig
 
-_NAMES = (*SIDES, ("image_left", "image_right"))
-_TIMES = ("times.txt", "timestamps.txt")
 
-
-class _Side(NamedTuple):
+class Side(NamedTuple):
     """The images of a camera: a video, or a folder and the names in it."""
 
     path: Path
@@ -29,45 +25,53 @@ class _Side(NamedTuple):
 
 
 def matches_folder(folder: Path) -> bool:
-    """Whether a folder holds a left or a right camera by one of the usual names, as folders, videos or images."""
-    return any(_by_convention(folder, side) is not None for side in (0, 1))
+    """Whether a folder holds two cameras by one of the usual names, as folders, videos or images; or one of them."""
+    return folder.is_dir() and (_two_cameras(folder) is not None or any(_called(folder, side) for side in (0, 1)))
 
 
-def open_folder(folder: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
     """Open two folders or two videos, or one of either that holds both cameras."""
     home = folder.parent if folder.is_file() else folder
     source, size = _source(_sides(folder, options), home, options, faults)
     files = calibration_files(home, options)
     if files[0].suffix == ".txt" and "calibration" not in options:  # KITTI's, of four cameras
-        faults.assume(f"{files[0]}: the images are taken as its cameras' 0 and 1 (see calibration=…)")
+        faults.report("calibration", f"{files[0]}: the images are taken as its cameras' 0 and 1 (see calibration=…)")
     rig = read_rig(files, size, options)
     return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, source)
 
 
-def _source(sides: list[_Side], home: Path, options: Given, faults: FaultLog) -> tuple[FrameSource, Size]:
+def _source(sides: list[Side], home: Path, options: Options, faults: FaultLog) -> tuple[FrameSource, Size]:
     """Where the images come from, and their size; `home` has the file of times."""
     paths, names = [side.path for side in sides], [side.names for side in sides]
+    if len(sides) == 2 and names[0] == names[1] and paths[0].samefile(paths[1]):
+        raise SequenceError(f"{paths[0]} and {paths[1]} are the same: the left and the right camera's are needed")
     if len({own is None for own in names}) > 1:
         raise SequenceError(f"{paths[0]} and {paths[1]}: one is a video and the other is not")
     if names[0] is None:
-        videos = open_videos(paths, options.rate(), faults)
-        return videos, videos.size
-    left, *right = by_names(paths, [own or [] for own in names], faults)
-    times = read_times(home, options, faults, *(home / name for name in _TIMES))
-    pairs = timed(left, right[0] if right else None, options, faults, times)
-    images = image_pairs(pairs, right[0].folder if right else None)
-    return images, images.size
+        return open_videos(paths, options.get("fps"), faults)
+    left, *right = listed(paths, [own or [] for own in names], faults)
+    times = told_times(home, options, faults, home / "times.txt", home / "timestamps.txt")
+    pairs = pair_up(left, right[0] if right else None, options, faults, times)
+    return image_pairs(pairs, left, right[0] if right else None)
 
 
-def _sides(folder: Path, options: Given) -> list[_Side]:
+def _sides(folder: Path, options: Options) -> list[Side]:
     """Both cameras, or the one place where both are side by side."""
-    if layout_of(options) is None:
-        return [_side(folder, side, options) for side in (0, 1)]
+    if options.get("layout") is None:
+        if not options.keys() & {"left", "right"} and (both := _two_cameras(folder)):
+            return [side if side.names else _found(side.path) for side in both]
+        sides = []
+        for at, name in enumerate(("left", "right")):
+            path = folder / expanded(options[name]) if name in options else _called(folder, at)
+            if path is None:
+                raise SequenceError(f"{folder}: two cameras are needed, but there is no {name} one: add {name}=…")
+            sides.append(_found(path))
+        return sides
     if folder.is_file():
-        return [_Side(folder)]
+        return [Side(folder)]
     if "left" in options:
         return [_found(folder / expanded(options["left"]))]
-    inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    inside = _inside(folder)
     if any(path.suffix.lower() in IMAGE_SUFFIXES for path in inside):
         return [_found(folder)]
     places = [path for path in inside if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES]
@@ -76,46 +80,43 @@ def _sides(folder: Path, options: Given) -> list[_Side]:
     return [_found(places[0])]
 
 
-def _side(folder: Path, side: int, options: Given) -> _Side:
-    """Folder, video or pattern of files of one side (0 left, 1 right), by option or by convention."""
-    name = ("left", "right")[side]
-    if name in options:
-        return _found(folder / expanded(options[name]))
-    found = _by_convention(folder, side)
-    if found is None:
-        raise SequenceError(f"{folder}: two cameras are needed, but there is no {name} one: add {name}=…")
-    return _with_images(found)
-
-
-def _found(path: Path) -> _Side:
+def _found(path: Path) -> Side:
     """What a path stands for: a folder, a video, or a pattern with ``*``."""
     if "*" in path.name:
-        return _with_images(_Side(path, [n for n in image_names(path.parent) if Path(n).match(path.name)]))
+        names = [name for name in image_names(path.parent) if Path(name).match(path.name)]
+        if not names:
+            raise SequenceError(f"{path}: no images")
+        return Side(path.parent, names)
     if not path.exists():
         raise SequenceError(f"{path}: there is no such folder or video")
-    is_video = path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
-    return _Side(path) if is_video else _with_images(_Side(path, image_names(path)))
+    return Side(path) if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES else Side(path, image_names(path))
 
 
-def _with_images(side: _Side) -> _Side:
-    """A side, which must have images; a pattern's folder in the place of the pattern."""
-    if side.names == []:
-        raise SequenceError(f"{side.path}: no images")
-    return side._replace(path=side.path.parent) if "*" in side.path.name else side
+def _two_cameras(folder: Path) -> list[Side] | None:
+    """Two folders or videos, or the images of one folder, by words such as left and right in their names."""
+    inside = _inside(folder)
+    places = [p.name for p in inside if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES]
+    for words in SIDES:  # these alone, before names that hold them
+        exact = [[name for name in places if name.lower().partition(".")[0] == word] for word in words]
+        if all(exact):
+            return [Side(folder / min(names)) for names in exact]
+    found = of_sides(places)
+    if found and len(found[0]) == len(found[1]) == 1:
+        return [Side(folder / names[0]) for names in found]
+    images = of_sides([p.name for p in inside if p.suffix.lower() in IMAGE_SUFFIXES])
+    return None if images is None else [Side(folder, sorted(names, key=natural)) for names in images]
 
 
-def _by_convention(folder: Path, side: int) -> _Side | None:
-    """A folder, a video, or the images of a folder, by one of the usual names."""
-    if not folder.is_dir():
-        return None
-    for names in _NAMES:
-        if (folder / names[side]).is_dir():
-            return _Side(folder / names[side], image_names(folder / names[side]))
-    films = (folder / f"{names[side]}{suffix}" for names in _NAMES for suffix in sorted(VIDEO_SUFFIXES))
-    film = next((path for path in films if path.is_file()), None)
-    if film is not None:
-        return _Side(film)
-    with suppress(SequenceError):  # a folder that may not be looked into
-        both = of_sides(image_names(folder))
-        return None if both is None else _Side(folder, both[side])
-    return None
+def _called(folder: Path, side: int) -> Path | None:
+    """What is called as the cameras of one side usually are, though the other side is missing."""
+    names = {words[side] for words in SIDES} - {words[1 - side] for words in SIDES}
+    usual = (path for path in sorted(_inside(folder)) if path.stem.lower() in names)
+    return next((path for path in usual if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES), None)
+
+
+def _inside(folder: Path) -> list[Path]:
+    """What is in a folder, without hidden files; nothing where it may not be looked into."""
+    try:
+        return [path for path in folder.iterdir() if not path.name.startswith(".")]
+    except OSError:
+        return []

@@ -34,10 +34,8 @@ def read_image(path: Path, size: Size | None = None) -> np.ndarray:
     """The image (H, W) in grey, uint8 or uint16 as stored; colour is converted, EXIF rotation ignored.
 
     The size is taken from the header before anything is decoded. A file that is cut off, or a PNG with a wrong
-    checksum, is never taken for a partly grey image. With `size` it must have this width and height.
-
-    Raises:
-        SequenceError: the file is missing, cut off, damaged, or no image, or of another size; the message names it.
+    checksum, is never taken for a partly grey image. SequenceError where the file is missing, damaged or no image, or
+    of another `size`.
     """
     return decode_image(read_bytes(path, _LARGEST), str(path), size)
 
@@ -104,10 +102,10 @@ def recorded_size(rig: StereoRig) -> Size:
     return (rig.height, rig.width) if rig.turns % 2 else (rig.width, rig.height)
 
 
-def require_same_size(left: tuple[int, ...], right: tuple[int, ...], *names: object) -> None:
-    """Raise SequenceError where the images of two cameras, by these names, differ in size (width first)."""
-    if left != right:
-        sizes = ", ".join(f"{name} is {size_text(size)}" for name, size in zip(names, (left, right)))
+def require_same_size(left: np.ndarray, right: np.ndarray, *names: object) -> None:
+    """Raise SequenceError where the images (H, W) of two cameras, by these names, differ in size."""
+    if left.shape != right.shape:
+        sizes = ", ".join(f"{name} is {size_text(image.shape[::-1])}" for name, image in zip(names, (left, right)))
         raise SequenceError(f"left and right images differ in size: {sizes}")
 
 

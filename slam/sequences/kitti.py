@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -17,11 +18,19 @@ from slam.geometry.se3 import Array, inverse, pose
 from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence
-from slam.sequences.calibration import kitti_matrix, naming, projection_offset, read_kitti, rig_from_projections, rigid
+from slam.sequences.calibration import (
+    kitti_matrix,
+    naming,
+    projection_offset,
+    read_kitti,
+    rig_from_projections,
+    rigid,
+)  # fmt: skip
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import Given
 from slam.sequences.images import Size, size_text
-from slam.sequences.pairs import Pairs, image_pairs, number_of, numbered, read_times, timed
+from slam.sequences.names import stem
+from slam.sequences.options import Options
+from slam.sequences.pairs import image_names, image_pairs, listed, pair_up, told_times
 from slam.sequences.rigs import calibration_files, read_rig
 from slam.sequences.tables import date_time, numbers, read_rows, require_truth, shorten
 
@@ -32,6 +41,7 @@ OXTS_NOISE = TruthNoise(rotation=float(np.radians(0.03)), translation=0.02, moun
 #: Synchronised drives have one of a hundred OXTS records a second for each frame, the nearest one [s].
 _OXTS_TIME = 0.01 / np.sqrt(12)
 
+_COUNT = re.compile(r"\d{1,18}", re.ASCII)  # the name of a record
 _EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
 _OXTS = "latitude, longitude, altitude, roll, pitch, yaw"
 _PAIRS = (("0", "1"), ("2", "3"))  # grey first, colour where there is no grey
@@ -41,8 +51,7 @@ class Layout(NamedTuple):
     """Where the files of a sequence are."""
 
     name: str
-    left: Path  # folders of images
-    right: Path
+    folders: list[Path]  # of left and right images
     cameras: tuple[str, str]  # their numbers, as the calibration writes them
     calibration: Path  # the file, where it is or should be
     times: Path  # the file, which may be missing
@@ -62,30 +71,31 @@ def matches_drive(folder: Path) -> bool:
     return bool(cameras) and not any(path.name.isdecimal() and path.is_dir() for path in inside)
 
 
-def open_folder(folder: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
     """Open one sequence of KITTI odometry, or of KITTI tracking."""
     return _open(folder, _tracking(folder) if _is_tracking(folder) else _odometry(folder), options, faults)
 
 
-def open_drive(folder: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+def open_drive(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
     """Open one drive of KITTI raw or KITTI-360; stamps count from its first row of times. Raises as `open_folder`."""
     return _open(folder, _drive(folder), options, faults)
 
 
-def _open(folder: Path, where: Layout, options: Given, faults: FaultLog) -> RecordedSequence:
-    left, right = (numbered(side, faults) for side in (where.left, where.right))
+def _open(folder: Path, where: Layout, options: Options, faults: FaultLog) -> RecordedSequence:
+    left, right = listed(where.folders, [image_names(images) for images in where.folders], faults)
     origin, times = None, None
     if where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options):
         dates = read_rows(where.times, date_time, faults)
         origin = next(date for date in dates if date is not None)
         times = where.times, np.array([np.nan if date is None else (date - origin) * 1e-9 for date in dates])
     else:
-        times = read_times(folder, options, faults, where.times)
-    pairs = timed(left, right, options, faults, times, by_number=True)
-    source = image_pairs(pairs, right.folder)
-    rig, T_left_reference = _rig(folder, where, source.size, options)
+        times = told_times(folder, options, faults, where.times)
+    pairs = pair_up(left, right, options, faults, times, by_number=True)
+    source, size = image_pairs(pairs, left, right)
+    rig, T_left_reference = _rig(folder, where, size, options)
+    by_number = dict(zip((pairs.rows[:, 0] if left.stamped else pairs.keys).tolist(), pairs.stamps.tolist()))
     try:
-        truth = _truth(where, origin, T_left_reference, pairs, faults)
+        truth = _truth(where, origin, T_left_reference, by_number, faults)
     except (SequenceError, CalibrationError, TrajectoryError) as error:
         faults.report("ground truth", f"{error}; there is no ground truth")
         truth = None
@@ -101,32 +111,35 @@ def _is_tracking(folder: Path) -> bool:
 
 
 def _odometry(folder: Path) -> Layout:
-    a, b = _choose_pair(folder, _PAIRS)
+    cameras = _choose_pair(folder, _PAIRS)
     poses = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
-    left, right = (folder / f"image_{camera}" for camera in (a, b))
-    return Layout(folder.name, left, right, (a, b), folder / "calib.txt", folder / "times.txt", poses)
+    folders = [folder / f"image_{camera}" for camera in cameras]
+    return Layout(folder.name, folders, cameras, folder / "calib.txt", folder / "times.txt", poses)
 
 
 def _tracking(folder: Path) -> Layout:
     root, name = folder.parent.parent, folder.name
-    calibration = root / "calib" / f"{name}.txt"
-    if not calibration.exists():  # as downloaded: data_tracking_calib/training beside data_tracking_image_2/training
-        others = sorted(root.parent.parent.glob(f"*/{root.name}/calib/{name}.txt"))
-        calibration = others[0] if others else calibration
-    return Layout(name, folder, root / "image_03" / name, ("2", "3"), calibration, root / f"times_{name}.txt")
+    # As downloaded: data_tracking_calib/training beside data_tracking_image_2/training
+    files = [root / "calib" / f"{name}.txt", *sorted(root.parent.parent.glob(f"*/{root.name}/calib/{name}.txt"))]
+    folders = [folder, root / "image_03" / name]
+    return Layout(name, folders, ("2", "3"), _first(files), root / f"times_{name}.txt")
 
 
 def _drive(folder: Path) -> Layout:
     """Of KITTI raw the calibration is in the day's folder, or in the drive's own; of KITTI-360 in ``calibration``."""
     cameras = _choose_pair(folder, tuple((f"0{a}", f"0{b}") for a, b in _PAIRS))
-    is_360 = (folder / f"image_{cameras[0]}" / "data_rect").exists()
-    left, right = (folder / f"image_{camera}" / ("data_rect" if is_360 else "data") for camera in cameras)
+    images = [folder / f"image_{camera}" for camera in cameras]
+    inside = next((name for name in ("data_rect", "data") if (images[0] / name).exists()), "")
     raw = [where / "calib_cam_to_cam.txt" for where in (folder.parent, folder)]
     usual = [where / "calibration" / "perspective.txt" for where in (folder.parent.parent, folder.parent)]
-    usual = [*usual, *raw] if is_360 else [*raw, *usual]
-    calibration = next((path for path in usual if path.exists()), usual[0])
-    poses, times = folder / "poses_cam0_oxts.txt", left.parent / "timestamps.txt"
-    return Layout(folder.name, left, right, cameras, calibration, times, (poses,), folder)
+    calibration = _first([*usual, *raw] if inside == "data_rect" else [*raw, *usual])
+    poses, times = folder / "poses_cam0_oxts.txt", images[0] / "timestamps.txt"
+    return Layout(folder.name, [path / inside for path in images], cameras, calibration, times, (poses,), folder)
+
+
+def _first(paths: list[Path]) -> Path:
+    """The first path that exists, else the first one."""
+    return next((path for path in paths if path.exists()), paths[0])
 
 
 def _choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
@@ -134,21 +147,16 @@ def _choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str,
     for left, right in pairs:
         if all((folder / f"image_{c}").is_dir() for c in (left, right)):
             return left, right
-    there = [path for pair in pairs for camera in pair if (path := folder / f"image_{camera}").exists()]
-    if files := [path for path in there if not path.is_dir()]:
-        raise SequenceError(f"{files[0]}: a file where a folder of images should be")
-    found = f"only {', '.join(path.name for path in there)} is there" if there else "no folder of images is there"
-    wanted = " or ".join(f"image_{a} and image_{c}" for a, c in pairs)
-    raise SequenceError(f"{folder}: two cameras are needed ({wanted}), {found}")
+    wanted = " or ".join(f"folders image_{a} and image_{c}" for a, c in pairs)
+    raise SequenceError(f"{folder}: two cameras are needed, {wanted}")
 
 
-def _rig(folder: Path, where: Layout, size: Size, options: Given) -> tuple[StereoRig, Array]:
+def _rig(folder: Path, where: Layout, size: Size, options: Options) -> tuple[StereoRig, Array]:
     """The rig, and the pose (4, 4) of the reference camera 0 (of a drive before rectification) in the left one."""
-    named = calibration_files(folder, options) if "calibration" in options else None
     if not where.calibration.exists():
-        if named is None:
-            raise CalibrationError(f"{where.calibration}: the calibration is missing: add calibration=FILE")
-        return read_rig(named, size, options), np.eye(4)
+        missing = f"{where.calibration}: the calibration is missing: add calibration=FILE"
+        return read_rig(calibration_files(folder, options, missing), size, options), np.eye(4)
+    named = calibration_files(folder, options) if "calibration" in options else None
     T: Array = np.eye(4)
     rows = read_kitti(where.calibration)
     with naming(where.calibration):
@@ -167,23 +175,21 @@ def _rig(folder: Path, where: Layout, size: Size, options: Given) -> tuple[Stere
 
 
 def _truth(
-    where: Layout, origin: int | None, T_left_reference: Array, pairs: Pairs, faults: FaultLog
+    where: Layout, origin: int | None, T_left_reference: Array, by_number: dict[int, float], faults: FaultLog
 ) -> Trajectory | None:
-    """The left camera's path.
+    """The left camera's path at the stamps of the frames `by_number`.
 
     Of drives by the OXTS records, where the world is the left camera's first frame; KITTI-360 has poses of the
     rectified left camera. Else by rows of 12, one for each frame number, of the reference camera: of a drive camera 0
     before rectification. `origin` is the time of stamp zero [ns since 1970], None where it is not known.
     """
-    keys, stamps, drive = pairs.left.keys, pairs.stamps, where.drive
-    by_number = dict(zip(keys.tolist(), stamps.tolist()))
-    if drive is not None:
+    if where.drive is not None:
+        drive = where.drive
         world = drive.parent.parent / "data_poses" / drive.name / "cam0_to_world.txt"
         grey = where.cameras[0] == "00"
         if world.is_file() and grey:
             found = read_rows(world, partial(numbers, count=17, what="a frame and its pose"), faults)
-            rows = [row for row in found if row and row[0] in by_number]
-            table = np.array(sorted(rows)).reshape(-1, 17)
+            table = np.array(sorted(row for row in found if row and row[0] in by_number)).reshape(-1, 17)
             times = np.array([by_number[int(number)] for number in table[:, 0]])
             return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), world)
         if (drive / "oxts").is_dir():
@@ -199,10 +205,12 @@ def _truth(
     if path is None:
         return None
     given = Trajectory.read_kitti(path)
-    inside = keys < len(given)
-    if not inside.all():
-        faults.report("ground truth", f"{path}: {len(given)} poses, {int((~inside).sum())} frames are beyond them")
-    truth = require_truth(Trajectory(stamps[inside], given.poses[keys[inside]]), path)
+    inside = [number for number in by_number if number < len(given)]
+    if len(inside) < len(by_number):
+        line = f"{path}: {len(given)} poses, {len(by_number) - len(inside)} frames are beyond them"
+        faults.report("ground truth", line)
+    times = np.array([by_number[number] for number in inside])
+    truth = require_truth(Trajectory(times, given.poses[inside]), path)
     return Trajectory(truth.stamps, truth.poses @ inverse(T_left_reference))
 
 
@@ -212,22 +220,21 @@ def read_oxts(folder: Path, origin: int | None, frame_stamps: dict[int, float], 
     Stamps come from ``timestamps.txt`` [s since `origin`, ns since 1970]; where it or `origin` is missing, a record
     has the stamp of the frame of its number. SequenceError where no record is readable and has a stamp.
     """
-    numbered = [(number_of(file.name), file) for file in sorted((folder / "data").glob("*.txt"))]
-    if all(number is None for number, _ in numbered):
+    files = {int(stem(f.name)): f for f in sorted((folder / "data").glob("*.txt")) if _COUNT.fullmatch(stem(f.name))}
+    if not files:
         raise SequenceError(f"{folder / 'data'}: no OXTS records")
     stamps, rows = frame_stamps, []
     if origin is not None and (folder / "timestamps.txt").exists():
         dates = read_rows(folder / "timestamps.txt", date_time, faults)
         stamps = {number: (row - origin) * 1e-9 for number, row in enumerate(dates) if row is not None}
-    for number, file in numbered:
-        if number is not None:
-            try:
-                record = read_rows(file, _record, faults)[0]
-            except SequenceError as error:
-                faults.report("OXTS records left out", f"{error}; record left out")
-                continue
-            if record is not None and number in stamps:
-                rows.append([stamps[number], *record])
+    for number, file in files.items():
+        try:
+            record = read_rows(file, _record, faults)[0]
+        except SequenceError as error:
+            faults.report("OXTS records left out", f"{error}; record left out")
+            continue
+        if record is not None and number in stamps:
+            rows.append([stamps[number], *record])
     if not rows:
         raise SequenceError(f"{folder}: no OXTS record is readable and has a stamp")
     table = np.array(rows)

@@ -1,8 +1,9 @@
-"""Pairs of image files: listing the two cameras' folders, pairing them, and decoding them one by one."""
+"""Who belongs to whom: the images of two cameras listed, paired by stamp or number, given times, and decoded."""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,10 +15,10 @@ from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
 from slam.sequences.base import Images
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import WIDEST_TOLERANCE, Given
 from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, require_same_size
-from slam.sequences.names import MOST_FRAMES, keys_of, natural, odd_ones, same_order, stem
-from slam.sequences.tables import read_rows, seconds
+from slam.sequences.names import Keys, keys_of, natural, odd_ones, stem
+from slam.sequences.options import WIDEST_TOLERANCE, Options
+from slam.sequences.tables import read_times
 
 #: Frames per second of images that say nothing of time.
 RATE = 10.0
@@ -37,23 +38,22 @@ class Listing:
     def __len__(self) -> int:
         return len(self.names)
 
-    def select(self, rows: IntArray | slice) -> Listing:
+    def select(self, rows: IntArray) -> Listing:
         """The listing of these rows."""
-        index = np.arange(len(self))[rows]
-        return replace(self, keys=self.keys[index], names=[self.names[i] for i in index])
+        return replace(self, keys=self.keys[rows], names=[self.names[i] for i in rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Left images, and what belongs to each."""
+    """Which images make a frame, and when."""
 
-    left: Listing
-    partners: list[str | None]  # the right images' names (N), None where there is none
-    stamps: Array  # times (N,) [s], strictly increasing; without times those of the keys
+    keys: IntArray  # the left images' (N,)
+    rows: IntArray  # of the left and the right listing (N, 2), -1 where there is no right image
+    stamps: Array  # times (N,) [s], strictly increasing
 
     def select(self, rows: IntArray, stamps: Array) -> Pairs:
-        """These rows with these stamps."""
-        return Pairs(self.left.select(rows), [self.partners[i] for i in rows], stamps)
+        """These frames at these times."""
+        return Pairs(self.keys[rows], self.rows[rows], stamps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,17 +64,13 @@ class ImagePairs:
     left: list[Path]  # (N)
     right: list[Path | None]  # None where there is no right image
     size: Size  # width and height that every image must have
-    halves: bool = False  # both images are in the left file, side by side; there are no others
+    single: bool  # both images are in the left file, side by side; there are no others
 
     def images(self, start: int, stop: int, faults: FaultLog) -> Images:
         """Decode the images of frames `start` to `stop`; an error in place of one that is unreadable."""
-        size = (2 * self.size[0], self.size[1]) if self.halves else self.size
-        for name, partner in zip(self.left[start:stop], self.right[start:stop]):
-            left = _image(name, size)
-            if self.halves:
-                yield (left, None) if isinstance(left, SequenceError) else halves(left, name)
-            else:
-                yield left, None if partner is None else _image(partner, size)
+        for left, right in zip(self.left[start:stop], self.right[start:stop]):
+            image = _image(left, self.size)
+            yield (image,) if self.single else (image, None if right is None else _image(right, self.size))
 
 
 def _image(path: Path, size: Size) -> np.ndarray | SequenceError:
@@ -84,15 +80,17 @@ def _image(path: Path, size: Size) -> np.ndarray | SequenceError:
         return error
 
 
-def image_pairs(pairs: Pairs, right: Path | None) -> ImagePairs:
-    """The source of pairs of image files, those of the right camera in the folder `right`; None for side by side.
+def image_pairs(pairs: Pairs, left: Listing, right: Listing | None) -> tuple[ImagePairs, Size]:
+    """The source of pairs of image files, and the size of a camera's images.
+
+    Without a right listing both images are in the left files, side by side.
 
     SequenceError where no pair can be read, or the two images of the first one that can differ in size.
     """
-    left = [pairs.left.folder / name for name in pairs.left.names]
-    partners = [None if right is None or name is None else right / name for name in pairs.partners]
+    lefts = [left.folder / left.names[row] for row in pairs.rows[:, 0]]
+    rights = [right.folder / right.names[row] if right and row >= 0 else None for row in pairs.rows[:, 1]]
     fault = "no frame has two images"
-    for left_path, right_path in zip(left, partners):
+    for left_path, right_path in zip(lefts, rights):
         if right is None or right_path is not None:
             try:
                 image = read_image(left_path)
@@ -100,9 +98,10 @@ def image_pairs(pairs: Pairs, right: Path | None) -> ImagePairs:
             except SequenceError as error:
                 fault = str(error)
                 continue
-            require_same_size(a.shape[::-1], b.shape[::-1], left_path, right_path)
-            return ImagePairs(pairs.stamps, left, partners, (a.shape[1], a.shape[0]), right is None)
-    raise SequenceError(f"{pairs.left.folder}: no pair of images can be read: {fault}")
+            require_same_size(a, b, left_path, right_path)
+            whole = image.shape[1], image.shape[0]
+            return ImagePairs(pairs.stamps, lefts, rights, whole, right is None), (a.shape[1], a.shape[0])
+    raise SequenceError(f"{left.folder}: no pair of images can be read: {fault}")
 
 
 def image_names(folder: Path) -> list[str]:
@@ -118,54 +117,43 @@ def image_names(folder: Path) -> list[str]:
     return sorted((n for n in names if os.path.splitext(n)[1].lower() in IMAGE_SUFFIXES), key=natural)  # noqa: PTH122
 
 
-def number_of(name: str) -> int | None:
-    """The number that is the name of a file without its ending, in 64 bits; None where it is none."""
-    text = stem(name)
-    return int(text) if text.isascii() and text.isdecimal() and int(text) < 2**63 else None
-
-
-def numbered(folder: Path, faults: FaultLog) -> Listing:
-    """The images of a folder whose names are numbers (``000017.png``); gaps are reported, other files ignored."""
-    by_number: dict[int, str] = {}
-    for name in image_names(folder):
-        number = number_of(name)
-        if number is not None and number <= MOST_FRAMES:
-            by_number.setdefault(number, name)
-    if not by_number:
-        raise SequenceError(f"{folder}: no images with numbers for names")
-    keys = np.array(sorted(by_number), np.int64)
-    gaps = int(keys[-1] - keys[0]) + 1 - len(keys)
-    if gaps:
-        after = by_number[int(keys[int(np.argmax(np.diff(keys) > 1))])]
-        faults.report("images", f"{folder}: {gaps} images are missing between the first and the last (after {after})")
-    return Listing(folder, keys, [by_number[k] for k in keys.tolist()])
-
-
-def by_names(folders: list[Path], names: list[list[str]], faults: FaultLog) -> list[Listing]:
+def listed(folders: list[Path], names: list[list[str]], faults: FaultLog) -> list[Listing]:
     """The images of one camera or two by what their names say: stamps, else numbers, else their order.
 
-    SequenceError where only their order is left, and the cameras have unequally many.
+    SequenceError where a camera has no images, or where only their order is left and the cameras have unequally many.
     """
-    for at, own in enumerate(names):
-        if odd := odd_ones(own):
-            line = f"{folders[at]}: {len(odd)} of {len(own)} images are named unlike the others (first: {odd[0]})"
-            faults.report("images", f"{line}; left out")
-            names[at] = [name for name in own if name not in odd]
+    for at, (folder, own) in enumerate(zip(folders, names)):
+        if not own:
+            raise SequenceError(f"{folder}: no images")
+        endings = Counter(name.rpartition(".")[2] for name in own)
+        once = {stem(name): name for name in sorted(own, key=lambda name: endings[name.rpartition(".")[2]])}
+        odd = odd_ones(list(once.values()))
+        for kind, left_out in (("images are there in another format, too", set(own) - set(once.values())),
+                               ("images are named unlike the others", odd)):  # fmt: skip
+            if left_out:
+                first = min(left_out, key=natural)
+                faults.report("images", f"{folder}: {len(left_out)} of {len(own)} {kind} (first: {first}); left out")
+        taken = set(once.values()) - odd
+        names[at] = [name for name in own if name in taken]
     found = keys_of(names)
     if found is None:
         if len({len(own) for own in names}) > 1:
             counts = " and ".join(f"{folder} has {len(own)} images" for folder, own in zip(folders, names))
             raise SequenceError(f"{counts}: neither stamps nor numbers in their names say which go together")
-        names = [sorted(own, key=natural) for own in names]
         guess = "neither stamps nor numbers in the names say which images go together: their order does"
-        found = [np.arange(len(own)) for own in names], False, "" if same_order(names) else guess
-    keys, stamped, guess = found
-    if guess:
-        faults.assume(f"{folders[0]}: {guess}")
+        found = Keys([np.arange(len(own)) for own in names], False, guess)  # they are sorted
+    if found.guess:
+        faults.report("names", f"{folders[0]}: {found.guess}")
     listings = []
-    for folder, own_keys, own in zip(folders, keys, names):
-        order = np.argsort(own_keys, kind="stable")
-        listing = Listing(folder, own_keys[order], [own[i] for i in order], stamped)
+    for folder, keys, own in zip(folders, found.sides, names):
+        rows = np.argsort(keys, kind="stable")
+        listing = Listing(folder, keys, own, found.stamped).select(rows)
+        steps = np.diff(listing.keys)
+        gaps = int(steps.sum()) - len(steps)
+        if not found.stamped and gaps > 0 and np.median(steps) == 1:
+            after = listing.names[int(np.argmax(steps > 1))]
+            line = f"{folder}: {gaps} images are missing between the first and the last (after {after})"
+            faults.report("images", line)
         listings.append(in_order(listing, str(folder), faults))
     return listings
 
@@ -183,21 +171,7 @@ def in_order(listing: Listing, what: str, faults: FaultLog) -> Listing:
     return listing.select(rows)
 
 
-def present(listing: Listing, what: str, faults: FaultLog) -> Listing:
-    """The listed images that exist; another ending (``.jpg`` for ``.png``) is accepted. The rest is reported."""
-    there = image_names(listing.folder)
-    known = {stem(name): name for name in there} | {name: name for name in there}
-    names = [known.get(n) or known.get(stem(n), "") for n in listing.names]
-    missing = [wanted for wanted, found in zip(listing.names, names) if not found]
-    if len(missing) == len(names):
-        raise SequenceError(f"{listing.folder}: none of the {len(names)} images listed in {what} is there")
-    if missing:
-        line = f"{what}: {len(missing)} of {len(names)} listed images are missing (first: {missing[0]})"
-        faults.report("listed images", line)
-    return replace(listing, names=names).select(np.flatnonzero([bool(n) for n in names]))
-
-
-def read_times(folder: Path, options: Given, faults: FaultLog, *usual: Path) -> tuple[Path, Array] | None:
+def told_times(folder: Path, options: Options, faults: FaultLog, *usual: Path) -> tuple[Path, Array] | None:
     """The file of times, by option or by convention, and the times in it by row [s], NaN for unreadable ones.
 
     None where there is no file, or ``fps`` is given in its place.
@@ -206,80 +180,76 @@ def read_times(folder: Path, options: Given, faults: FaultLog, *usual: Path) -> 
         path: Path | None = folder / expanded(options["times"])
     else:
         path = None if "fps" in options else next((path for path in usual if path.is_file()), None)
-    if path is None:
-        return None
-    return path, np.array([np.nan if row is None else row for row in read_rows(path, seconds, faults)])
+    return None if path is None else (path, read_times(path, faults))
 
 
-def pair_up(left: Listing, right: Listing | None, options: Given, faults: FaultLog, told: bool = False) -> Pairs:
-    """Pair the images of two cameras by their keys, the option ``tolerance`` apart at most.
+def pair_up(
+    left: Listing, right: Listing | None, options: Options, faults: FaultLog,
+    times: tuple[Path, Array] | None = None, by_number: bool = False,
+) -> Pairs:  # fmt: skip
+    """The images of two cameras that belong together by their keys, the option ``tolerance`` apart at most.
 
     Left images before the first pair and after the last are left out, and so are right images without a partner;
-    what is left out or stands alone is reported. Without a right camera both images are in one file, side by side.
-    Where time is `told` by a file or a rate, half a frame, not `_TOLERANCE`, is the default. SequenceError where
-    nothing pairs.
+    what is left out or stands alone is reported. Without a right listing both images are in one file, side by side.
+
+    Time is by the file of `times`, else by ``fps``, else by stamps, else by numbers at `RATE`. Rows of the file belong
+    to the left images in order; with `by_number` a row's number is a frame's. SequenceError where nothing pairs, or
+    hardly a frame has a time.
     """
-    if right is None:
-        return Pairs(left, list(left.names), 1e-9 * left.keys)
-    tolerance: float = 0
-    if left.stamped:
-        half = np.median(np.diff(left.keys)) / 2 if len(left) > 1 else _TOLERANCE
-        tolerance = int(0.98 * half if told and len(left) > 1 else min(_TOLERANCE, half))
-        given = options.tolerance()
-        tolerance = tolerance if given is None else given
-    partner = pair(left.keys, right.keys, tolerance)
-    rows = trim(partner)
-    if rows.stop == 0:
-        raise SequenceError(_no_pair(left, right, tolerance))
-    head, tail, unused = rows.start, len(left) - rows.stop, len(right) - int((partner >= 0).sum())
-    if head or tail:
-        line = f"{left.folder}: {head} images before the first pair and {tail} after the last are left out"
-        faults.report("pairs", line)
-    alone = np.flatnonzero(partner[rows] < 0)
-    if len(alone):
-        first = left.names[int(alone[0]) + rows.start]
-        line = f"{left.folder}: {len(alone)} images have no partner in {right.folder} (first: {first})"
-        faults.report("pairs", f"{line}; given without a right image")
-    if unused:
-        faults.report("pairs", f"{right.folder}: {unused} images have no partner in {left.folder}; left out")
-    names = [right.names[i] if i >= 0 else None for i in partner[rows]]
-    kept = left.select(rows)
-    return Pairs(kept, names, 1e-9 * kept.keys)
-
-
-def timed(
-    left: Listing, right: Listing | None, options: Given, faults: FaultLog, times: tuple[Path, Array] | None,
-    by_number: bool = False,
-) -> Pairs:  # fmt: skip
-    """The pairs of two cameras, see `pair_up`, each with its time.
-
-    Time is by the file of times, else by ``fps``, else by stamps, else by numbers at `RATE`. Rows of the file `times`
-    belong to the left images in order; with `by_number` a row's number is a frame's. SequenceError where nothing pairs,
-    or hardly a frame has a time.
-    """
-    rate = None if times else options.rate()
-    pairs = pair_up(left, right, options, faults, bool(times or rate))
-    position = np.searchsorted(left.keys, pairs.left.keys)
+    rate = None if times else options.get("fps")
+    partner = np.full(len(left), -1)
+    kept = np.arange(len(left))
+    if right is not None:
+        tolerance = _tolerance(left, options, bool(times or rate))
+        partner = pair(left.keys, right.keys, tolerance)
+        kept = kept[trim(partner)]
+        if not len(kept):
+            raise SequenceError(_no_pair(left, right, tolerance))
+        _report_alone(left, right, partner, kept, faults)
+    pairs = Pairs(left.keys[kept], np.stack([kept, partner[kept]], axis=1), 1e-9 * left.keys[kept])
     if times is not None:
         path, rows = times
         if not by_number and len(rows) != len(left):
             faults.report("stamps", f"{path} has {len(rows)} rows, {left.folder} has {len(left)} images")
-        return pairs.select(*_stamped(pairs.left.keys if by_number else position, rows, path, faults))
+        numbers = pairs.keys if by_number and not left.stamped else kept
+        return pairs.select(*_stamped(numbers, rows, path, faults))
     if left.stamped and rate is None:
-        return distinct(pairs, faults)
-    numbers = position if left.stamped else pairs.left.keys - (0 if by_number else pairs.left.keys[0])
+        good = increasing(pairs.stamps)
+        if len(good) < len(pairs.stamps):
+            line = f"{left.folder}: {len(pairs.stamps) - len(good)} stamps are nearer than a microsecond to the"
+            faults.report("stamps", f"{line} one before; images left out")
+        return pairs.select(good, pairs.stamps[good])
     if rate is None:
-        faults.assume(f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
+        faults.report("times", f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
+    numbers = kept if left.stamped else pairs.keys - (0 if by_number else pairs.keys[0])
     return replace(pairs, stamps=numbers / (rate or RATE))
 
 
-def distinct(pairs: Pairs, faults: FaultLog) -> Pairs:
-    """The pairs whose stamps [s] increase; others are the same as the one before in floating point."""
-    rows = increasing(pairs.stamps)
-    if len(rows) < len(pairs.stamps):
-        line = f"{pairs.left.folder}: {len(pairs.stamps) - len(rows)} stamps are nearer than a microsecond to the"
-        faults.report("stamps", f"{line} one before; images left out")
-    return pairs.select(rows, pairs.stamps[rows])
+def _tolerance(left: Listing, options: Options, told: bool) -> float:
+    """How far the keys of a pair may be apart: of numbers not at all, of stamps [ns] as the option says.
+
+    Where time is `told` by a file or a rate, half a frame, not `_TOLERANCE`, is the default.
+    """
+    if not left.stamped:
+        return 0
+    half = float(np.median(np.diff(left.keys))) / 2 if len(left) > 1 else _TOLERANCE
+    default = 0.98 * half if told and len(left) > 1 else min(_TOLERANCE, half)
+    return round(1e9 * options.get("tolerance", 1e-9 * default))
+
+
+def _report_alone(left: Listing, right: Listing, partner: IntArray, kept: IntArray, faults: FaultLog) -> None:
+    """Report the images that have no partner."""
+    head, tail = int(kept[0]), len(left) - 1 - int(kept[-1])
+    alone = kept[partner[kept] < 0]
+    unused = len(right) - int((partner >= 0).sum())
+    if head or tail:
+        line = f"{left.folder}: {head} images before the first pair and {tail} after the last are left out"
+        faults.report("pairs", line)
+    if len(alone):
+        line = f"{left.folder}: {len(alone)} images have no partner in {right.folder} (first: {left.names[alone[0]]})"
+        faults.report("pairs", f"{line}; given without a right image")
+    if unused:
+        faults.report("pairs", f"{right.folder}: {unused} images have no partner in {left.folder}; left out")
 
 
 def _stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,8 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import pose
 from slam.sequences.calibration import is_kitti, naming
 from slam.sequences.calibration_keys import read_entries, rig_of
-from slam.sequences.given import flag, metres_per_unit
 from slam.sequences.images import Size, recorded_size, size_text
+from slam.sequences.options import value_of
 
 _USUAL = (
     *((stem + end,) for stem, end in product(
@@ -58,7 +59,7 @@ def load_rig(
         >>> import slam
         >>> rig = slam.load_rig("calibration.yaml")  # doctest: +SKIP
     """
-    options = {"unit": unit} | ({"rectified": "yes"} if rectified else {}) | ({"fisheye": "yes"} if fisheye else {})
+    options = {"unit": value_of("unit", unit), "rectified": rectified, "fisheye": fisheye}
     files = [expanded(path, CalibrationError) for path in paths]
     if not files:
         raise CalibrationError("no calibration is named")
@@ -71,13 +72,13 @@ def load_rig(
     return StereoRig(*rig.as_recorded) if rig.turns else rig  # refused, unless the images are turned, too
 
 
-def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, str]) -> StereoRig:
+def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, Any]) -> StereoRig:
     """The rig of one or two files, see `load_rig`; of cameras above each other, that of turned images.
 
     Of the `options` ``unit``, ``rectified`` and ``fisheye`` count. SequenceError where the images, of this size if it
     is known, are of another one than the calibration is for.
     """
-    unit, rectified, fisheye = metres_per_unit(options), flag(options, "rectified"), flag(options, "fisheye")
+    unit, rectified, fisheye = options.get("unit", 1.0), options.get("rectified", False), options.get("fisheye", False)
     entries = read_entries(paths, size)
     for name, given in (("unit", unit != 1), ("fisheye", fisheye)):
         if given and entries.form:
@@ -96,7 +97,7 @@ def require_size(size: Size, rig: StereoRig, calibration: Path) -> None:
         raise SequenceError(f"images are {size_text(size)}, but {calibration} is for {size_text(expected)}")
 
 
-def calibration_files(folder: Path, options: Mapping[str, str], missing: str = "") -> list[Path]:
+def calibration_files(folder: Path, options: Mapping[str, Any], missing: str = "") -> list[Path]:
     """The file, or the two files, by the option ``calibration`` (names joined by a comma) or under usual names.
 
     Names are relative to the folder: the sequence's, or that of the file that it is; of a camera the working folder.
@@ -113,8 +114,10 @@ def calibration_files(folder: Path, options: Mapping[str, str], missing: str = "
     files = _first(folder, _USUAL) or [file for file in texts if is_kitti(file)][:1]
     if not files:
         there = f" ({texts[0].name} is not of KITTI's form)" if texts else ""
+        others = sorted(path.name for path in folder.iterdir() if path.suffix in (".yaml", ".yml", ".xml", ".json"))
+        hint = f"; is it {', '.join(others[:3])}?" if others else ""
         usual = f"{folder}: the calibration is missing{there}: calibration.yaml, or add calibration=FILE"
-        raise CalibrationError(missing or usual)
+        raise CalibrationError((missing or usual) + hint)
     return files
 
 

@@ -17,9 +17,9 @@ from slam.geometry.stamps import IntArray
 from slam.sequences.base import Images, RecordedSequence
 from slam.sequences.calibration import naming
 from slam.sequences.faults import FaultLog
-from slam.sequences.given import Given, flag, metres_per_unit
 from slam.sequences.images import Size, halves
-from slam.sequences.pairs import Listing, distinct, in_order, pair_up
+from slam.sequences.options import Options
+from slam.sequences.pairs import Listing, in_order, pair_up
 from slam.sequences.rigs import calibration_files, read_rig, require_size
 from slam.sequences.ros_bag import (
     Bag,
@@ -39,8 +39,8 @@ SUFFIXES = (".bag", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 
 _METADATA, _ROS_2, _BEGINNING = "metadata.yaml", b"rosbag2_bagfile_information", 4096
 
-_LATE = 10  # messages in a row that are out of order; more, or the last ones, are of a clock that was set back
 _LATEST = 10**9  # [ns] that a message is late; more is a wrong stamp, or the clock
+_AROUND = 5  # messages whose median says how far the recording's clock is ahead of the camera's
 
 
 def matches_folder(path: Path) -> bool:
@@ -53,27 +53,27 @@ def matches_folder(path: Path) -> bool:
     )
 
 
-def open_folder(path: Path, options: Given, faults: FaultLog) -> RecordedSequence:
+def open_folder(path: Path, options: Options, faults: FaultLog) -> RecordedSequence:
     """Open a recording; all of it is read once, for the stamps."""
     with open_bag(path) as bag:
         topics = choose_topics(bag, options)
         infos = [camera_info(bag, topic) for topic in topics.infos]
-        messages = [_stamps(bag, topic, faults) for topic in dict.fromkeys(topics.images)]
+        messages = [_stamps(bag, topic, faults) for topic in topics.images]
         image = bag.first_image(topics.images[0])
     left, *right = _in_time(messages, faults)
-    pairs = distinct(pair_up(left, right[0] if right else None, options, faults), faults)
+    pairs = pair_up(left, right[0] if right else None, options, faults)
     one = image if right else halves(image, topics.images[0])[0]
     size = one.shape[1], one.shape[0]
     if "calibration" in options:
         rig = read_rig(calibration_files(path if path.is_dir() else path.parent, options), size, options)
     else:
         where = Path(" and ".join(topics.infos))
-        rectified = flag(options, "rectified") if "rectified" in options else all(map(is_rectified, topics.images))
+        rectified = options.get("rectified", all(map(is_rectified, topics.images)))
         with naming(where):
-            rig = rig_by_messages(infos, rectified, metres_per_unit(options))
+            rig = rig_by_messages(infos, rectified, options.get("unit", 1.0))
         require_size(size, rig, where)
-    rows = np.array([[-1 if row is None else int(row) for row in n] for n in (pairs.left.names, pairs.partners)])
-    source = RosPairs(pairs.stamps, path, messages, rows[: len(messages)].T, (image.shape[1], image.shape[0]))
+    rows = [np.array([*listing.names, -1], int)[pairs.rows[:, side]] for side, listing in enumerate([left, *right])]
+    source = RosPairs(pairs.stamps, path, messages, np.stack(rows, axis=1), (image.shape[1], image.shape[0]))
     return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source)
 
 
@@ -119,9 +119,7 @@ class RosPairs:
                     if place in wanted:
                         ahead[place] = message
                 images = [self._image(bag, ahead.pop(place), place) for place in frame]
-                if len(self.topics) == 1 and isinstance(images[0], np.ndarray):
-                    images = list(halves(images[0], self.topics[0].topic))
-                yield images[0], images[1] if len(images) > 1 else None
+                yield *images, *[None] * (len(self.topics) - len(images))
 
     def _image(self, bag: Bag, message: Message, place: tuple[str, int]) -> np.ndarray | SequenceError:
         try:
@@ -133,45 +131,44 @@ class RosPairs:
 def _in_time(topics: list[Messages], faults: FaultLog) -> list[Listing]:
     """The messages of both topics in order of time; the names are their rows.
 
-    Messages out of order are sorted. Where a clock was set back, time goes on as the recording's own clock did, by
-    the left topic for both.
+    Messages out of order are sorted, and those with wrong stamps left out. Where a clock was set back, time goes on as
+    the recording's own clock did, by the left topic for both.
     """
     listings, shifts = [], list[int]()
-    for topic, stamps, recorded in topics:
-        stamps, found, start = stamps.copy(), list[int](), 1
-        while (row := _set_back(stamps, start)) is not None:
-            found.append(int(recorded[row] - recorded[row - 1] - stamps[row] + stamps[row - 1]))
-            shift = shifts[len(found) - 1] if len(found) <= len(shifts) else found[-1]
-            stamps[row:] += shift
-            line = f"{topic}: the clock was set back by {1e-9 * shift:.3f} s at message {row}"
-            faults.report("clock", f"{line}; time goes on by the clock of the recording")
-            start = row + 1
+    for topic, taken, recorded in topics:
+        rows = np.arange(len(taken))
+        steps = np.abs(np.diff(taken))
+        ahead = recorded - taken
+        usual = np.array([_usual(ahead, row - _AROUND // 2) for row in rows.tolist()])
+        rows = rows[np.abs(ahead - usual) <= max(_LATEST, _AROUND * (np.median(steps) if len(steps) else 0))]
+        stamps, ahead, found = taken[rows], ahead[rows], list[int]()
+        latest, start = -np.inf, 0
+        for at in (np.flatnonzero(np.diff(stamps) < 0) + 1).tolist():
+            latest, start = max(latest, stamps[start:at].max()), at
+            shift = round(_usual(ahead, at) - _usual(ahead, at - _AROUND))
+            if 2 * shift > latest - stamps[at] > 0 and (len(rows) - at > _AROUND // 2 or shift > _LATEST):
+                found.append(shift)
+                shift = shifts[len(found) - 1] if len(found) <= len(shifts) else shift
+                stamps[at:] += shift
+                ahead[at:] -= shift
+                line = f"{topic}: the clock was set back by {1e-9 * shift:.3f} s at message {rows[at]}"
+                faults.report("clock", f"{line}; time goes on by the clock of the recording")
         shifts = shifts or found
-        late = np.maximum.accumulate(stamps) - stamps
-        rows = np.flatnonzero(late <= _LATEST)
-        rows = rows[np.argsort(stamps[rows], kind="stable")]
-        disordered, wrong = int(((late > 0) & (late <= _LATEST)).sum()), len(stamps) - len(rows)
-        if disordered:
-            faults.report("order", f"{topic}: {disordered} messages are out of order; sorted by their stamps")
-        if wrong:
-            faults.report("stamps", f"{topic}: {wrong} of {len(stamps)} stamps run backwards; left out")
-        listing = Listing(Path(topic), stamps[rows], [str(row) for row in rows.tolist()], True)
+        late = int((stamps < np.maximum.accumulate(stamps)).sum())
+        if late:
+            faults.report("order", f"{topic}: {late} messages are out of order; sorted by their stamps")
+        if len(rows) < len(taken):
+            line = f"{topic}: {len(taken) - len(rows)} of {len(taken)} stamps are far from when they were recorded"
+            faults.report("stamps", f"{line}; left out")
+        order = np.argsort(stamps, kind="stable")
+        listing = Listing(Path(topic), stamps[order], [str(row) for row in rows[order].tolist()], True)
         listings.append(in_order(listing, topic, faults))
     return listings
 
 
-def _set_back(stamps: IntArray, start: int) -> int | None:
-    """The first row, from `start` on, from which on a clock is behind what it was, and stays so; None for none."""
-    late = stamps < np.maximum.accumulate(stamps)
-    edges = np.flatnonzero(np.diff(late, prepend=False, append=False)).reshape(-1, 2)
-    for first, end in edges.tolist():
-        behind, length = stamps[first - 1] - stamps[first], end - first
-        # Late messages fill a gap; after a clock was set back there are messages of the same times twice.
-        twice = int(((stamps[:first] >= stamps[first]) & (stamps[:first] <= stamps[end - 1])).sum())
-        again = length > 1 and 2 * twice >= length
-        if first >= start and (again or length > _LATE or (end == len(stamps) and behind > _LATEST)):
-            return int(first)
-    return None
+def _usual(ahead: IntArray, start: int) -> float:
+    """How far the recording's clock usually is ahead of the stamps, in a few messages from `start` on [ns]."""
+    return float(np.median(ahead[max(0, start) : start + _AROUND]))
 
 
 def _stamps(bag: Bag, topic: str, faults: FaultLog) -> Messages:

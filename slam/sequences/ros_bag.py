@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from importlib.util import find_spec
@@ -17,7 +16,6 @@ from slam.geometry.rig import StereoRig
 from slam.naming import suggestion
 from slam.sequences.calibration import array, naming
 from slam.sequences.calibration_keys import Entries, Entry, rig_of
-from slam.sequences.given import layout_of
 from slam.sequences.images import Size, decode_image, require_image_size, size_text
 from slam.sequences.names import SIDES
 
@@ -31,6 +29,8 @@ _MATRICES: dict[str, tuple[str, tuple[int, ...] | None]] = {
     "R": ("rectificationmatrix", (3, 3)),  # from raw to rectified camera axes
     "P": ("projectionmatrix", (3, 4)),  # of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair
 }
+_ZSTD = b"\x28\xb5\x2f\xfd"  # begins what is compressed
+_LARGEST, _RATIO = 2**30, 50  # [bytes] of a message; of what is unpacked, times its size
 _SAME_PLACE = 1e-6  # [m] from a pair's left camera
 _LISTED = 12  # topics named in a message
 
@@ -40,7 +40,7 @@ DEPTH = frozenset({"16UC1", "32FC1"})
 # Bits and channels of an encoding, and OpenCV's conversion to grey. OpenCV names a Bayer pattern by its second row.
 _ENCODINGS: dict[str, tuple[int, int, str]] = {
     **{name: (bits, 1, "") for bits in (8, 16) for name in (f"mono{bits}", f"{bits}UC1")},
-    "8UC3": (8, 3, "COLOR_BGR2GRAY"),
+    **{f"{bits}UC{n}": (bits, n, f"COLOR_{'BGR' if n == 3 else 'BGRA'}2GRAY") for bits in (8, 16) for n in (3, 4)},
     **{name: (8, 2, "COLOR_YUV2GRAY_UYVY") for name in ("yuv422", "uyvy")},
     **{name: (8, 2, "COLOR_YUV2GRAY_YUY2") for name in ("yuv422_yuy2", "yuyv")},
     **{
@@ -57,7 +57,7 @@ _ENCODINGS: dict[str, tuple[int, int, str]] = {
 
 
 @contextmanager
-def naming_recording(path: Path) -> Iterator[None]:
+def _one_line(path: Path) -> Iterator[None]:
     """Whatever goes wrong with a damaged recording as one SequenceError with its name."""
     try:
         yield
@@ -69,16 +69,9 @@ def naming_recording(path: Path) -> Iterator[None]:
 
 
 def grey_image(message: Any, kind: str, what: str, size: Size | None = None) -> np.ndarray:
-    """The image (H, W) of a message in grey, 8 or 16 bits as sent; sizes are checked before anything is decoded.
+    """The image (H, W) of a message of a `kind`, `RAW` or `COMPRESSED`, in grey, 8 or 16 bits as sent.
 
-    Args:
-        message: as rosbags reads it.
-        kind: its type, `RAW` or `COMPRESSED`.
-        what: where it is from, for the message of an error.
-        size: width and height that the image must have; None for any.
-
-    Raises:
-        SequenceError: it is damaged, or in an unknown encoding, or of another size.
+    SequenceError, which names `what` it is, where it is damaged, in an unknown encoding, or of another size.
     """
     if kind == COMPRESSED:
         return decode_image(bytes(message.data), what, size)
@@ -128,12 +121,13 @@ class Bag:
             yield Message(connection.topic, connection.msgtype, int(time), data)
 
     def read(self, message: Message) -> Any:
-        """A message as an object."""
-        return self._reader.deserialize(message.data, message.kind)
+        """A message as an object; one that is compressed by itself, in a file without its folder, is decompressed."""
+        packed = bytes(message.data[: len(_ZSTD)]) == _ZSTD
+        return self._reader.deserialize(_unpacked(message.data) if packed else message.data, message.kind)
 
     def image(self, message: Message, what: str, size: Size | None = None) -> np.ndarray:
         """The image (H, W) of a message, see `grey_image`."""
-        with naming_recording(self.path):
+        with _one_line(self.path):
             return grey_image(self.read(message), message.kind, what, size)
 
     def first_image(self, topic: str) -> np.ndarray:
@@ -155,41 +149,56 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a recording, and close it in the end; SequenceError for every fault of it, or where rosbags is missing."""
+    """Open a recording, and close it in the end.
+
+    SequenceError for every fault of it, also of what is read meanwhile, or where rosbags is missing.
+    """
     if find_spec("rosbags") is None:
         line = "ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
         raise SequenceError(f"{path}: {line}")
-    with ExitStack() as stack:
-        with naming_recording(path):
-            bag = _opened(path, stack)
-        yield bag
+    with _one_line(path), ExitStack() as stack:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        file = path
+        if path.name.lower().endswith(".zstd"):
+            file = Path(stack.enter_context(TemporaryDirectory())) / path.stem
+            _unpack(path, file)
+        reader = AnyReader([file], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        yield Bag(path, stack.enter_context(reader))
 
 
-def _opened(path: Path, stack: ExitStack) -> Bag:
-    """A recording, of which the stack closes what is open; a compressed file is decompressed as rosbags would."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+def _zstd() -> Any:
+    """The module that decompresses zstd."""
+    try:
+        from compression import zstd  # type: ignore[import-not-found, unused-ignore]
+    except ImportError:  # before Python 3.14
+        from backports import zstd
+    return zstd
 
-    if path.name.lower().endswith(".zstd"):
-        try:
-            from compression import zstd  # type: ignore[import-not-found, unused-ignore]
-        except ImportError:  # before Python 3.14
-            from backports import zstd
 
-        target = Path(stack.enter_context(TemporaryDirectory())) / path.stem
-        with zstd.open(path, "rb") as packed, target.open("wb") as file:
-            shutil.copyfileobj(packed, file)
-        path = target
-    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    stack.enter_context(reader)
-    return Bag(path, reader)
+def _unpacked(data: bytes) -> bytes:
+    """A message, decompressed; SequenceError where it is larger than any image."""
+    unpacked: bytes = _zstd().ZstdDecompressor().decompress(data, max_length=_LARGEST)
+    if len(unpacked) >= _LARGEST:
+        raise SequenceError(f"a message of more than {_LARGEST} bytes")
+    return unpacked
+
+
+def _unpack(packed: Path, target: Path) -> None:
+    """Decompress a file as rosbags would; SequenceError where little becomes very much."""
+    most = max(_LARGEST, _RATIO * packed.stat().st_size)
+    with _zstd().open(packed, "rb") as file, target.open("wb") as unpacked:
+        while part := file.read(_LARGEST // 64):
+            unpacked.write(part)
+            if unpacked.tell() > most:
+                raise SequenceError(f"{packed}: unpacks to more than {_RATIO} times its size")
 
 
 def camera_info(bag: Bag, topic: str) -> dict[str, Entry]:
     """The first CameraInfo message of a topic, of ROS 1, which writes matrices in capitals, or 2, as entries.
 
-    Raises:
-        CalibrationError: there is none, it holds what no calibration holds, or only a part of the image is given.
+    CalibrationError where there is none, it holds what no calibration holds, or only a part of the image is given.
     """
     message = bag.first(topic)
     if message is None:
@@ -208,8 +217,7 @@ def camera_info(bag: Bag, topic: str) -> dict[str, Entry]:
 def rig_by_messages(infos: Sequence[dict[str, Entry]], rectified: bool, unit: float = 1.0) -> StereoRig:
     """The rig of the rectified or of the raw images; the baseline in ``P`` is in units of so many metres.
 
-    Raises:
-        CalibrationError: a camera is not calibrated, or not as one of a pair; or the rig is impossible.
+    CalibrationError where a camera is not calibrated, or not as one of a pair; or the rig is impossible.
     """
     for side, info in zip(("left", "right"), infos):
         if not (info["projectionmatrix"][1][0, 0] > 0 and info["cameramatrix"][1][0, 0] > 0):
@@ -223,7 +231,7 @@ def rig_by_messages(infos: Sequence[dict[str, Entry]], rectified: bool, unit: fl
 class Topics(NamedTuple):
     """The topics of a stereo rig."""
 
-    images: tuple[str, ...]  # of the left and the right one; the same where they are side by side
+    images: tuple[str, ...]  # of the left and the right one; one where they are side by side
     infos: tuple[str, ...] = ()  # of the cameras' calibrations; none where a file is named in their place
 
 
@@ -232,7 +240,7 @@ def is_rectified(topic: str) -> bool:
     return "rect" in _split(topic)[1]
 
 
-def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
+def choose_topics(bag: Bag, options: Mapping[str, Any]) -> Topics:
     """The topics by the options ``left``, ``right``, ``left_info``, ``right_info``; without them those of a pair.
 
     A pair are two cameras whose messages say so: the same size and focal length of the rectified images, and a baseline
@@ -241,25 +249,41 @@ def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
     Raises:
         SequenceError: a topic is not there, or there is not exactly one pair.
         CalibrationError: there is no calibration.
-        ConfigurationError: one of the two images is named and the other is not.
+        ConfigurationError: one of the two images is named and the other is not, or both are the same.
     """
-    if layout_of(options) is not None:
-        images = [topic for topic in _of_kind(bag, _IMAGES) if not _is_depth(bag, topic)]
-        if "left" not in options and len(images) != 1:
+    sides = ("left",) if options.get("layout") is not None else ("left", "right")
+    if any(side in options for side in sides):
+        if not all(side in options for side in sides):
+            raise ConfigurationError("name both topics: left=/…&right=/…")
+        images = tuple(_named(bag, options[side], _IMAGES) for side in sides)
+        if len(sides) > len(set(images)):
+            raise ConfigurationError(f"left and right are the same topic, {images[0]}")
+    else:
+        images = tuple(_cameras(bag)) if sides == ("left",) else _only_pair(bag, options)
+        if sides == ("left",) and len(images) != 1:
             there = f"{len(images)} topics of images, where layout=sbs needs one"
-            raise SequenceError(f"{bag.path}: {there}: add left=/… of {_listed(images)}")
-        topic = _named(bag, options["left"], _IMAGES) if "left" in options else images[0]
-        return _with_infos(bag, (topic, topic), options)
-    if ("left" in options) != ("right" in options):
-        raise ConfigurationError("name both topics: left=/…&right=/…")
-    if "left" in options:
-        return _with_infos(bag, tuple(_named(bag, options[side], _IMAGES) for side in ("left", "right")), options)
-    pairs = list(_pairs_by_name(bag) if "calibration" in options else _pairs_by_messages(bag))
+            raise SequenceError(f"{bag.path}: {there}: add left=/… of {_listed(list(images))}")
+    infos = []
+    for side, topic in zip(("left", "right"), () if "calibration" in options else images * (3 - len(images))):
+        usual = f"{_split(topic)[0]}/camera_info"
+        if f"{side}_info" in options:
+            infos.append(_named(bag, options[f"{side}_info"], (_INFO,)))
+        elif bag.kinds.get(usual) == _INFO:
+            infos.append(usual)
+        else:
+            there = f"add {side}_info=/… (there are {_listed(_of_kind(bag, (_INFO,)))}) or calibration=FILE"
+            raise CalibrationError(f"{bag.path}: no {usual} for {topic}: {there}")
+    return Topics(images, tuple(infos))
+
+
+def _only_pair(bag: Bag, options: Mapping[str, Any]) -> tuple[str, ...]:
+    """The only pair of topics of images."""
+    pairs = _pairs_by_name(bag) if "calibration" in options else _pairs_by_messages(bag)
     if len(pairs) == 1:
         return pairs[0]
     images = _of_kind(bag, _IMAGES)
     if pairs:
-        found = "; ".join("left={}&right={}".format(*pair.images) for pair in pairs[:3])
+        found = "; ".join("left={}&right={}".format(*pair) for pair in pairs[:3])
         raise SequenceError(f"{bag.path}: several stereo pairs, choose one: {found}")
     if not images:
         raise SequenceError(f"{bag.path}: no images; its topics are {_listed(sorted(bag.kinds))}")
@@ -269,49 +293,37 @@ def choose_topics(bag: Bag, options: Mapping[str, str]) -> Topics:
     )
 
 
-def _with_infos(bag: Bag, images: tuple[str, ...], options: Mapping[str, str]) -> Topics:
-    """Images with their cameras' messages, named or in the same name space, unless a calibration is named."""
-    names = []
-    for side, topic in zip(("left", "right"), () if "calibration" in options else images):
-        usual = f"{_split(topic)[0]}/camera_info"
-        if f"{side}_info" in options:
-            names.append(_named(bag, options[f"{side}_info"], (_INFO,)))
-        elif bag.kinds.get(usual) == _INFO:
-            names.append(usual)
-        else:
-            known = _listed(_of_kind(bag, (_INFO,)))
-            raise CalibrationError(
-                f"{bag.path}: no {usual} for {topic}: add {side}_info=/… (there are {known}) or calibration=FILE"
-            )
-    return Topics(images, tuple(names))
-
-
-def _pairs_by_messages(bag: Bag) -> Iterator[Topics]:
-    """All pairs of cameras that say that they are one."""
-    cameras = []
-    for name in _of_kind(bag, (_INFO,)):
-        images = [t for t in _preferred(bag) if _split(t)[0] == _split(name)[0] and not _is_depth(bag, t)]
-        if images and bag.first(name) is not None:
+def _pairs_by_messages(bag: Bag) -> list[tuple[str, ...]]:
+    """All pairs of cameras whose CameraInfo says that they are one."""
+    cameras: dict[str, tuple[object, float]] = {}
+    spaces = set()
+    for topic in _cameras(bag):
+        space = _split(topic)[0]
+        name = f"{space}/camera_info"
+        if space not in spaces and bag.kinds.get(name) == _INFO and bag.first(name) is not None:
+            spaces.add(space)
             info = camera_info(bag, name)
-            P, size = info["projectionmatrix"][1], info["size"][1]
+            P = info["projectionmatrix"][1]
             if P[0, 0] > 0:
-                cameras.append((images[0], name, (size, P[0, 0]), -P[0, 3] / P[0, 0]))
-    for left, left_info, a, left_offset in cameras:
-        for right, right_info, b, right_offset in cameras:
-            if a == b and abs(left_offset) < _SAME_PLACE and right_offset > _SAME_PLACE:
-                yield Topics((left, right), (left_info, right_info))
+                cameras[topic] = (info["size"][1], P[0, 0]), -P[0, 3] / P[0, 0]
+    return [
+        (left, right)
+        for left, (a, left_offset) in cameras.items()
+        for right, (b, right_offset) in cameras.items()
+        if a == b and abs(left_offset) < _SAME_PLACE and right_offset > _SAME_PLACE
+    ]
 
 
-def _pairs_by_name(bag: Bag) -> list[Topics]:
+def _pairs_by_name(bag: Bag) -> list[tuple[str, ...]]:
     """Pairs of topics of images that differ in one of the usual names for left and right, one of each two cameras."""
-    images = _preferred(bag)
-    found: dict[tuple[str, str], Topics] = {}
+    images = _cameras(bag)
+    found: dict[tuple[str, str], tuple[str, ...]] = {}
     for topic in images:
         for names in SIDES:
             other = topic.replace(*names)
-            if other != topic and other in images and not _is_depth(bag, topic):
+            if other != topic and other in images:
                 spaces = _split(topic)[0], _split(other)[0]
-                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), Topics((topic, other)))
+                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), (topic, other))
     return list(found.values())
 
 
@@ -328,22 +340,20 @@ def _of_kind(bag: Bag, kinds: tuple[str, ...]) -> list[str]:
     return sorted(topic for topic, kind in bag.kinds.items() if kind in kinds)
 
 
-def _is_depth(bag: Bag, topic: str) -> bool:
-    """Whether a topic holds depth images, or nothing."""
-    message = bag.first(topic)
-    if message is None or bag.kinds[topic] == COMPRESSED:
-        return message is None or "compressedDepth" in topic
-    return message.encoding in DEPTH
+def _cameras(bag: Bag) -> list[str]:
+    """Topics of images, not of depth, in the order in which they are taken: rectified, raw, and grey ones first."""
 
-
-def _preferred(bag: Bag) -> list[str]:
-    """Topics of images in the order in which they are chosen: rectified, raw before compressed, grey before colour."""
-
-    def key(topic: str) -> Any:
-        _, name = _split(topic)
+    def order(topic: str) -> tuple[bool, ...]:
+        name = _split(topic)[1]
         return "rect" not in name, bag.kinds[topic] == COMPRESSED, "color" in name
 
-    return sorted(_of_kind(bag, _IMAGES), key=key)
+    def depth(topic: str) -> bool:
+        message = bag.first(topic)
+        if message is None or bag.kinds[topic] == COMPRESSED:
+            return message is None or "compressedDepth" in topic
+        return message.encoding in DEPTH
+
+    return sorted((topic for topic in _of_kind(bag, _IMAGES) if not depth(topic)), key=order)
 
 
 def _split(topic: str) -> tuple[str, str]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from slam.errors import SequenceError, TrajectoryError
 from slam.files import read_text
+from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.sequences.faults import FaultLog
 
@@ -32,12 +33,8 @@ _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASC
 def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T | None]:
     """The rows of a text file; blank lines and ``#`` comments do not count.
 
-    A row that `parse` refuses with a ValueError is reported to `faults` and stands as None, so that row numbers keep
-    their meaning.
-
-    Raises:
-        SequenceError: the file cannot be read or holds no row, or more than half of its rows are refused (the
-            message names the first of them).
+    A row that `parse` refuses with a ValueError is reported and stands as None, so that row numbers keep their meaning.
+    SequenceError where the file cannot be read or holds no row, or where more than half of its rows are refused.
     """
     rows: list[T | None] = []
     refused: list[str] = []
@@ -59,19 +56,37 @@ def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T
     return rows
 
 
-def seconds(text: str) -> float:
-    """A finite number of seconds."""
-    try:
-        value = float(text.split()[0])
-    except ValueError:
-        raise ValueError(f"{shorten(text)} is not a time in seconds") from None
-    if not np.isfinite(value):
+def read_times(path: Path, faults: FaultLog) -> Array:
+    """The times in a file by row [s], NaN for unreadable ones.
+
+    A row's time is its first number, whatever names stand beside it; the second one where the first ones count rows.
+    """
+    rows = read_rows(path, _numbers_in, faults)
+    table = np.array([(*(row or ())[:2], np.nan, np.nan)[:2] for row in rows])
+    first, second = table.T
+    if len(table) > 1 and (np.diff(first) == 1).all() and (np.diff(second) > 0).all() and first[0] in (0, 1):
+        faults.report("times", f"{path}: the first number of each row counts rows; the second one is taken as time")
+        return second
+    return first
+
+
+def _numbers_in(text: str) -> list[float]:
+    """The numbers of a row, of which the first is a finite number of seconds."""
+    found: list[float] = []
+    for word in re.split(r"[,;\s]+", text):
+        try:
+            found.append(float(word))
+        except ValueError:
+            continue
+    if not found:
+        raise ValueError(f"{shorten(text)} is not a time in seconds")
+    if not np.isfinite(found[0]):
         raise ValueError(f"{shorten(text)} is not a finite time")
-    if abs(value) > _MOST_SECONDS:
-        unit = next((unit for unit, size in _UNITS if _EARLIEST <= abs(value) / size <= _LATEST), None)
+    if abs(found[0]) > _MOST_SECONDS:
+        unit = next((unit for unit, size in _UNITS if _EARLIEST <= abs(found[0]) / size <= _LATEST), None)
         hint = f" (is it in {unit}?): give it in seconds" if unit else ""
         raise ValueError(f"{shorten(text)} is no possible time in seconds{hint}")
-    return value
+    return found
 
 
 def date_time(text: str) -> int:
@@ -101,11 +116,10 @@ def shorten(text: str, length: int = 40) -> str:
 
 
 def require_truth(path: Trajectory, source: Path) -> Trajectory:
-    """The true path of a file, where every pose is a rigid motion, and the whole path not all zeros.
+    """The true path of a file.
 
-    Raises:
-        TrajectoryError: a rotation is none (a matrix of zeros, a reflection), a position is beyond the Earth, or every
-            position is exactly zero: errors against such a path would mean nothing.
+    TrajectoryError where a rotation is none (a matrix of zeros, a reflection), a position beyond the Earth, or every
+    position exactly zero: errors against such a path would mean nothing.
     """
     if not len(path):
         raise TrajectoryError(f"{source}: no pose is left")

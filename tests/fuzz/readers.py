@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 import slam
+from slam.sequences.captures import quiet_libraries
 from tests import recordings
 from tests.fuzz.harness import Broken, Subject
 from tests.fuzz.hostile import NUMBERS, PATHS, XML_BOMBS, YAML_BOMBS, broken_bytes, broken_text, choose
@@ -44,7 +45,8 @@ def videos(folder: Path) -> Path:
     """Two videos with OpenCV's calibration."""
     recordings.write_storage(folder / "calibration.xml", recordings.stereo_entries())
     for side in ("left", "right"):
-        writer = cv2.VideoWriter(str(folder / f"{side}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 20, (64, 48))
+        with quiet_libraries():  # ffmpeg asks only once how much it may say
+            writer = cv2.VideoWriter(str(folder / f"{side}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 20, (64, 48))
         for k in range(4):
             writer.write(np.random.default_rng(k).integers(0, 256, (48, 64, 3), dtype=np.uint8))
         writer.release()

@@ -91,10 +91,10 @@ def test_a_front_end_of_nonsense_is_named_and_the_next_frame_is_taken(method, ch
     system = aligning(**{method: change})
     with pytest.raises(SlamError, match=f"Spoilt.{words}"):
         for k in range(3):
-            system.process(LEFT ^ (k % 2), RIGHT, 0.1 * k)  # a still camera has noise
+            system.process(LEFT ^ (k % 2), RIGHT ^ (k % 2), 0.1 * k)  # a still camera has noise
     system.frontend.answers = {}
     for k in range(3, 6):
-        result = system.process(LEFT ^ (k % 2), RIGHT, 0.1 * k)  # a still camera has noise
+        result = system.process(LEFT ^ (k % 2), RIGHT ^ (k % 2), 0.1 * k)  # a still camera has noise
     assert result.status.measured
 
 

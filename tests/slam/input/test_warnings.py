@@ -11,6 +11,7 @@ import pytest
 
 import slam
 from slam.data import StereoFeatures, StereoFrame
+from slam.errors import SequenceError
 from slam.geometry.camera import PinholeCamera
 from slam.input.pair import pair_geometry
 from slam.input.warnings import InputWarnings, farthest_apart
@@ -52,6 +53,48 @@ def test_swapped_cameras_are_named_once():
     assert "exchange them" in line
 
 
+def test_cameras_that_are_exchanged_for_certain_are_refused():
+    swapped = [replace(f, left=f.right, right=f.left) for f in stamped(0.05 * np.arange(8))]
+    with pytest.raises(SequenceError, match=r"left and right look swapped: .* exchange them"):
+        lines(swapped, stereo=3)
+    assert len(lines([*stamped([0.0, 0.1]), *swapped[3:]], stereo=3)) <= 1  # they were right before
+
+
+def test_one_camera_twice_is_refused_and_a_single_frame_loses_its_right_image():
+    doubled = [replace(f, right=f.left.copy()) for f in stamped(0.05 * np.arange(8))]
+    for rig in (RIG, distorted()):
+        system = slam.StereoSlam(rig, "surf", "ekf")
+        with pytest.raises(SequenceError, match="frame 0: left and right are one and the same image"):
+            system.process(doubled[0])
+    frames = list(slam.open_sequence("synthetic:desk?frames=5"))
+    frames[2] = replace(frames[2], right=frames[2].left.copy())
+    system = slam.StereoSlam(RIG, "surf", "ekf")
+    seen = [system.process(frame).features.has_stereo.sum() for frame in frames]
+    assert [count > 50 for count in seen] == [True, True, False, True, True]
+    assert any("frame 2: left and right are one and the same image; it and others" in line for line in system.warnings)
+
+
+def test_a_camera_that_freezes_measures_nothing():
+    """A right image that stays is not used; with a left one that stays the whole frame is a repeated one."""
+    frames = list(slam.open_sequence("synthetic:desk?frames=6"))
+    right = [replace(f, right=frames[2].right if 2 <= f.index < 5 else f.right) for f in frames]
+    system = slam.StereoSlam(RIG, "surf", "ekf")
+    seen = [system.process(frame).features.has_stereo.sum() > 50 for frame in right]
+    assert seen == [True, True, True, False, False, True]
+    assert any("frame 3: the right image is that of the frame before: its camera froze" in w for w in system.warnings)
+    left = [replace(f, left=frames[2].left if 2 <= f.index < 5 else f.left) for f in frames]
+    system = slam.StereoSlam(RIG, "surf", "ekf")
+    before = [system.process(frame).status.value for frame in left]
+    assert before[3:5] == ["predicted"] * 2 and before[5] == "tracked"
+
+
+def test_right_images_that_slip_later_are_named():
+    frames = list(slam.open_sequence("synthetic:desk?frames=80"))[::4]
+    slipped = [replace(b, right=b.right if b.index < 24 else a.right) for a, b in pairwise(frames)]
+    (line,) = lines(slipped)
+    assert "not of one moment, though they were" in line and "a frame too late" in line
+
+
 def test_swapped_cameras_of_an_unrectified_rig():
     turn = cv2.Rodrigues(np.array([0.02, 0.05, -0.03]))[0]
     left = PinholeCamera(250.0, 251.0, 170.0, 110.0, 320, 240, "radtan", (-0.1, 0.02, 0.001, 0.0))
@@ -90,6 +133,8 @@ def test_images_of_different_things_say_nothing():
 
 
 def test_one_image_twice_is_named():
+    copies = [replace(f, right=cv2.GaussianBlur(f.left, (3, 3), 0.5)) for f in stamped(0.05 * np.arange(8))]
+    assert "left and right image show the same" in lines(copies, rig=distorted())[0]
     (line,) = lines([replace(f, right=f.left) for f in stamped(0.05 * np.arange(8))])
     assert "left and right image show the same" in line
     assert f"nearer than {RIG.left.fu * RIG.baseline / 2:.0f} m" in line
@@ -159,8 +204,8 @@ def test_frames_without_texture_are_named_once_and_single_ones_are_not():
 def test_a_calibration_for_images_of_another_size_is_suspected(times):
     """Its file names no size: that of the images is taken."""
     rig = slam.StereoRig.rectified_pair(times * 300.0, times * 160.0, times * 120.0, 0.12, 320, 240)
-    said = [line for line in lines(stamped([0.0]), rig=rig) if "calibration for images of another size" in line]
-    assert bool(said) == (times != 1.0)
+    said = lines(stamped(0.05 * np.arange(12)), rig=rig, stereo=3 if times != 1.0 else 200)
+    assert ["calibration for images of another size" in line for line in said] == [True] * (times != 1.0)
 
 
 def test_the_image_of_a_real_rig_is_not_suspected():
@@ -200,7 +245,7 @@ def test_images_never_rectified_are_named():
     H = RIG.left.K @ turn @ np.linalg.inv(RIG.left.K)
     raw = [replace(f, right=cv2.warpPerspective(f.right, H, (320, 240))) for f in stamped([0.0, 0.1])]
     (line,) = lines(raw)
-    assert "were the images rectified, as this calibration says" in line
+    assert "were they rectified, as this calibration says" in line
 
 
 def test_a_repeated_pattern_is_named_as_the_reason():

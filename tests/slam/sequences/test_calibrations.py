@@ -98,7 +98,11 @@ def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNames
         ({"R": np.eye(2)}, "R is no matrix of shape"),
         ({"T": np.zeros((3, 1))}, "baseline is zero"),
         ({"T": np.array([[np.nan], [0], [0]])}, "T is not finite"),
-        ({"K1": np.eye(4)}, "K1 is no matrix of shape"),
+        ({"K1": np.array([[50.0, 3, 31.5], [0, 51, 23.5], [0, 0, 1]])}, "K1 is no camera matrix"),
+        ({"K1": K.T}, "K1 is no camera matrix"),
+        ({"K1": np.eye(3)}, "a focal length of 1 px for images 64 px wide: is it in pixels?"),
+        ({"R": np.array([1.0, -2.0, 0.5])}, "the cameras look 126 degrees apart: is a rotation in degrees?"),
+        ({"K1": np.eye(4)}, "K1 has 16 numbers; it has fx, fy, cx, cy, or 3 rows of 3"),
     ],
 )
 def test_faulty_entries(tmp_path: Path, build: SimpleNamespace, change: dict, text: str) -> None:
@@ -157,11 +161,13 @@ def test_kalibr(two_folders: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
+        ("-0.11]", "0.11]", "are the cameras swapped? The first one of a calibration is the left one"),
+        ("  T_cn_cnm1:", "  T_12:", "it looks like Kalibr's, which has cam0 and cam1, each with intrinsics"),
         ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),
-        ("cam1:", "cam7:", "K2, R, T are missing (it looks like Kalibr's)"),
+        ("cam1:", "cam7:", "it looks like Kalibr's, which has cam0 and cam1, each with"),
         ("[0.0, 0.0, 1.0, 0.002]", "[0.0, 0.0, 2.0, 0.002]", "T_cn_cnm1 is not a rigid motion"),
-        ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "intrinsics is no matrix of shape (3, 3)"),
+        ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "cam0/intrinsics has 3 numbers; it has fx, fy, cx, cy, or"),
         ("2e-4, 1e-5]", "2e-4]", "takes 4 coefficients or more, got 3"),
         ("resolution: [64, 48]", "resolution: [64]", "resolution is no matrix of shape (2,)"),
         ("cam0:", "cam0: [", "no valid YAML"),
@@ -258,6 +264,29 @@ OAK = json.dumps(
 )  # fmt: skip
 
 
+VINS_CAMERA = """%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: camera
+image_width: 64
+image_height: 48
+distortion_parameters:
+   k1: 0.1
+   k2: 0
+   p1: 0
+   p2: 0
+projection_parameters:
+   fx: 45
+   fy: 45
+   cx: 31
+   cy: 23
+"""
+VINS = "%YAML:1.0\ncam0_calib: cam0.yaml\ncam1_calib: cam1.yaml\nimage_width: 64\nimage_height: 48\n" + "".join(
+    MATRIX.format(f"body_T_cam{i}", 4, 4, f"1, 0, 0, {x}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1")
+    for i, x in ((0, 0.1), (1, 0.3))
+)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "size", "focal", "baseline", "rectified"),
     [
@@ -269,12 +298,15 @@ OAK = json.dumps(
         ("SN123.conf", ZED, (1280, 720), 600, 0.12, False),
         ("SN123.conf", ZED, (672, 376), 300, 0.12, False),
         ("oak.json", OAK, None, 45, 0.2, False),
+        ("vins.yaml", VINS, None, 45, 0.2, False),
     ],
 )
 def test_calibrations_of_other_programs(
     tmp_path: Path, name: str, text: str, size: tuple[int, int] | None, focal: float, baseline: float, rectified: bool
 ) -> None:
     file = tmp_path / name
+    for cam in ("cam0", "cam1"):  # of VINS-Fusion's
+        (tmp_path / f"{cam}.yaml").write_text(VINS_CAMERA)
     file.write_text(text)
     rig = slam.load_rig(file, size=size)
     assert rig.left.fu == focal and rig.is_rectified == rectified
@@ -295,6 +327,14 @@ def test_what_is_recognised_but_cannot_be_read_is_named(tmp_path: Path) -> None:
     file.write_text(OAK.replace('"toCameraSocket": 2', '"toCameraSocket": 0'))
     with pytest.raises(CalibrationError, match="depthai's, but says nothing of how the pair stands"):
         slam.load_rig(file)
+    file.write_text(VINS.replace("cam1.yaml", "elsewhere.yaml"))
+    with pytest.raises(
+        CalibrationError, match="looks like VINS-Fusion's, which has cam0_calib and cam1_calib, files that"
+    ):
+        slam.load_rig(file)
+    file.write_text('{"value0": {"intrinsics": [], "resolution": []}}')
+    with pytest.raises(CalibrationError, match="looks like Basalt's"):
+        slam.load_rig(file, size=(64, 48))
     for number, text in enumerate(("Image_Size: [64, 48]\nfoo_Bar: 1\n", "K1: [1]\n")):
         (tmp_path / f"{number}.yaml").write_text(text)
     with pytest.raises(CalibrationError, match=r"in it: Image_Size, K1, foo_Bar"):
@@ -335,7 +375,7 @@ def test_what_is_no_calibration_is_one_line(tmp_path: Path, two_folders: Path) -
         ([two_folders / "left"], {}, "no calibration under one of the usual names"),
         ([two_folders / "calibration.yaml"], {}, r"names no image size: give size=\(width, height\)"),
         (["a.yaml", "b.yaml"], {"size": (32, 24)}, r"images are 32x24, but .* is for 64x48"),
-        ([two_folders], {"unit": "inch"}, "unit must be one of m, cm, mm"),
+        ([two_folders], {"unit": "inch"}, "unit must be m or cm or mm"),
         ([], {}, "no calibration is named"),
     ):
         with pytest.raises(SlamError, match=words):

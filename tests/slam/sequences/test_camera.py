@@ -148,7 +148,7 @@ def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
         "camera:?left=0": "both left",
         "camera:0?left=0&right=1": "no other address",
         "camera:0?colour=yes": "unknown option 'colour' of format camera",
-        "camera:0?kind=flying": "kind of motion",
+        "camera:0?kind=flying": "kind must be driving or handheld",
         "camera:0?wait=long": "wait must be a number",
         "camera:0?width=0": "width must be a number",
     }

@@ -36,6 +36,10 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "ISO": ("2023-04-05T12:00:{:02d}.250000Z",) * 2 + (lambda i: i, 1680696000.25, 1.0),
     "inside": ("l_{}_a", "r_{}", lambda i: 10**18 + i * 10**8, 1e9, 0.1),
     "malaga": ("img_C1_{:.6f}_left", "img_C1_{:.6f}_right", lambda i: 1261228749.91 + 0.04 * i, 1261228749.91, 0.04),
+    "inside, since a start": ("left_{:.3f}", "right_{:.3f}", lambda i: 12.85 + 0.05 * i, 12.85, 0.05),
+    "before a start": ("{:.2f}", "{:.2f}", lambda i: -0.1 + 0.05 * i, -0.1, 0.05),
+    "dash": ("frame-1600000000-{:03d}",) * 2 + (lambda i: 700 + 50 * i, 1.6e9 + 0.7, 0.05),
+    "counted in each second": ("{0[0]}_{0[1]}",) * 2 + (lambda i: (1_600_000_000 + i // 3, i % 3), 0.0, 0.1),
     "date": ("20230405_120000_{:03d}", "20230405_120000_{:03d}", lambda i: 90 * i, 1680696000, 0.09),
     "numbers": ("frame{:04d}", "frame{:04d}", lambda i: 3 + i, 0.0, 0.1),
     "unpadded numbers": ("{}_cam0", "{}_cam1", lambda i: 7 + i, 0.0, 0.1),
@@ -66,11 +70,34 @@ def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
         (lambda i, side: "abcdef"[i] + side, "their order does"),
         (lambda i, _: f"x_{1_700_000_000 + i}.500000", "is taken as 1700000000.500000 s"),
         (lambda i, _: f"{33 * i}", "33 apart and taken as frame numbers; if they are times, see times="),
+        (lambda i, _: ("3fa9c10", "3fa9c25", "5e1b", "71", "8ac0", "9")[i], "their order does"),
         (lambda i, _: "preview" if i == 5 else f"{i}", "1 of 6 images are named unlike the others .first: preview.png"),
     ):
         for side in ("left", "right"):
             rename(two_folders / side, lambda i, form=form, side=side: form(i, side[::2]) + ".png")
         assert any(re.search(words, line) for line in open_sequence(two_folders).warnings), words
+
+
+def test_images_in_two_formats_are_taken_once(two_folders: Path) -> None:
+    for path in list(two_folders.glob("*/*.png")):
+        path.with_suffix(".bmp").write_bytes(path.read_bytes())
+    sequence = open_sequence(two_folders)
+    assert seeds(sequence) == PAIRS
+    assert "6 of 12 images are there in another format, too" in sequence.warnings[0]
+
+
+@pytest.mark.parametrize("row", ["{i:03d}.png {t}", "{t} left/{i:03d}.png", "{i} {t}", "{i},{t}", "{i} {t} 0.004"])
+def test_a_row_of_times_may_hold_more_than_the_time(two_folders: Path, row: str) -> None:
+    (two_folders / "times.txt").write_text("".join(row.format(i=i, t=7 + 0.3 * i) + "\n" for i in range(6)))
+    assert np.allclose(open_sequence(two_folders).stamps, 7 + 0.3 * np.arange(6))
+
+
+def test_one_camera_twice_is_refused(two_folders: Path, videos: Path) -> None:
+    queries = [f"{two_folders}?left=left&right=left", f"{videos}?left=left.avi&right=left.avi"]
+    (two_folders / "link").symlink_to(two_folders / "left")
+    for path in (*queries, f"{two_folders}?left=left&right=link"):
+        with pytest.raises(SequenceError, match="are the same: the left and the right camera's are needed"):
+            open_sequence(path)
 
 
 def test_equal_counts_with_other_stamps_are_not_paired_by_order(two_folders: Path) -> None:
@@ -104,7 +131,8 @@ def test_words_for_left_and_right() -> None:
     assert of_sides(["left_01.png", "right_01.png"]) == (["left_01.png"], ["right_01.png"])
     assert of_sides(["0_cam0.png", "0_cam1.png", "0_cam10.png"]) == (["0_cam0.png"], ["0_cam1.png"])
     assert of_sides(["L01.png", "R01.png"]) == (["L01.png"], ["R01.png"])
-    assert of_sides(["brightness.png", "leftover.png"]) is None
+    assert of_sides(["a_leftImg8bit.png", "a_rightImg8bit.png"]) == (["a_leftImg8bit.png"], ["a_rightImg8bit.png"])
+    assert of_sides(["brightness.png", "leftover.png"]) is of_sides(["HALL_1.png", "DOOR_1.png"]) is None
     assert keys_of([["a.png", "b.png"]]) is None
 
 
@@ -140,7 +168,7 @@ def test_a_wrong_option_is_said_before_anything_of_the_files(
     with pytest.raises(ConfigurationError):
         open_sequence(f"{two_folders}?{query}")
     assert caplog.records == []
-    assert "have no partner" in open_sequence(two_folders).warnings[0]
+    assert "1 images are missing between the first and the last" in open_sequence(two_folders).warnings[0]
     assert "have no partner" in caplog.text
 
 
@@ -158,11 +186,18 @@ def test_kitti_s_calib_txt_beside_the_images_is_read_and_another_one_named(two_f
 # ------------------------------------------------------------------------------------------------ layouts
 
 
-@pytest.mark.parametrize("names", [("image_left", "image_right"), ("camera0", "camera1"), ("infra1", "infra2")])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("image_left", "image_right"), ("camera0", "camera1"), ("infra1", "infra2"), ("cam1", "cam2"), ("L", "R"),
+        ("Left", "Right"), ("cam_left", "cam_right"), ("left_images", "right_images"),
+    ],
+)  # fmt: skip
 def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str]) -> None:
     for usual, name in zip(("left", "right"), names):
         (two_folders / usual).rename(two_folders / name)
     assert seeds(open_sequence(two_folders)) == PAIRS
+    assert seeds(open_sequence(f"{two_folders}?swap=yes")) == [(b, a) for a, b in PAIRS]
 
 
 def test_one_folder_with_both_cameras_in_it_and_patterns(two_folders: Path) -> None:
@@ -195,6 +230,7 @@ def test_images_and_videos_side_by_side(two_folders: Path, tmp_path: Path, build
         assert seeds(sequence) == PAIRS
         assert (sequence.name, len(sequence), sequence.rig.width) == (name, 6, 64)
         assert np.allclose(sequence.stamps, step * np.arange(6))
+    assert seeds(open_sequence(f"{folder}?layout=sbs&swap=yes")) == [(b, a) for a, b in PAIRS]
     build.write_image(folder / "3.png", 3, 131)
     assert [f.index for f in open_sequence(f"{folder}?layout=sbs")] == [0, 1, 2, 4, 5]
 
@@ -275,8 +311,8 @@ def test_features_under_a_mask_are_not_used(tmp_path: Path, two_folders: Path) -
 # ------------------------------------------------------------------------------------------------ videos
 
 
-def write_video(path: Path, images: list[np.ndarray], codec: str = "FFV1") -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, images[0].shape[::-1])
+def write_video(path: Path, images: list[np.ndarray], codec: str = "FFV1", rate: float = 25) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), rate, images[0].shape[::-1])
     for image in images:
         writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     writer.release()
@@ -305,6 +341,10 @@ def test_two_videos(videos: Path) -> None:
     assert np.allclose(open_sequence(f"{videos}?fps=10").stamps, np.arange(12) / 10)
     assert len(open_sequence(f"{videos}?left=left.avi&right=right.avi&calibration=calib.yml")) == 12
     assert sequence.warnings == []
+    write_video(videos / "right.avi", grey(100), rate=30)
+    with pytest.raises(SequenceError, match=r"has 25 frames per second, .* has 30: .* add fps="):
+        open_sequence(videos)
+    assert len(open_sequence(f"{videos}?fps=25")) == 12
     write_video(videos / "right.avi", grey(100, 9))
     sequence = open_sequence(videos)
     assert len(list(sequence)) == 9 and "has 12 frames, " in sequence.warnings[0]

@@ -80,13 +80,13 @@ def stereo(store, count: int = 6, late: int = 0):
     return rows
 
 
-def write(path: Path, rows, version: int = 1, packed: bool = False) -> Path:
+def write(path: Path, rows, version: int = 1, packed: CompressionMode | None = None) -> Path:
     store = STORES[version]
     mcap = {"storage_plugin": StoragePlugin.MCAP} if path.suffix == ".mcap" else {}
     folder = path.with_suffix("") if version == 2 else path
     bag = Writer1(path) if version == 1 else Writer2(folder, version=9, **mcap)
     if packed:
-        bag.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+        bag.set_compression(packed, CompressionFormat.ZSTD)
     with bag:
         topics = {}
         for topic, kind, time, message in sorted(rows, key=lambda row: row[2]):
@@ -146,9 +146,17 @@ def test_the_unit_of_the_camera_messages(bag: Path, rectified: str) -> None:
         slam.open_sequence(f"{bag}?fisheye=yes")
 
 
-@pytest.mark.parametrize("kind", ["ros1", "folder", "mcap", "db3", "packed folder", "packed mcap", "packed db3"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("ros1", "folder", "mcap", "db3"),
+        *(f"{p} {k}" for p in ("packed", "single") for k in ("folder", "mcap", "db3")),
+    ],
+)
 def test_every_kind_of_recording_is_found_out_and_read(kind: str, tmp_path: Path) -> None:
-    version, packed = (1 if kind == "ros1" else 2), kind.startswith("packed")
+    version = 1 if kind == "ros1" else 2
+    modes = {"packed": CompressionMode.FILE, "single": CompressionMode.MESSAGE}
+    packed = modes.get(kind.split()[0])
     name = "walk.bag" if version == 1 else "walk.mcap" if kind.endswith("mcap") else "walk"
     path = write(tmp_path / name, stereo(STORES[version]), version, packed)
     if kind.endswith(("mcap", "db3")):
@@ -210,6 +218,8 @@ def bayer(pattern: str) -> np.ndarray:
         ("bgr8", COLOURS, GREY, np.uint8),
         ("rgb8", np.ascontiguousarray(COLOURS[..., ::-1]), GREY, np.uint8),
         ("rgba8", np.dstack([COLOURS[..., ::-1], COLOURS[..., :1]]), GREY, np.uint8),
+        ("8UC4", np.dstack([COLOURS, COLOURS[..., :1]]), GREY, np.uint8),
+        ("16UC3", COLOURS.astype(np.uint16) * 256, 256 * GREY, np.uint16),
         ("bgr16", COLOURS.astype(np.uint16) * 256, 256 * GREY, np.uint16),
         *((f"bayer_{p}8", bayer(p).astype(np.uint8), GREY, np.uint8) for p in ("rggb", "bggr", "gbrg", "grbg")),
         ("bayer_rggb16", (bayer("rggb") * 256).astype(np.uint16), 256 * GREY, np.uint16),
@@ -280,8 +290,11 @@ def test_topics_can_be_named_and_a_missing_one_lists_those_there_are(bag: Path) 
         slam.open_sequence(f"{bag}?left={LEFT}")
     with pytest.raises(ConfigurationError, match="tolerance must be"):
         slam.open_sequence(f"{bag}?tolerance=long")
-    with pytest.raises(ConfigurationError, match=r"option 'fps' does nothing here: .* is read as ros"):
-        slam.open_sequence(f"{bag}?fps=3")
+    with pytest.raises(ConfigurationError, match=r"option 'times' does nothing here: .* is read as ros"):
+        slam.open_sequence(f"{bag}?times=a.txt")
+    assert np.allclose(slam.open_sequence(f"{bag}?fps=3").stamps, np.arange(6) / 3)
+    with pytest.raises(ConfigurationError, match="left and right are the same topic"):
+        slam.open_sequence(f"{bag}?left={LEFT}&right={LEFT}")
 
 
 def test_depth_images_and_other_cameras_are_no_stereo_pair(tmp_path: Path) -> None:

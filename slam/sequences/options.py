@@ -1,0 +1,99 @@
+"""The options of a sequence, ``PATH?key=value``: checked before any file is read, refused where nothing uses them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+from urllib.parse import parse_qsl
+
+from slam.errors import ConfigurationError
+from slam.naming import suggestion
+
+#: Options of every format whose calibration is in a file that can be named.
+CALIBRATION = frozenset({"calibration", "unit", "rectified", "fisheye", "kind", "mask", "swap"})
+
+#: Options that every recorded format knows; which of them mean something depends on what is found in the folder.
+RECORDED = CALIBRATION | {"tolerance", "times", "fps", "left", "right", "layout"}
+
+#: Frame rates that are believed [1/s].
+SLOWEST, FASTEST = 1e-3, 1e5
+
+#: Most that the option ``tolerance`` takes [s].
+WIDEST_TOLERANCE = 10.0
+
+_MOST_OPTIONS = 100
+
+_YES_NO = {"yes": True, "no": False}
+_WORDS: dict[str, dict[str, Any]] = {
+    "kind": {"driving": "driving", "handheld": "handheld"},
+    "unit": {"m": 1.0, "cm": 0.01, "mm": 0.001},  # in metres
+    "layout": {"sbs": "sbs"},  # side by side
+    **dict.fromkeys(("rectified", "fisheye", "swap"), _YES_NO),
+}
+_RANGES = {
+    "fps": (SLOWEST, FASTEST),
+    "tolerance": (0.0, WIDEST_TOLERANCE),
+    "wait": (0.0, 86400.0),
+    "width": (1, 100_000),
+    "height": (1, 100_000),
+}
+
+
+def value_of(name: str, text: str) -> Any:
+    """The value of an option: a word's, a number in its range, or the text; ConfigurationError where it is none."""
+    if name in _WORDS:
+        if text not in _WORDS[name]:
+            raise ConfigurationError(f"{name} must be {' or '.join(_WORDS[name])}, got {text!r}")
+        return _WORDS[name][text]
+    if name in _RANGES:
+        low, high = _RANGES[name]
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise ConfigurationError(f"{name} must be a number from {low:g} to {high:g}, got {text!r}")
+        return value
+    return text
+
+
+class Options(dict[str, Any]):
+    """Options of a format by name, with their values; they remember which of them were read.
+
+    ConfigurationError where the query, ``key=value&key=value``, has one that is not `known`, or whose value is none.
+    """
+
+    def __init__(self, query: str, format: str, known: frozenset[str]) -> None:
+        self._read = {"kind"}
+        texts = read_options(query)
+        strange = sorted(set(texts) - known)
+        if strange:
+            hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"
+            raise ConfigurationError(f"unknown option {strange[0]!r} of format {format}{hint}")
+        super().__init__({name: value_of(name, text) for name, text in texts.items()})
+
+    def __getitem__(self, name: str) -> Any:
+        self._read.add(name)
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The option, or what stands for it."""
+        self._read.add(name)
+        return super().get(name, default)
+
+    def require_read(self, what: str) -> None:
+        """Raise ConfigurationError where an option was not read by anything."""
+        for name in sorted(set(self) - self._read):
+            raise ConfigurationError(f"option {name!r} does nothing here: {what}")
+
+
+def read_options(query: str) -> dict[str, str]:
+    """The options ``key=value&key=value`` as texts."""
+    try:
+        texts = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=_MOST_OPTIONS))
+    except ValueError:
+        raise ConfigurationError(f"more than {_MOST_OPTIONS} options") from None
+    for name, text in texts.items():
+        if "\0" in text:
+            raise ConfigurationError(f"option {name!r} holds a NUL")
+    return texts
