@@ -6,39 +6,40 @@ Drawn without pyplot: there is no state to share, and it is loaded faster.
 from __future__ import annotations
 
 import logging
+import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from slam.errors import ConfigurationError, SlamError
 from slam.files import noting_inputs, whole_file
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
-from slam.run.panels import error_panels, map_panels, path_panel, time_panel, wrapped
+from slam.run.panels import draw_errors, draw_maps, draw_paths, draw_times
 from slam.run.results import facts
 from slam.run.run_data import RunData
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: The picture that a run leaves.
 PICTURE = "summary.png"
 
-_MOST_MAPS = 3  # side by side in the summary
-_PAGE = 8.0  # [in] below which text is small, as in a paper
-_COLUMN = 5.0  # [in] below which panels do not stand side by side
-_STYLE: dict[str, Any] = {
-    "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 10, "legend.fontsize": 8, "svg.hashsalt": "slam",
-    "pdf.fonttype": 42, "text.parse_math": False,
-}  # fmt: skip
-_SMALL_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
-
 #: Widths that a picture may be given [mm].
 NARROWEST, WIDEST = 50.0, 1000.0
+
+_MOST_MAPS = 3  # side by side in the summary
+_PAGE = 8.0  # [in] below which text is small, as in a paper
+_LETTERS = 13  # an inch of the head holds
+_COLUMN = 5.0  # [in] below which panels do not stand side by side
+_STYLE: dict[str, Any] = {
+    "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 10, "legend.fontsize": 8, "legend.edgecolor": "none",
+    "svg.hashsalt": "slam", "pdf.fonttype": 42, "text.parse_math": False,
+}  # fmt: skip
+_SMALL_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
 
 #: What a file of a format says of itself: nothing that changes from run to run.
 _METADATA: dict[str, dict[str, Any]] = {
@@ -125,12 +126,12 @@ def drawn(runs: Sequence[RunData], kind: str, width: float | None, titles: bool 
     """A picture, so wide [mm], and its titles in one text; maps side by side keep the names of their runs anyway."""
     with _style(width):
         figure = KINDS[kind](runs, None if width is None else width / 25.4)
-        texts = [" ".join(axis.get_title().split()) for axis in figure.axes]
+        texts = [axis.get_title() for axis in figure.axes]
         if not titles:
             figure.suptitle("")
-            names = [run.name for run in runs] if kind == "map" and len(runs) > 1 else [""] * len(figure.axes)
-            for axis, name in zip(figure.axes, names if kind != "summary" else ()):
-                axis.set_title(name)
+            names = [run.name for run in runs] if kind == "map" and len(runs) > 1 else []
+            for i, axis in enumerate(figure.axes if kind != "summary" else ()):
+                axis.set_title(names[i] if i < len(names) else "")
     return figure, ". ".join([_title(runs), *filter(None, texts)]) + "."
 
 
@@ -141,57 +142,66 @@ def _style(width: float | None) -> AbstractContextManager[None]:
     return rc_context(_STYLE | (_SMALL_STYLE if width is not None and width / 25.4 < _PAGE else {}))
 
 
+def _figure(width: float, rows: list[list[Any]], heights: Sequence[float], more: float = 0) -> dict[str, Axes]:
+    """Panels by name, in rows so high [in]; `more` is room above them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, sum(heights) + more), layout="constrained")
+    return figure.subplot_mosaic(rows, height_ratios=heights)
+
+
 def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
     """All at a glance: path and maps above, errors and times below; in a column one below the other."""
-    maps = runs[:_MOST_MAPS]
-    column = width is not None and width < _COLUMN
-    width = width or max(10.0, 4.4 * (1 + len(maps)))
+    maps = [f"map {k}" for k in range(len(runs[:_MOST_MAPS]))]
+    column, count = width is not None and width < _COLUMN, 1 + len(maps)
+    wide = width or max(10.0, 4.4 * count)
     lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
-    text = "\n".join(wrapped(line, 1.1 * width) for line in lines)
-    head = 0.18 * (1 + text.count("\n"))
+    text = "\n".join(textwrap.fill(line, int(_LETTERS * wide)) for line in lines)
+    rows: list[list[Any]] = [[[["path", *maps]]], ["key"], [[["position", "time"], ["rotation", "time"]]]]
+    heights = [wide / count, 0.5, 4.2]
     if column:
-        heights = [0.9 * width, 0.95 * width * len(maps), max(width, 4.8), 1.9 + 0.4 * len(runs)]
-        figure = _figure(width, sum(heights) + head)
-        first, second, left, right = np.asarray(figure.subfigures(4, 1, height_ratios=heights))
-        path_axis, map_axes = first.subplots(), list(second.subplots(len(maps), 1, squeeze=False).ravel())
-    else:
-        side = width / (1 + len(maps))
-        figure = _figure(width, 0.95 * side + 5.4 + head)
-        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(0.95 * side + 0.4, 5.0)))
-        left, right = np.asarray(below.subfigures(1, 2, width_ratios=(3, 2)))
-        path_axis, *map_axes = above.subplots(1, 1 + len(maps))
-    path_panel(path_axis, runs)
-    map_panels(map_axes, maps)
-    error_panels(left.subplots(4, 1, sharex=True), runs)
-    time_panel(right.subplots(), runs)
+        rows = [[name] for name in ("path", *maps, "key", "position", "rotation", "time")]
+        heights = [0.9 * wide, *[0.95 * wide] * len(maps), 1.0, 1.6, 1.6, 2.6]
+    panels = _figure(wide, rows, heights, 0.17 * text.count("\n") + 0.3)
+    draw_paths(panels["path"], runs)
+    draw_maps([panels[name] for name in maps], runs, panels["key"])
+    draw_errors([panels["position"], panels["rotation"]], runs)
+    draw_times(panels["time"], runs)
+    figure = _of(panels)
     figure.suptitle(text, x=0.01, ha="left")
     return figure
 
 
+def _of(panels: dict[str, Axes]) -> Figure:
+    return next(iter(panels.values())).get_figure(root=True)  # type: ignore[return-value]
+
+
 def _path(runs: Sequence[RunData], width: float | None) -> Figure:
-    figure = _figure(width or 5.0, 0.92 * (width or 5.0))
-    path_panel(figure.subplots(), runs)
-    return figure
+    panels = _figure(width or 5.0, [["path"]], [0.92 * (width or 5.0)])
+    draw_paths(panels["path"], runs)
+    return _of(panels)
 
 
 def _map(runs: Sequence[RunData], width: float | None) -> Figure:
-    rows, columns = (len(runs), 1) if width is not None and width < _COLUMN else (1, len(runs))
-    width = width or 5.0 * columns
-    figure = _figure(width, width / columns * rows + 0.3)
-    map_panels(list(figure.subplots(rows, columns, squeeze=False).ravel()), runs)
-    return figure
+    names, wide = [f"{run.name} {k}" for k, run in enumerate(runs)], width or 5.0 * len(runs)
+    if wide < _COLUMN:
+        panels = _figure(wide, [*([name] for name in names), ["key"]], [*[wide] * len(runs), 0.9])
+    else:
+        panels = _figure(wide, [names, ["key"] * len(runs)], [wide / len(runs), 0.5])
+    draw_maps([panels[name] for name in names], runs, panels["key"])
+    return _of(panels)
 
 
 def _errors(runs: Sequence[RunData], width: float | None) -> Figure:
-    figure = _figure(width or 6.0, max(width, 4.8) if width else 5.6)  # below 4.8 in the labels of the axes overlap
-    error_panels(figure.subplots(4, 1, sharex=True), runs)
-    return figure
+    panels = _figure(width or 6.0, [["position"], ["rotation"]], [1.8, 1.8])
+    draw_errors([panels["position"], panels["rotation"]], runs)
+    return _of(panels)
 
 
 def _time(runs: Sequence[RunData], width: float | None) -> Figure:
-    figure = _figure(width or 6.0, 1.9 + 0.4 * len(runs))
-    time_panel(figure.subplots(), runs)
-    return figure
+    panels = _figure(width or 6.0, [["time"]], [2.6])
+    draw_times(panels["time"], runs)
+    return _of(panels)
 
 
 #: Figures by name.
@@ -206,9 +216,3 @@ def _title(runs: Sequence[RunData]) -> str:
     frames = ", ".join(dict.fromkeys(f"{len(run.status)} frames" for run in runs))
     frames += "".join(f"; {name}: {count} not tracked" for name, count in lost.items() if count)
     return f"{runs[0].sequence}: {frames}"
-
-
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
