@@ -119,7 +119,6 @@ def run_command(
     viewer: Annotated[_Text, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
     draw: Annotated[_File, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
     draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
-    overlap: Annotated[bool, option("Extract the next frame while this one is estimated; same results.")] = True,
     live: Annotated[bool, option("Frames at their own rate; late ones are dropped.", None, "--live")] = False,
     picture: _Picture = True,
     overwrite: _Overwrite = False,
@@ -149,7 +148,7 @@ def run_command(
     shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
-        options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
+        options = replace(options, out=folder, record=record, save_map=save_map, live=live)
         written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
         require_outputs(written, [*inputs, *options.inputs], overwrite)
         if options.config.objects.mode != "off":
@@ -328,9 +327,10 @@ def list_command(
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
 def warm_up_command(quiet: _Quiet = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
+    from slam.commands.display import compiling
     from slam.run.warm_up import compiled_in_background, warm_up
 
-    with compiled_in_background(ONLINE[-1]):
+    with compiled_in_background(ONLINE[-1]), compiling(quiet):
         seconds = warm_up()
     if not quiet:
         print(f"kernels compiled in {seconds:.0f} s" if seconds else "all kernels were compiled already")

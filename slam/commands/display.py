@@ -18,12 +18,13 @@ from rich.table import Table
 from slam.data import FrameResult
 from slam.errors import SlamError
 from slam.run.results import rows, verdict_of_run
-from slam.runtime.compile_clock import working_time
+from slam.runtime.compile_clock import compile_clock, working_time
 
 if TYPE_CHECKING:
     from slam.compare.tables import Group
 
 _console = Console()
+_COMPILING = "compiling, once on this machine"
 _COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}  # of badges, by direction
 
 
@@ -35,22 +36,30 @@ def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
 
 @contextmanager
 def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[FrameResult], None]]:
-    """A progress bar over frames, without an end where `total` is None; it appears with the first one."""
-    status = TextColumn("{task.fields[rate]} {task.fields[status]}")
-    bar = _bar(status, quiet=quiet, get_time=working_time)
-    task = bar.add_task(title, total=total, rate="", status="")
+    """A progress bar over frames, without an end where `total` is None; it appears with the first one.
+
+    Kernels that have to be compiled have a bar of their own above it.
+    """
+    bar = _bar(TextColumn("{task.fields[status]}"), quiet=quiet, get_time=working_time)
+    kernels = bar.add_task(_COMPILING, total=None, status="", visible=False)
+    task = bar.add_task(title, total=total, status="")
+
+    def compiling(begun: int, of: int) -> None:
+        bar.start()
+        bar.update(kernels, completed=begun, total=of, visible=True)
 
     def frame(result: FrameResult) -> None:
         bar.start()
-        speed = bar.tasks[0].speed
+        speed = bar.tasks[task].speed
         said = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
-        bar.update(task, advance=1, rate=f"{speed:.1f} Hz" if speed else "", status=said)
+        bar.update(task, advance=1, status=f"{speed:.1f} Hz {said}" if speed else said)
 
-    try:
-        yield frame
-    finally:
-        if bar.live.is_started:
-            bar.stop()
+    with _watching(compiling):
+        try:
+            yield frame
+        finally:
+            if bar.live.is_started:
+                bar.stop()
 
 
 @contextmanager
@@ -59,6 +68,24 @@ def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
     with _bar(quiet=quiet) as bar:
         task = bar.add_task(title, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+@contextmanager
+def compiling(quiet: bool = False) -> Iterator[None]:
+    """A bar that counts kernels which are compiled meanwhile; their number is that of the modules loaded so far."""
+    with _bar(quiet=quiet) as bar:
+        task = bar.add_task(_COMPILING, total=None)
+        with _watching(lambda begun, of: bar.update(task, completed=begun, total=of)):
+            yield
+
+
+@contextmanager
+def _watching(watch: Callable[[int, int], None]) -> Iterator[None]:
+    compile_clock.watch = watch
+    try:
+        yield
+    finally:
+        compile_clock.watch = None
 
 
 def print_conclusions(every: Sequence[Group], caution: str) -> None:

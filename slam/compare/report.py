@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,8 @@ from slam.compare import figures, wording
 from slam.compare.plan import Plan
 from slam.compare.statistics import FEWEST, LEVEL, Verdict
 from slam.compare.sweep import SWEEP, Run
-from slam.compare.tables import RUN_COLUMNS, Group, count_tests, most_tests, run_rows
+from slam.compare.tables import Group, count_tests, most_tests
 from slam.files import read_object, write_text
-from slam.run.results import BY_KEY, number
 from slam.run.schema import STAGE_NAMES
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -30,7 +28,6 @@ def write_report(plan: Plan, every: Sequence[Group], runs: Sequence[Run], out: P
     from jinja2 import Environment, FileSystemLoader
     from markupsafe import Markup
 
-    keys = [key for key in BY_KEY if any(key in run.metrics for run in runs)]
     timed = {stage for run in runs for stage in run.milliseconds}
     stages = {"total": "whole frame"} | {stage: name for stage, name in STAGE_NAMES.items() if stage in timed}
     environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
@@ -49,11 +46,8 @@ def write_report(plan: Plan, every: Sequence[Group], runs: Sequence[Run], out: P
         workers=workers,
         stages=stages.values(),
         times=[_times(group, backend, stages) for group in every for backend in group.runs],
-        run_columns=(*RUN_COLUMNS, *keys),
-        run_rows=run_rows(runs, keys, number),
         command=f"{plan.command()} --out DIR",
         versions=read_object(out / SWEEP)["versions"],
-        settings=_settings(runs),
         script=Markup((TEMPLATES / "map3d.js").read_text(encoding="utf-8")),
     )
     write_text(out / "report.html", text)
@@ -82,13 +76,3 @@ def _times(group: Group, backend: str, stages: dict[str, str]) -> tuple[str, ...
     values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in stages)
     cells = (f"{np.median(each):.2f}" if each else "–" for each in values)
     return (group.sequence, group.variant.name, group.mode, backend, *cells)
-
-
-def _settings(runs: Sequence[Run]) -> str:
-    """``config.json`` of the first run of each variant and back end that has one."""
-    shown: dict[str, Any] = {}
-    for run in runs:
-        name = f"{run.trial.variant.name} · {run.trial.backend}"
-        if name not in shown and (run.folder / "config.json").exists():
-            shown[name] = read_object(run.folder / "config.json")
-    return json.dumps(shown, indent=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -99,24 +99,21 @@ def most_tests(plan: Plan) -> int:
 def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None:
     """Write runs.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
     stages = list(dict.fromkeys(stage for run in runs for stage in run.milliseconds))
-    times = [*RUN_COLUMNS, *(f"ms_{stage}" for stage in stages)]
-    for name, columns, rows in (
-        ("runs", (*RUN_COLUMNS, *BY_KEY), run_rows(runs, BY_KEY, _number)),
-        ("differences", DIFFERENCE_COLUMNS, [row for group in every for row in _difference_rows(group)]),
-        ("timings", times, [(*_head(r), *(_number(r.milliseconds.get(s, np.nan)) for s in stages)) for r in runs]),
-    ):
-        write_text(out / f"{name}.csv", csv_rows([columns, *rows]))
+    differences = [row for group in every for row in _difference_rows(group)]
+    tables = {
+        "runs": [(*RUN_COLUMNS, *BY_KEY), *(_row(run, run.metrics, BY_KEY) for run in runs)],
+        "differences": [DIFFERENCE_COLUMNS, *differences],
+        "timings": [(*RUN_COLUMNS, *(f"ms_{s}" for s in stages)), *(_row(r, r.milliseconds, stages) for r in runs)],
+    }
+    for name, rows in tables.items():
+        write_text(out / f"{name}.csv", csv_rows(rows))
 
 
-def run_rows(runs: Sequence[Run], keys: Iterable[str], text: Callable[[float], str]) -> list[tuple[str, ...]]:
-    """A row per run: `RUN_COLUMNS`, and its figures by their keys, as `text` writes them."""
-    return [(*_head(run), *(text(run.metrics.get(key, np.nan)) for key in keys)) for run in runs]
-
-
-def _head(run: Run) -> tuple[str, ...]:
-    """Cells of `RUN_COLUMNS`."""
+def _row(run: Run, values: Mapping[str, float], keys: Iterable[str]) -> tuple[str, ...]:
+    """Cells of `RUN_COLUMNS`, and values by their keys."""
     t = run.trial
-    return t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
+    head = t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
+    return *head, *(_number(values.get(key, np.nan)) for key in keys)
 
 
 def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:
