@@ -206,8 +206,8 @@ def plot_command(
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
     from slam.run.plots import plot_folders
 
-    for file, caption in plot_folders(folders, out, figure, width, overwrite):
-        print(f"{file}: {caption}")
+    file, caption = plot_folders(folders, out, figure, width, overwrite)
+    print(f"{file}: {caption}")
 
 
 @app.command("settings", short_help="List all settings.")
@@ -234,12 +234,12 @@ def compare_command(
     replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
     scheduler: Annotated[_Text, option("A Dask scheduler to be used.", "ADDRESS")] = None,
-    quick: Annotated[bool, option("30 frames, 2 trials: does it work?", None, "--quick")] = False,
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
     from slam.commands import compare as command
+    from slam.commands.run import command_line
     from slam.compare.plan import Plan
     from slam.run.options import parse_frames
     from slam.sequences import with_mask
@@ -249,7 +249,7 @@ def compare_command(
     variants = command.variants_of(names[1], variant or [], settings or [])
     plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
     with leaving("trials done so far are kept: the same command continues"):
-        command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet, overwrite)
+        command.compare(plan, out, workers, scheduler, quiet, overwrite, command_line())
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from slam.compare.plan import CLOSED_LOOP, Plan, Trial, Variant, is_world, parse_variant
@@ -20,7 +19,6 @@ from slam.runtime.cores import available_cores
 from slam.sequences.faults import said_before
 from slam.settings import require_settable
 
-_QUICK_FRAMES, _QUICK_TRIALS = 30, 2
 _MOST_WORKERS = 1024
 _TRIED = 15  # frames by which the time of a comparison is told
 
@@ -39,13 +37,6 @@ def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Seq
     return tuple(every)
 
 
-def quick(plan: Plan) -> Plan:
-    """The plan cut down to see whether it works."""
-    stop = plan.start + _QUICK_FRAMES
-    stop = stop if plan.stop is None else min(plan.stop, stop)
-    return replace(plan, trials=min(plan.trials, _QUICK_TRIALS), stop=stop)
-
-
 def compare(
     plan: Plan,
     out: Path,
@@ -53,6 +44,7 @@ def compare(
     address: str | None = None,
     quiet: bool = False,
     overwrite: bool = False,
+    command: str = "",
 ) -> list[Run]:
     """Run a comparison to its end and leave ``report.html``, tables and figures in `out`.
 
@@ -63,6 +55,7 @@ def compare(
         address: of a Dask scheduler to be used instead.
         quiet: show nothing.
         overwrite: run all again, and replace files that are there.
+        command: what was typed, for the report.
 
     Raises:
         SlamError: bad input; nothing has been run then.
@@ -97,7 +90,7 @@ def compare(
         runs = sweep(plan, out, scheduler, ended, overwrite)
     every = groups(plan, runs)
     write_tables(every, runs, out)
-    report = write_report(plan, every, runs, out, where)
+    report = write_report(plan, every, runs, out, where, command)
     if not quiet:
         print_conclusions(every, limits)
         print(f"{len(runs)} runs, {sum(not run.completed for run in runs)} failed. Report: {report}")

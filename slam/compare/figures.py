@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST_TICKS = 15
+_SHORT = 20  # letters of names that stand side by side
 _WIDTH = 132.0  # [mm] about that of a phone: text stays readable where the picture fills the screen
 _MOST_LANDMARKS, _MOST_POSES = 700, 600  # of a run in the map that can be turned
 
@@ -166,7 +167,9 @@ def _svg(figure: Figure) -> str:
     text = io.StringIO()
     with _style():
         axis = figure.axes[0]
-        if axis.get_legend() is None and axis.get_legend_handles_labels()[0]:
-            axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0))
+        names = axis.get_legend_handles_labels()[1]
+        if names and axis.get_legend() is None:
+            columns = 3 if max(map(len, names)) < _SHORT else 2
+            axis.legend(frameon=False, fontsize=8, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1.0))
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()

@@ -20,10 +20,13 @@ from slam.run.schema import STAGE_NAMES
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def write_report(plan: Plan, every: Sequence[Group], runs: Sequence[Run], out: Path, workers: str) -> Path:
+def write_report(
+    plan: Plan, every: Sequence[Group], runs: Sequence[Run], out: Path, workers: str, command: str = ""
+) -> Path:
     """Write ``report.html`` into a comparison's folder, and return its path; it needs no network and no other file.
 
-    `runs` are all of the plan's, also those that failed; `workers` says in words where trials ran.
+    `runs` are all of the plan's, also those that failed; `workers` says in words where trials ran, `command` is what
+    was typed.
     """
     from jinja2 import Environment, FileSystemLoader
     from markupsafe import Markup
@@ -46,7 +49,7 @@ def write_report(plan: Plan, every: Sequence[Group], runs: Sequence[Run], out: P
         workers=workers,
         stages=stages.values(),
         times=[_times(group, backend, stages) for group in every for backend in group.runs],
-        command=f"{plan.command()} --out DIR",
+        command=command,
         versions=read_object(out / SWEEP)["versions"],
         script=Markup((TEMPLATES / "map3d.js").read_text(encoding="utf-8")),
     )

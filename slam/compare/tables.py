@@ -100,7 +100,7 @@ def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None
     """Write runs.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
     stages = list(dict.fromkeys(stage for run in runs for stage in run.milliseconds))
     differences = [row for group in every for row in _difference_rows(group)]
-    tables = {
+    tables: dict[str, list[tuple[object, ...]]] = {
         "runs": [(*RUN_COLUMNS, *BY_KEY), *(_row(run, run.metrics, BY_KEY) for run in runs)],
         "differences": [DIFFERENCE_COLUMNS, *differences],
         "timings": [(*RUN_COLUMNS, *(f"ms_{s}" for s in stages)), *(_row(r, r.milliseconds, stages) for r in runs)],

@@ -127,13 +127,9 @@ def caution(trials: int, tests: int) -> str:
         return ""
     more = f"{enough} trials are enough for all figures (--trials {enough})."
     if trials == 1:
-        return (
-            "One trial cannot tell a difference from chance: a recorded sequence has one, synthetic worlds have as "
-            f"many as are asked for. {more}"
-        )
+        return f"One trial cannot tell a difference from chance: a recorded sequence has no more. In worlds {more}"
     if trials < fewest(1):
-        chance = f"chance alone does as much in {200 / 2**trials:.2g} % of such comparisons"
-        return f"With {trials} trials nothing can be certain: even where all agree, {chance}. {more}"
+        return f"With {trials} trials nothing can be certain, even where all agree. {more}"
     few = certain_of(trials)
     at_most = "a single figure is" if few == 1 else f"up to {few} figures are"
     return f"With {trials} trials a difference that has the same sign in all is certain where {at_most} tested. {more}"

@@ -51,42 +51,40 @@ _METADATA: dict[str, dict[str, Any]] = {
 
 def plot_folders(
     folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None, overwrite: bool = False
-) -> list[tuple[Path, str]]:
-    """Draw finished runs, those of one sequence in one picture, as `plot` does; returns files and captions.
+) -> tuple[Path, str]:
+    """Draw finished runs of one sequence in one picture, as `plot` does; returns the file and its caption.
 
-    Without `out`, a PNG goes to the first folder of each sequence. Raises SlamError where a folder is none of a
-    finished run, or a file cannot be written.
+    Without `out`, a PNG goes to the first folder. Raises SlamError where a folder is none of a finished run, where runs
+    are of several sequences, or where a file cannot be written.
     """
     with noting_inputs() as inputs:
-        groups = _read(folders)
-    if out is not None and len(groups) > 1:
-        names = ", ".join(runs[0].sequence for runs in groups)
-        raise ConfigurationError(f"runs of {len(groups)} sequences ({names}) do not go into one file: leave out --out")
-    files = [out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png") for runs in groups]
-    require_outputs([Output(file, "--out", makes_folder=True) for file in files], inputs, overwrite)
-    return [(file, plot(runs, file, kind, width)) for runs, file in zip(groups, files)]
+        runs = _read(folders)
+    sequences = list(dict.fromkeys(run.sequence for run in runs))
+    if len(sequences) > 1:
+        raise ConfigurationError(
+            f"runs of {len(sequences)} sequences ({', '.join(sequences)}): draw those of one at a time"
+        )
+    file = out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png")
+    require_outputs([Output(file, "--out", makes_folder=True)], inputs, overwrite)
+    return file, plot(runs, file, kind, width)
 
 
 def leave_picture(folder: Path) -> None:
     """The picture of a run that has just ended; where there is nothing to draw a warning says so."""
     try:
-        plot(_read([folder])[0], folder / PICTURE)
+        plot(_read([folder]), folder / PICTURE)
     except SlamError as error:
         logging.getLogger(__name__).warning("no picture: %s", error)
 
 
-def _read(folders: Sequence[Path]) -> list[list[RunData]]:
-    """Finished runs by sequence, in the order given; each has the shortest name that tells it from the others."""
-    found: dict[str, list[RunData]] = {}
-    for folder in folders:
-        run = RunData.read(folder, folder.resolve().name)
-        found.setdefault(run.sequence, []).append(run)
-    for runs in found.values():
-        if len({run.backend for run in runs}) == len(runs):
-            runs[:] = [replace(run, name=run.backend) for run in runs]
-        elif len({run.name for run in runs}) < len(runs):
-            runs[:] = [replace(run, name=f"{run.name} ({i})") for i, run in enumerate(runs, start=1)]
-    return list(found.values())
+def _read(folders: Sequence[Path]) -> list[RunData]:
+    """Finished runs, in the order given; each has the shortest name that tells it from the others."""
+    runs = [RunData.read(folder, folder.resolve().name) for folder in folders]
+    if len({run.backend for run in runs}) == len(runs):
+        return [replace(run, name=run.backend) for run in runs]
+    if len({run.name for run in runs}) == len(runs):
+        return runs
+    return [replace(run, name=f"{run.name} ({i})") for i, run in enumerate(runs, start=1)]
 
 
 def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: float | None = None) -> str:
@@ -146,7 +144,8 @@ def _figure(width: float, rows: list[list[Any]], heights: Sequence[float], more:
     """Panels by name, in rows so high [in]; `more` is room above them."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, sum(heights) + more), layout="constrained")
+    figure = Figure(figsize=(width, sum(heights) + more))
+    figure.set_layout_engine("constrained", w_pad=0.08)
     return figure.subplot_mosaic(rows, height_ratios=heights)
 
 

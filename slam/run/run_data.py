@@ -46,7 +46,6 @@ class RunData:
     truth_is_exact: bool  # whether the truth has no errors of its own: that of a world
     loops: np.ndarray  # rows of `final` whose places are the same (L, 2), the later one first
     refused: np.ndarray  # rows of `final` whose places only looked alike (L, 2), the later one first
-    keyframes: np.ndarray  # rows of `final` (K,)
     old: Array  # landmarks that had left the map before the end (M, 3) [m]
     bodies: Mapping[str, Array]  # where moving bodies were measured (B, 3) [m], by id
     summary: Mapping[str, Any]  # of the run; empty where there is none
@@ -73,12 +72,10 @@ class RunData:
         sd = _numbers(located, ("sd_x", "sd_y", "sd_z", "sd_rotation"))
         config, stamps = read_object(folder / "config.json"), {row["frame"]: float(row["stamp"]) for row in frames}
 
-        def rows_at(stamps: Any) -> np.ndarray:
-            return np.searchsorted(final.stamps, np.array(stamps, float) - 1e-9).clip(0, max(len(final) - 1, 0))
-
         def pairs(column: str) -> np.ndarray:
             found = [(stamps[row["frame"]], stamps[row[column]]) for row in frames if (row[column] or "").isdigit()]
-            return rows_at(found).reshape(-1, 2)
+            rows = np.searchsorted(final.stamps, np.array(found, float).reshape(-1, 2) - 1e-9)
+            return rows.clip(0, max(len(final) - 1, 0))
 
         bodies: dict[str, list[list[float]]] = {}
         for _, body, position in read_objects(folder):
@@ -105,7 +102,6 @@ class RunData:
             truth_is_exact=config["format"] == "synthetic",
             loops=pairs("loop"),
             refused=pairs("refused"),
-            keyframes=rows_at([float(row["stamp"]) for row in frames if row["keyframe"] == "1"]),
             old=_numbers(_rows(old) if old.exists() else [], ("x", "y", "z")),
             bodies={body: np.array(positions) for body, positions in bodies.items()},
             summary=summary,
