@@ -95,7 +95,7 @@ def print_conclusions(every: Sequence[Group], caution: str) -> None:
     used = set()
     for group in every:
         _say(f"\n{group.name}", "bold")
-        for text in filter(None, (*wording.in_short(group), wording.failed(group))):
+        for text in filter(None, (*wording.sentences(group), wording.failed(group))):
             _say(text)
         table = _table("", group.runs)
         for row in (wording.row(group, metric) for metric in group.metrics if metric.main):

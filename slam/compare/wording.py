@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,20 +69,21 @@ def _cell(d: Difference) -> Cell:
     return Cell("less than 1 %" if equal else d.verdict.value, "" if equal else direction, *_difference(d), p, p_holm)
 
 
-def in_short(group: Group) -> list[str]:
-    """Which back end is better in what, a sentence for each but the reference: in the main figures that differ."""
-    reference, *others = group.runs
-    sentences = []
-    for other in others:
-        differences = [group.differences(metric)[other] for metric in group.metrics if metric.main]
-        told = [d for d in differences if d.verdict in (Verdict.CERTAIN, Verdict.LIKELY) and not _is_trifle(d)]
-        parts = []
-        for better, first, second in ((True, other, reference), (False, reference, other)):
-            if names := [f"{_name(d.metric)} ({d.verdict.value})" for d in told if d.better is better]:
-                parts.append(f"{first} is better than {second} in {', '.join(names)}")
-        nothing = f"No difference between {reference} and {other} can be concluded"
-        sentences.append(f"{'; '.join(parts) or nothing}.")
-    return sentences
+def sentences(group: Group) -> list[str]:
+    """`in_short` of each back end but the reference."""
+    first, *others = group.runs
+    return [in_short([group.differences(metric)[other] for metric in group.metrics], first, other) for other in others]
+
+
+def in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
+    """Which of two back ends is better in what, in one sentence: in the main figures that can be told apart."""
+    sure = (Verdict.CERTAIN, Verdict.LIKELY)
+    told = [d for d in differences if d.metric.main and d.verdict in sure and not _is_trifle(d)]
+    parts = []
+    for better, first, second in ((True, other, reference), (False, reference, other)):
+        if names := [f"{_name(d.metric)} ({d.verdict.value})" for d in told if d.better is better]:
+            parts.append(f"{first} is better than {second} in {', '.join(names)}")
+    return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
 
 
 def failed(group: Group) -> str:

@@ -98,7 +98,7 @@ OBJECT_TABLE = _table(
 #: Landmarks that had left the map before the end.
 OLD_LANDMARKS = "landmarks_old.csv"
 
-OLD_TABLE = LANDMARK_TABLE[:2]
+OLD_TABLE = LANDMARK_TABLE[:4]  # id, x, y, z
 
 #: Files that are tables, with their columns.
 TABLES: dict[str, tuple[Column, ...]] = {
