@@ -93,6 +93,19 @@ def common_options(version: _Version = False) -> None:
     """Options of the command itself."""
 
 
+@app.command("demo", short_help="Try three back ends on a built-in scene.")
+def demo_command(
+    out: _Out = Path("slam_demo"),
+    frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
+    overwrite: _Overwrite = False,
+    quiet: _Quiet = False,
+) -> None:
+    """Run three back ends on a built-in scene, compare them, and draw pictures."""
+    from slam.commands.demo import demo
+
+    demo(out, frames, quiet, overwrite)
+
+
 @app.command("run", short_help="Run one sequence through one back end.")
 def run_command(
     sequence: Annotated[
@@ -334,16 +347,3 @@ def warm_up_command(quiet: _Quiet = False) -> None:
         seconds = warm_up()
     if not quiet:
         print(f"kernels compiled in {seconds:.0f} s" if seconds else "all kernels were compiled already")
-
-
-@app.command("demo", short_help="Try three back ends on a built-in scene.")
-def demo_command(
-    out: _Out = Path("slam_demo"),
-    frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
-    overwrite: _Overwrite = False,
-    quiet: _Quiet = False,
-) -> None:
-    """Run three back ends on a built-in scene, compare them, and draw pictures."""
-    from slam.commands.demo import demo
-
-    demo(out, frames, quiet, overwrite)
