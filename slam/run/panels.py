@@ -206,5 +206,5 @@ def draw_times(axis: Axes, runs: Sequence[RunData]) -> None:
         axis.barh(at, [medians[stage][i] for stage in stages], height=high, color=colour, label=name)
     axis.set_yticks(range(len(stages)), [STAGE_NAMES[stage] for stage in stages])
     axis.invert_yaxis()
-    axis.set(title="Median time of a frame and of its stages", xlabel="time [ms]")
+    axis.set(title="Median time of a frame", xlabel="time [ms]")
     axis.legend(framealpha=0.8, loc="lower right")

@@ -124,7 +124,7 @@ def drawn(runs: Sequence[RunData], kind: str, width: float | None, titles: bool 
     """A picture, so wide [mm], and its titles in one text; maps side by side keep the names of their runs anyway."""
     with _style(width):
         figure = KINDS[kind](runs, None if width is None else width / 25.4)
-        texts = [axis.get_title() for axis in figure.axes]
+        texts = [" ".join(axis.get_title().split()) for axis in figure.axes]
         if not titles:
             figure.suptitle("")
             names = [run.name for run in runs] if kind == "map" and len(runs) > 1 else []
@@ -159,13 +159,16 @@ def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
     rows: list[list[Any]] = [[[["path", *maps]]], ["key"], [[["position", "time"], ["rotation", "time"]]]]
     heights = [wide / count, 0.5, 4.2]
     if column:
-        rows = [[name] for name in ("path", *maps, "key", "position", "rotation", "time")]
-        heights = [0.9 * wide, *[0.95 * wide] * len(maps), 1.0, 1.6, 1.6, 2.6]
+        rows = [[[[name]]] for name in ("path", *maps, "key")]  # each as wide as it can
+        rows += [[[["position"], ["rotation"]]], [[["time"]]]]
+        heights = [0.9 * wide, *[0.95 * wide] * len(maps), 1.0, 3.2, 2.6]
     panels = _figure(wide, rows, heights, 0.17 * text.count("\n") + 0.3)
     draw_paths(panels["path"], runs)
     draw_maps([panels[name] for name in maps], runs, panels["key"])
     draw_errors([panels["position"], panels["rotation"]], runs)
     draw_times(panels["time"], runs)
+    for axis in panels.values():
+        axis.set_title(textwrap.fill(axis.get_title(), int(_LETTERS * wide / (1 if column else 2))))
     figure = _of(panels)
     figure.suptitle(text, x=0.01, ha="left")
     return figure
