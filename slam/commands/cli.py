@@ -69,7 +69,6 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     with one_line_errors():
         logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
-        logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
         require_address_space()
         app(prog_name="slam")
 

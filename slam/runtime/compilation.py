@@ -86,7 +86,8 @@ class _Notice(event.Listener):
         if compile_clock.watch is not None:
             compile_clock.watch(compile_clock.begun, max(compile_clock.begun, compile_clock.kernels))
         elif compile_clock.begun == 1:
-            _LOG.info("compiling kernels, once on this machine; `slam warm-up` does it beforehand")
+            text = "compiling kernels, once on this machine, at most %d; `slam warm-up` does it beforehand"
+            _LOG.warning(text, max(1, compile_clock.kernels))
         self._collects = gc.isenabled()
         gc.disable()
 
