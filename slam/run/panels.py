@@ -185,7 +185,7 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         axis.grid(color="0.9", lw=0.5)
         axis.margins(x=0.01)
     axes[0].tick_params(labelbottom=False)
-    title = "Error of the online pose (solid), and the σ that it claims (dashed)"
+    title = "Error of the online pose (solid), claimed σ (dashed)"
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
     axes[-1].set_xlabel("time [s]")
     if len(runs) > 1:  # in the room above all lines

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +24,9 @@ from slam.run.run_data import RunData
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+#: Pictures by name.
+KINDS = ("summary", "path", "map", "errors", "time")
 
 #: The picture that a run leaves.
 PICTURE = "summary.png"
@@ -123,7 +126,7 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
 def drawn(runs: Sequence[RunData], kind: str, width: float | None, titles: bool = False) -> tuple[Figure, str]:
     """A picture, so wide [mm], and its titles in one text; maps side by side keep the names of their runs anyway."""
     with _style(width):
-        figure = KINDS[kind](runs, None if width is None else width / 25.4)
+        figure = _draw(kind, runs, None if width is None else width / 25.4)
         texts = [" ".join(axis.get_title().split()) for axis in figure.axes]
         if not titles:
             figure.suptitle("")
@@ -140,76 +143,55 @@ def _style(width: float | None) -> AbstractContextManager[None]:
     return rc_context(_STYLE | (_SMALL_STYLE if width is not None and width / 25.4 < _PAGE else {}))
 
 
-def _figure(width: float, rows: list[list[Any]], heights: Sequence[float], more: float = 0) -> dict[str, Axes]:
-    """Panels by name, in rows so high [in]; `more` is room above them."""
+def _layout(kind: str, maps: list[str], width: float | None) -> tuple[float, list[list[Any]], list[float]]:
+    """Width of a picture [in], names of its panels in rows, and heights of the rows [in].
+
+    Nested rows have margins of their own. In a narrow column panels stand one below the other.
+    """
+    column, count = width is not None and width < _COLUMN, len(maps)
+    if kind == "summary":
+        wide = width or max(10.0, 4.4 * (1 + count))
+        if column:
+            rows = [[[[name]]] for name in ("path", *maps, "key")] + [[[["position"], ["rotation"]]], [[["time"]]]]
+            return wide, rows, [0.9 * wide, *[0.95 * wide] * count, 1.0, 3.2, 2.6]
+        below = [["position", "time"], ["rotation", "time"]]
+        return wide, [[[["path", *maps]]], ["key"], [below]], [wide / (1 + count), 0.5, 4.2]
+    if kind == "map":
+        wide = width or 5.0 * count
+        if column:
+            return wide, [*([name] for name in maps), ["key"]], [*[wide] * count, 0.9]
+        return wide, [maps, ["key"] * count], [wide / count, 0.5]
+    if kind == "path":
+        return width or 5.0, [["path"]], [0.92 * (width or 5.0)]
+    if kind == "errors":
+        return width or 6.0, [["position"], ["rotation"]], [1.8, 1.8]
+    return width or 6.0, [["time"]], [2.6]
+
+
+def _draw(kind: str, runs: Sequence[RunData], width: float | None) -> Figure:
+    """The panels of a picture with all that is in them."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, sum(heights) + more))
-    figure.set_layout_engine("constrained", w_pad=0.08)
-    return figure.subplot_mosaic(rows, height_ratios=heights)
-
-
-def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
-    """All at a glance: path and maps above, errors and times below; in a column one below the other."""
-    maps = [f"map {k}" for k in range(len(runs[:_MOST_MAPS]))]
-    column, count = width is not None and width < _COLUMN, 1 + len(maps)
-    wide = width or max(10.0, 4.4 * count)
+    maps = [f"map {k}" for k in range(len(runs[:_MOST_MAPS] if kind == "summary" else runs))]
+    wide, rows, heights = _layout(kind, maps, width)
     lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
-    text = "\n".join(textwrap.fill(line, int(_LETTERS * wide)) for line in lines)
-    rows: list[list[Any]] = [[[["path", *maps]]], ["key"], [[["position", "time"], ["rotation", "time"]]]]
-    heights = [wide / count, 0.5, 4.2]
-    if column:
-        rows = [[[[name]]] for name in ("path", *maps, "key")]  # each as wide as it can
-        rows += [[[["position"], ["rotation"]]], [[["time"]]]]
-        heights = [0.9 * wide, *[0.95 * wide] * len(maps), 1.0, 3.2, 2.6]
-    panels = _figure(wide, rows, heights, 0.17 * text.count("\n") + 0.3)
-    draw_paths(panels["path"], runs)
-    draw_maps([panels[name] for name in maps], runs, panels["key"])
-    draw_errors([panels["position"], panels["rotation"]], runs)
-    draw_times(panels["time"], runs)
-    for axis in panels.values():
-        axis.set_title(textwrap.fill(axis.get_title(), int(_LETTERS * wide / (1 if column else 2))))
-    figure = _of(panels)
-    figure.suptitle(text, x=0.01, ha="left")
+    head = "\n".join(textwrap.fill(line, int(_LETTERS * wide)) for line in lines) if kind == "summary" else ""
+    figure = Figure(figsize=(wide, sum(heights) + (0.17 * head.count("\n") + 0.3 if head else 0.0)))
+    figure.set_layout_engine("constrained", w_pad=0.08)
+    panels: dict[str, Axes] = figure.subplot_mosaic(rows, height_ratios=heights)
+    if "path" in panels:
+        draw_paths(panels["path"], runs)
+    if "key" in panels:
+        draw_maps([panels[name] for name in maps], runs, panels["key"])
+    if "position" in panels:
+        draw_errors([panels["position"], panels["rotation"]], runs)
+    if "time" in panels:
+        draw_times(panels["time"], runs)
+    if head:
+        for axis in panels.values():
+            axis.set_title(textwrap.fill(axis.get_title(), int(_LETTERS * min(wide, 5.0))))
+        figure.suptitle(head, x=0.01, ha="left")
     return figure
-
-
-def _of(panels: dict[str, Axes]) -> Figure:
-    return next(iter(panels.values())).get_figure(root=True)  # type: ignore[return-value]
-
-
-def _path(runs: Sequence[RunData], width: float | None) -> Figure:
-    panels = _figure(width or 5.0, [["path"]], [0.92 * (width or 5.0)])
-    draw_paths(panels["path"], runs)
-    return _of(panels)
-
-
-def _map(runs: Sequence[RunData], width: float | None) -> Figure:
-    names, wide = [f"{run.name} {k}" for k, run in enumerate(runs)], width or 5.0 * len(runs)
-    if wide < _COLUMN:
-        panels = _figure(wide, [*([name] for name in names), ["key"]], [*[wide] * len(runs), 0.9])
-    else:
-        panels = _figure(wide, [names, ["key"] * len(runs)], [wide / len(runs), 0.5])
-    draw_maps([panels[name] for name in names], runs, panels["key"])
-    return _of(panels)
-
-
-def _errors(runs: Sequence[RunData], width: float | None) -> Figure:
-    panels = _figure(width or 6.0, [["position"], ["rotation"]], [1.8, 1.8])
-    draw_errors([panels["position"], panels["rotation"]], runs)
-    return _of(panels)
-
-
-def _time(runs: Sequence[RunData], width: float | None) -> Figure:
-    panels = _figure(width or 6.0, [["time"]], [2.6])
-    draw_times(panels["time"], runs)
-    return _of(panels)
-
-
-#: Figures by name.
-KINDS: dict[str, Callable[[Sequence[RunData], float | None], Figure]] = {
-    "summary": _summary, "path": _path, "map": _map, "errors": _errors, "time": _time,
-}  # fmt: skip
 
 
 def _title(runs: Sequence[RunData]) -> str:
