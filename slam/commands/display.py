@@ -72,11 +72,23 @@ def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
 
 @contextmanager
 def compiling(quiet: bool = False) -> Iterator[None]:
-    """A bar that counts kernels which are compiled meanwhile; their number is that of the modules loaded so far."""
-    with _bar(quiet=quiet) as bar:
-        task = bar.add_task(_COMPILING, total=None)
-        with _watching(lambda begun, of: bar.update(task, completed=begun, total=of)):
+    """A bar that counts kernels which are compiled meanwhile; it appears with the first one.
+
+    Their number is that of the modules loaded so far.
+    """
+    bar = _bar(quiet=quiet)
+    task = bar.add_task(_COMPILING, total=None)
+
+    def tell(begun: int, of: int) -> None:
+        bar.start()
+        bar.update(task, completed=begun, total=of)
+
+    with _watching(tell):
+        try:
             yield
+        finally:
+            if bar.live.is_started:
+                bar.stop()
 
 
 @contextmanager
