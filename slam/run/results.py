@@ -72,8 +72,8 @@ COMPLETED = Metric("completed", "runs completed", *_PERCENT, "higher", (), True)
 
 #: In the order of a comparison's tables. Times are apart: they differ from run to run.
 METRICS = (
-    Metric("ate_online_m", "path error, online (ATE)", *_MM, "lower", (*_ONLINE, "ATE RMSE [m]"), True),
-    Metric("ate_final_m", "path error, final (ATE)", *_MM, "lower", ("accuracy", "final", "ATE RMSE [m]"), True),
+    Metric("ate_online_m", "online path error (ATE)", *_MM, "lower", (*_ONLINE, "ATE RMSE [m]"), True),
+    Metric("ate_final_m", "final path error (ATE)", *_MM, "lower", ("accuracy", "final", "ATE RMSE [m]"), True),
     Metric("ate_without_loops_m", "path error without loops (ATE)", *_MM, "lower",
            ("accuracy", "online without loops", "ATE RMSE [m]")),
     Metric("loops_closed", "loops closed", place=("loops", "closed")),
@@ -86,8 +86,8 @@ METRICS = (
     *(Metric(key, f"NEES / 6 {over} (1 is right)", "", 1.0, "one", (*_HONEST, name), main)
       for key, (over, name, main) in _NEES.items()),
     Metric("nis_per_dof", "NIS / dof (up to 1 is right)", place=(*_HONEST, "NIS per degree of freedom")),
-    Metric("landmark_error_m", "landmark error, median", *_MM, "lower", (), True),
-    Metric("landmark_error_90_m", "landmark error, 90 % below", *_MM, "lower"),
+    Metric("landmark_error_m", "median landmark error", *_MM, "lower", (), True),
+    Metric("landmark_error_90_m", "landmark error, 90 % are below", *_MM, "lower"),
     Metric("association_precision", "association precision", *_PERCENT, "higher"),
     Metric("tracked", "frames tracked", *_PERCENT, "higher", (), True),
     Metric("map_size", "landmarks in the map, mean"),
