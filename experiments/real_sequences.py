@@ -25,7 +25,6 @@ from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
 from slam.run.options import RunOptions
-from slam.run.panels import widths
 from slam.run.runner import run
 from slam.sequences import open_sequence
 
@@ -70,7 +69,7 @@ def draw(names: dict[str, Path], out: Path) -> None:
             axis.set_axis_off()
         for axis, (name, folder) in zip(axes, names.items()):
             paths = [Trajectory.read_tum(folder_of(name, backend, out) / "trajectory.txt") for backend in ONLINE]
-            for backend, path, width in zip(ONLINE, paths, 1.5 * widths(len(ONLINE))):
+            for backend, path, width in zip(ONLINE, paths, 1.5 + 1.8 * np.arange(len(ONLINE))[::-1]):
                 axis.plot(*path.positions[:, [0, 2]].T, lw=width, label=backend)
             truth = true_path(folder, paths[0])
             if truth is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -119,10 +119,10 @@ class SystemConfig:
         except ValidationError as error:
             raise ConfigurationError(_refused(error.errors()[0])) from None
 
-    def with_settings(self, settings: list[str]) -> SystemConfig:
-        """A copy with ``section.key=value`` settings applied, for instance ``map.max_landmarks=300``.
+    def with_settings(self, settings: Sequence[str] | Mapping[str, Any]) -> SystemConfig:
+        """A copy with settings applied: ``{"map.max_landmarks": 300}``, or ``["map.max_landmarks=300"]``.
 
-        Values are JSON (``true``, ``3.5``, ``[1, 2]``) or plain words.
+        Values in texts are JSON (``true``, ``3.5``, ``[1, 2]``) or plain words.
 
         Raises:
             ConfigurationError: not of that form, an unknown key, a value of the wrong type or out of range.

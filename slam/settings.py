@@ -28,18 +28,22 @@ _LONGEST = 10_000  # characters of a setting
 _BRACKETS = 100  # in its value
 
 
-def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
+def apply_settings(tree: dict[str, Any], settings: Sequence[str] | Mapping[str, Any]) -> None:
     """Change leaves of a configuration's tree in place; types and ranges are checked when it is read back.
 
     Args:
         tree: as `slam.config.SystemConfig.to_json` writes it.
-        settings: texts such as ``"map.max_landmarks=300"``; values are JSON or plain words.
+        settings: texts such as ``"map.max_landmarks=300"``, whose values are JSON or plain words; or values by key.
 
     Raises:
         ConfigurationError: a text is not of that form, or its section or key is unknown.
     """
+    if isinstance(settings, Mapping):
+        for key, value in settings.items():
+            _set(tree, str(key).split("."), value, f"{key}={value}")
+        return
     if not isinstance(settings, (list, tuple)) or not all(isinstance(setting, str) for setting in settings):
-        raise ConfigurationError("settings must be a list of texts section.key=value")
+        raise ConfigurationError("settings must be a list of texts section.key=value, or a dict of values by key")
     for setting in settings:
         if len(setting) > _LONGEST:
             raise ConfigurationError(f"setting {setting!r} is longer than {_LONGEST} characters")

@@ -69,7 +69,6 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     with one_line_errors():
         logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
-        logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
         require_address_space()
         app(prog_name="slam")
 
@@ -91,6 +90,19 @@ _Version = Annotated[
 @app.callback()
 def common_options(version: _Version = False) -> None:
     """Options of the command itself."""
+
+
+@app.command("demo", short_help="Try three back ends on a built-in scene.")
+def demo_command(
+    out: _Out = Path("slam_demo"),
+    frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
+    overwrite: _Overwrite = False,
+    quiet: _Quiet = False,
+) -> None:
+    """Run three back ends on a built-in scene, compare them, and draw pictures."""
+    from slam.commands.demo import demo
+
+    demo(out, frames, quiet, overwrite)
 
 
 @app.command("run", short_help="Run one sequence through one back end.")
@@ -119,7 +131,6 @@ def run_command(
     viewer: Annotated[_Text, option("Show it in Rerun, or keep it for Rerun.", "live|FILE.rrd")] = None,
     draw: Annotated[_File, option("Draw landmarks and objects into the frames.", "DIR|FILE.mp4")] = None,
     draw_map: Annotated[bool, option("With --draw: the growing map beside each frame.", None, "--draw-map")] = False,
-    overlap: Annotated[bool, option("Extract the next frame while this one is estimated; same results.")] = True,
     live: Annotated[bool, option("Frames at their own rate; late ones are dropped.", None, "--live")] = False,
     picture: _Picture = True,
     overwrite: _Overwrite = False,
@@ -149,7 +160,7 @@ def run_command(
     shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
-        options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
+        options = replace(options, out=folder, record=record, save_map=save_map, live=live)
         written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
         require_outputs(written, [*inputs, *options.inputs], overwrite)
         if options.config.objects.mode != "off":
@@ -207,8 +218,8 @@ def plot_command(
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
     from slam.run.plots import plot_folders
 
-    for file, caption in plot_folders(folders, out, figure, width, overwrite):
-        print(f"{file}: {caption}")
+    file, caption = plot_folders(folders, out, figure, width, overwrite)
+    print(f"{file}: {caption}")
 
 
 @app.command("settings", short_help="List all settings.")
@@ -235,12 +246,12 @@ def compare_command(
     replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
     scheduler: Annotated[_Text, option("A Dask scheduler to be used.", "ADDRESS")] = None,
-    quick: Annotated[bool, option("30 frames, 2 trials: does it work?", None, "--quick")] = False,
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
     from slam.commands import compare as command
+    from slam.commands.run import command_line
     from slam.compare.plan import Plan
     from slam.run.options import parse_frames
     from slam.sequences import with_mask
@@ -250,7 +261,7 @@ def compare_command(
     variants = command.variants_of(names[1], variant or [], settings or [])
     plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
     with leaving("trials done so far are kept: the same command continues"):
-        command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet, overwrite)
+        command.compare(plan, out, workers, scheduler, quiet, overwrite, command_line())
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
@@ -328,22 +339,10 @@ def list_command(
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
 def warm_up_command(quiet: _Quiet = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
+    from slam.commands.display import compiling
     from slam.run.warm_up import compiled_in_background, warm_up
 
-    with compiled_in_background(ONLINE[-1]):
+    with compiled_in_background(ONLINE[-1]), compiling(quiet):
         seconds = warm_up()
     if not quiet:
         print(f"kernels compiled in {seconds:.0f} s" if seconds else "all kernels were compiled already")
-
-
-@app.command("demo", short_help="Try three back ends on a built-in scene.")
-def demo_command(
-    out: _Out = Path("slam_demo"),
-    frames: Annotated[int, option("Number of frames.", "N", min=10)] = 150,
-    overwrite: _Overwrite = False,
-    quiet: _Quiet = False,
-) -> None:
-    """Run three back ends on a built-in scene, compare them, and draw pictures."""
-    from slam.commands.demo import demo
-
-    demo(out, frames, quiet, overwrite)

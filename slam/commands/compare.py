@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from datetime import timedelta
-from math import ceil
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
+from slam.compare.plan import CLOSED_LOOP, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
 from slam.compare.sweep import Run, check, sweep
 from slam.compare.tables import groups, most_tests, write_tables
-from slam.compare.wording import caution, conclusions
+from slam.compare.trial import RESULT, run_trial
+from slam.compare.wording import caution
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.runtime.cores import available_cores
 from slam.sequences.faults import said_before
 from slam.settings import require_settable
 
-_QUICK_FRAMES, _QUICK_TRIALS = 30, 2
 _MOST_WORKERS = 1024
+_TRIED = 15  # frames by which the time of a comparison is told
 
 
 def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Sequence[str]) -> tuple[Variant, ...]:
@@ -38,13 +37,6 @@ def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Seq
     return tuple(every)
 
 
-def quick(plan: Plan) -> Plan:
-    """The plan cut down to see whether it works."""
-    stop = plan.start + _QUICK_FRAMES
-    stop = stop if plan.stop is None else min(plan.stop, stop)
-    return replace(plan, trials=min(plan.trials, _QUICK_TRIALS), stop=stop)
-
-
 def compare(
     plan: Plan,
     out: Path,
@@ -52,6 +44,7 @@ def compare(
     address: str | None = None,
     quiet: bool = False,
     overwrite: bool = False,
+    command: str = "",
 ) -> list[Run]:
     """Run a comparison to its end and leave ``report.html``, tables and figures in `out`.
 
@@ -62,6 +55,7 @@ def compare(
         address: of a Dask scheduler to be used instead.
         quiet: show nothing.
         overwrite: run all again, and replace files that are there.
+        command: what was typed, for the report.
 
     Raises:
         SlamError: bad input; nothing has been run then.
@@ -78,9 +72,11 @@ def compare(
     total, done = sum(frames[trial.sequence] for trial in plan.every), 0
     limits = caution(plan.trials if any(map(is_world, plan.sequences)) else 1, most_tests(plan))
     if not quiet:
-        heavy = [t.mode == CLOSED_LOOP and t.variant.frontend != SIMULATED for t in plan.every]  # images are rendered
-        seconds = sum(frames[t.sequence] * (0.12 if h else 0.03) for t, h in zip(plan.every, heavy)) / count
-        about = f": about {timedelta(seconds=10 * ceil(seconds / 10))}" if address is None else ""
+        about = (
+            ""
+            if address is not None
+            else f": about {_seconds(plan, frames) / count:.0f} s, by the first frames of each"
+        )
         print(f"{len(plan.every)} runs, {total} frames in all, {where}{about}")
         if most_tests(plan):
             print(limits or f"{plan.trials} trials are enough for certainty in all figures.", flush=True)
@@ -92,9 +88,24 @@ def compare(
             tell(done)
 
         runs = sweep(plan, out, scheduler, ended, overwrite)
-    write_tables(plan, runs, out)
-    report = write_report(plan, runs, out, where)
+    every = groups(plan, runs)
+    write_tables(every, runs, out)
+    report = write_report(plan, every, runs, out, where, command)
     if not quiet:
-        print_conclusions(list(map(conclusions, groups(plan, runs))), limits, plan.backends[0])
+        print_conclusions(every, limits)
         print(f"{len(runs)} runs, {sum(not run.completed for run in runs)} failed. Report: {report}")
     return runs
+
+
+def _seconds(plan: Plan, frames: Mapping[str, int]) -> float:
+    """How long all runs of a plan take one after the other [s], by the first frames of one of each kind."""
+    seconds = 0.0
+    for sequence in plan.sequences:
+        for variant in plan.variants:
+            trial = Trial(sequence, variant, plan.backends[0], 0, CLOSED_LOOP, plan.start, plan.start + _TRIED)
+            with said_before():
+                times = json.loads(run_trial(trial)[RESULT])["milliseconds"]
+            runs = len(plan.backends) * (plan.trials if is_world(sequence) else 1) * frames[sequence]
+            estimator = times.get("total", 0.0) - times.get("read", 0.0) - times.get("extract", 0.0)
+            seconds += 1e-3 * runs * (times.get("total", 0.0) + (estimator if plan.replay else 0.0))
+    return seconds

@@ -14,7 +14,7 @@ from slam.outputs import Output, require_outputs
 from slam.registry import ONLINE
 from slam.run.drawing import draw_objects, with_legend
 from slam.run.options import RunOptions
-from slam.run.outputs import NAMES, write_json
+from slam.run.outputs import NAMES
 from slam.run.plots import PICTURE, plot
 from slam.run.run_data import RunData
 from slam.run.runner import run
@@ -33,11 +33,11 @@ _FRAME = "frame.png"
 def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -> list[dict[str, Any]]:
     """Run the demo; returns the runs' summaries, which are also in ``summary.json`` of each run's folder.
 
-    Leaves a folder per back end with the files of a run, ``comparison.json``, and the pictures ``summary.png`` and
-    ``frame.png`` (the last frame in which the box was measured). Raises SlamError where a file cannot be written, or is
+    Leaves a folder per back end with the files of a run, and the pictures ``summary.png`` and ``frame.png`` (the last
+    frame in which the box was measured). Raises SlamError where a file cannot be written, or is
     there already and may not be replaced.
     """
-    own = Output(out, "--out", ["comparison.json", PICTURE, _FRAME])
+    own = Output(out, "--out", [PICTURE, _FRAME])
     require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)
     summaries: list[dict[str, Any]] = []
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
@@ -53,7 +53,6 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
                     shown[any(thing.estimate.measured for thing in result.objects)] = result
 
                 summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
-    write_json(out / "comparison.json", {"runs": summaries})
     plot([RunData.read(out / backend, backend) for backend in ONLINE], out / PICTURE)
     last = shown.get(True, shown.get(False))
     if last is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from inspect import cleandoc
 from pathlib import Path
@@ -18,12 +18,13 @@ from rich.table import Table
 from slam.data import FrameResult
 from slam.errors import SlamError
 from slam.run.results import rows, verdict_of_run
-from slam.runtime.compile_clock import working_time
+from slam.runtime.compile_clock import compile_clock, working_time
 
 if TYPE_CHECKING:
-    from slam.compare.wording import Conclusions
+    from slam.compare.tables import Group
 
 _console = Console()
+_COMPILING = "compiling, once on this machine"
 _COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}  # of badges, by direction
 
 
@@ -35,22 +36,30 @@ def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
 
 @contextmanager
 def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[FrameResult], None]]:
-    """A progress bar over frames, without an end where `total` is None; it appears with the first one."""
-    status = TextColumn("{task.fields[rate]} {task.fields[status]}")
-    bar = _bar(status, quiet=quiet, get_time=working_time)
-    task = bar.add_task(title, total=total, rate="", status="")
+    """A progress bar over frames, without an end where `total` is None; it appears with the first one.
+
+    Kernels that have to be compiled have a bar of their own above it.
+    """
+    bar = _bar(TextColumn("{task.fields[status]}"), quiet=quiet, get_time=working_time)
+    kernels = bar.add_task(_COMPILING, total=None, status="", visible=False)
+    task = bar.add_task(title, total=total, status="")
+
+    def compiling(begun: int, of: int) -> None:
+        bar.start()
+        bar.update(kernels, completed=begun, total=of, visible=True)
 
     def frame(result: FrameResult) -> None:
         bar.start()
-        speed = bar.tasks[0].speed
+        speed = bar.tasks[task].speed
         said = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
-        bar.update(task, advance=1, rate=f"{speed:.1f} Hz" if speed else "", status=said)
+        bar.update(task, advance=1, status=f"{speed:.1f} Hz {said}" if speed else said)
 
-    try:
-        yield frame
-    finally:
-        if bar.live.is_started:
-            bar.stop()
+    with _watching(compiling):
+        try:
+            yield frame
+        finally:
+            if bar.live.is_started:
+                bar.stop()
 
 
 @contextmanager
@@ -61,26 +70,66 @@ def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
         yield lambda done: bar.update(task, completed=done)
 
 
-def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str) -> None:
-    """What may be concluded of each group, in the words of the report, and what so few trials can show at best."""
-    from slam.compare.wording import STRENGTH
+@contextmanager
+def compiling(quiet: bool = False) -> Iterator[None]:
+    """A bar that counts kernels which are compiled meanwhile; it appears with the first one.
 
-    for found in every:
-        _say(found.name, "bold")
-        for text in filter(None, (*found.verdict, found.failed)):
+    Their number is that of the modules loaded so far.
+    """
+    bar = _bar(quiet=quiet)
+    task = bar.add_task(_COMPILING, total=None)
+
+    def tell(begun: int, of: int) -> None:
+        bar.start()
+        bar.update(task, completed=begun, total=of)
+
+    with _watching(tell):
+        try:
+            yield
+        finally:
+            if bar.live.is_started:
+                bar.stop()
+
+
+@contextmanager
+def _watching(watch: Callable[[int, int], None]) -> Iterator[None]:
+    compile_clock.watch = watch
+    try:
+        yield
+    finally:
+        compile_clock.watch = None
+
+
+def print_conclusions(every: Sequence[Group], caution: str) -> None:
+    """What may be concluded of each group, in the words of the report, and what so few trials can show at best."""
+    from slam.compare import wording
+
+    used = set()
+    for group in every:
+        _say(f"\n{group.name}", "bold")
+        for text in filter(None, (*wording.sentences(group), wording.failed(group))):
             _say(text)
-        table = Table.grid(padding=(0, 2))
-        for line in found.headlines:
-            style = f"{'bold ' if line.verdict == 'certain' else ''}{_COLOURS[line.direction]}"
-            table.add_row(f"  [{style}]{escape(line.badge)}[/]", escape(line.text))
-        for text in found.honesty:
-            table.add_row("  covariances", escape(text.replace(": covariances ", ": they ")))
+        table = _table("", group.runs)
+        for row in (wording.row(group, metric) for metric in group.metrics if metric.main):
+            used |= {cell.verdict for cell in row.cells if cell.direction}
+            cells = [f"{mean} [{_COLOURS[c.direction]}]{c.badge}[/]" for (mean, _), c in zip(row.means[1:], row.cells)]
+            table.add_row(escape(row.label), row.means[0][0], *cells)
         _console.print(table, highlight=False)
-    used = {line.verdict for found in every for line in found.headlines}
-    if meanings := [meaning for verdict, meaning in STRENGTH.items() if verdict in used]:
-        _say(f"Better or worse than {reference}: {'; '.join(meanings)}.")
+        for text in wording.honesty(group):
+            _say(text)
+    if meanings := [meaning for verdict, meaning in wording.STRENGTH.items() if verdict in used]:
+        _say(f"Better or worse than {next(iter(every[0].runs))}: {'; '.join(meanings)}.")
     if caution:
         _say(caution)
+
+
+def _table(title: str, names: Iterable[str]) -> Table:
+    """An empty table with a column for each name."""
+    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("")
+    for name in names:
+        table.add_column(escape(name), justify="right")
+    return table
 
 
 def _say(text: str, style: str | None = None) -> None:
@@ -89,10 +138,7 @@ def _say(text: str, style: str | None = None) -> None:
 
 def print_summary(summaries: list[dict[str, Any]], files: Sequence[Path]) -> None:
     """A table of finished runs, a column each, whether their covariances hold, and what was written."""
-    table = Table(title=summaries[0]["sequence"], title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("")
-    for summary in summaries:
-        table.add_column(summary["backend"], justify="right", no_wrap=True)
+    table = _table(summaries[0]["sequence"], (summary["backend"] for summary in summaries))
     for label, values in rows(summaries):
         table.add_row(escape(label), *values)
     _console.print(table)

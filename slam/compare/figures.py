@@ -16,10 +16,10 @@ from slam.compare.trial import SERIES, SERIES_COLUMNS
 from slam.errors import SlamError
 from slam.evaluation.metrics import chi_square_band
 from slam.files import read_numbers
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, transform
 from slam.run.panels import backend_colours
 from slam.run.plots import drawn
-from slam.run.results import Metric
+from slam.run.results import BY_KEY
 from slam.run.run_data import RunData, place_of_truth, well_known
 
 if TYPE_CHECKING:
@@ -27,38 +27,34 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST_TICKS = 15
+_SHORT = 20  # letters of names that stand side by side
 _WIDTH = 132.0  # [mm] about that of a phone: text stays readable where the picture fills the screen
 _MOST_LANDMARKS, _MOST_POSES = 700, 600  # of a run in the map that can be turned
 
 
-def pictures(group: Group) -> Iterator[tuple[str, str, Figure]]:
-    """The pictures of a group with title and caption, as far as there is truth; none where every run failed."""
+def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
+    """Title, caption and SVG of a group's pictures, as far as there is truth; none where every run failed."""
     shown = _example(group)
     if not shown:
         return
     runs = [RunData.read(run.folder, backend) for backend, run in shown.items()]
     trial = next(iter(shown.values())).trial
     of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
-    known = {metric.key: metric for metric in group.metrics}
-    main = known.get("ate_online_m")
-    if main is not None and group.trials > 1:
-        text = f"{main.label}, of every trial; lines join the back ends' runs on the same recording."
-        yield main.label, text, _draw_pairs(group, main)
-    yield "Paths from above", f"Paths from above{of_seed}.", drawn(runs, "path", _WIDTH)[0]
+    known = {metric.key for metric in group.metrics}
+    if "ate_online_m" in known and group.trials > 1:
+        label = BY_KEY["ate_online_m"].label
+        yield label, f"{label}, of every trial; lines join the back ends' runs on the same recording.", _pairs(group)
+    yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path", _WIDTH)[0])
     if "nees_per_dof" in known:
-        text = f"Error of the position{of_seed}, and the ±3σ that each back end claims (shaded)."
-        yield "Error over time", text, drawn(runs, "errors", _WIDTH)[0]
+        text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
+        yield "Error over time", text, _svg(drawn(runs, "errors", _WIDTH)[0])
         text = (
             "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
             "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
         )
-        yield "NEES over time", text, _draw_nees(group)
+        yield "NEES over time", text, _nees(group)
     text = f"Time per frame by stage{of_seed}, one thread; it depends on the machine."
-    yield "Time per stage", text, drawn(runs, "time", _WIDTH)[0]
-
-
-def _colours(group: Group) -> dict[str, str]:
-    return dict(zip(group.runs, backend_colours(list(group.runs))))
+    yield "Time per stage", text, _svg(drawn(runs, "time", _WIDTH)[0])
 
 
 def _example(group: Group) -> dict[str, Run]:
@@ -70,31 +66,30 @@ def _example(group: Group) -> dict[str, Run]:
     return {backend: run for backend, run in firsts.items() if run is not None}
 
 
-def _draw_pairs(group: Group, metric: Metric) -> Figure:
-    """Each trial's values, those of the back ends side by side and joined: whether the differences are of one sign."""
+def _pairs(group: Group) -> str:
+    """Each trial's errors, those of the back ends side by side and joined: whether differences are of one sign."""
+    metric = BY_KEY["ate_online_m"]
     figure, axis = _axes(2.6)
     values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
     backends, trials = values.shape
     x = np.arange(trials) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
     axis.plot(x, values, color="0.7", lw=1, zorder=1)
-    for at, value, (name, colour) in zip(x, values, _colours(group).items()):
+    for at, value, name, colour in zip(x, values, group.runs, backend_colours(list(group.runs))):
         axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
-    axis.set_xlim(-0.5, trials - 0.5)
-    axis.set_xticks(range(0, trials, -(-trials // _MOST_TICKS)))
+    axis.set(xlim=(-0.5, trials - 0.5), xticks=range(0, trials, -(-trials // _MOST_TICKS)))
     axis.set(xlabel="seed", ylabel=metric.title)
     low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
     axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
-    _legend_above(axis, 4)
-    return figure
+    return _svg(figure)
 
 
-def _draw_nees(group: Group) -> Figure:
+def _nees(group: Group) -> str:
     """NEES / 6 over time, mean over the trials whose pose was measured, with the 95 % band of as many trials."""
     from matplotlib.ticker import LogLocator
 
     figure, axis = _axes(2.8)
     fewest = group.trials
-    for name, runs in group.runs.items():
+    for (name, runs), colour in zip(group.runs.items(), backend_colours(list(group.runs))):
         every = [_series(run) for run in runs if run.completed]
         if not every:
             continue
@@ -102,7 +97,7 @@ def _draw_nees(group: Group) -> Figure:
         length = min(map(len, every))
         nees = np.ma.masked_invalid([rows[1:length, 1] for rows in every])
         t = (every[0][:, 0] - every[0][0, 0])[1:length]
-        axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=_colours(group)[name], lw=1.2, label=name)
+        axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=colour, lw=1.2, label=name)
     axis.axhline(1, color="0.3", lw=0.8, ls="--", label="expected")
     low, high = chi_square_band(6, fewest)
     band = f"95 % band if consistent, mean of {fewest} trial{'s' if fewest > 1 else ''}"
@@ -113,8 +108,7 @@ def _draw_nees(group: Group) -> Figure:
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter("")
     axis.set(xlabel="time [s]", ylabel="NEES / 6")
-    _legend_above(axis, 2)
-    return figure
+    return _svg(figure)
 
 
 def _series(run: Run) -> Array:
@@ -130,32 +124,24 @@ def map_data(group: Group) -> dict[str, Any]:
     runs = [RunData.read(run.folder, backend) for backend, run in _example(group).items()]
     truth: Array = np.zeros((0, 3))
     if runs[0].truth is not None:
-        T = place_of_truth(runs[0], runs[0].truth)
-        truth = runs[0].truth.positions @ T[:3, :3].T + T[:3, 3]
+        truth = transform(place_of_truth(runs[0]), runs[0].truth.positions)
     layers = []
-    for run in runs:
+    for run, colour in zip(runs, backend_colours([run.backend for run in runs])):
         rows = well_known(run)[-_MOST_LANDMARKS:]
         values, vectors = np.linalg.eigh(run.covariances[rows])
         axes = 2 * np.sqrt(np.maximum(values, 0))[:, None, :] * vectors  # of the 2σ ellipsoids
-        layers.append(
-            {
-                "name": run.name,
-                "colour": _colours(group)[run.name],
-                "path": _rounded(run.online.positions[:: max(1, len(run.online) // _MOST_POSES)]),
-                "points": _rounded(run.positions[rows]),
-                "axes": _rounded(np.swapaxes(axes, 1, 2).reshape(-1, 9)),
-            }
-        )
+        layers.append({
+            "name": run.name,
+            "colour": colour,
+            "path": _rounded(run.online.positions[:: max(1, len(run.online) // _MOST_POSES)]),
+            "points": _rounded(run.positions[rows]),
+            "axes": _rounded(np.swapaxes(axes, 1, 2).reshape(-1, 9)),
+        })  # fmt: skip
     return {"layers": layers, "truth": _rounded(truth[:: max(1, len(truth) // _MOST_POSES)])}
 
 
 def _rounded(rows: Array) -> list[list[float]]:
     return [[round(float(x), 4) for x in row] for row in rows]
-
-
-def _legend_above(axis: Axes, columns: int) -> None:
-    """A legend that hides nothing."""
-    axis.legend(frameon=False, fontsize=8, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)
 
 
 def _style() -> AbstractContextManager[None]:
@@ -176,9 +162,14 @@ def _axes(height: float) -> tuple[Figure, Axes]:
         return figure, figure.subplots()
 
 
-def as_svg(figure: Figure) -> str:
-    """A picture as SVG, the same for the same data."""
+def _svg(figure: Figure) -> str:
+    """A picture as SVG, the same for the same data; its legend is above its panel, where it hides nothing."""
     text = io.StringIO()
     with _style():
+        axis = figure.axes[0]
+        names = axis.get_legend_handles_labels()[1]
+        if names and axis.get_legend() is None:
+            columns = 3 if max(map(len, names)) < _SHORT else 2
+            axis.legend(frameon=False, fontsize=8, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1.0))
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()

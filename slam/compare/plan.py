@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -95,17 +94,6 @@ class Plan:
     def every(self) -> list[Trial]:
         """All trials, mode by mode."""
         return [trial for mode in self.modes for trial in self.trials_of(mode)]
-
-    def command(self) -> str:
-        """The command that runs the plan again."""
-        words = ["slam", "compare", *self.sequences, "--backends", ",".join(self.backends)]
-        for variant in self.variants:
-            if variant != Variant("surf"):
-                words += ["--variant", ":".join([variant.name, variant.frontend, *variant.settings])]
-        words += ["--trials", str(self.trials)]
-        if self.start or self.stop is not None:
-            words += ["--frames", f"{self.start or ''}:{'' if self.stop is None else self.stop}"]
-        return shlex.join([*words, *([] if self.replay else ["--no-replay"])])
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -69,33 +69,36 @@ class LocalScheduler:
         """See `Scheduler`."""
         waiting = deque(jobs)
         while waiting:
-            for lost in _in_pool(waiting, self.workers, deliver):  # alone, so that no other is to blame
-                for job in _in_pool(deque([lost]), 1, deliver):
-                    deliver(job, None, WorkerDiedError("its worker process died, also where it ran alone"))
+            with _pool(self.workers) as pool:
+                lost = _spread(pool, waiting, self.workers, deliver)
+            for one in lost:  # alone, so that no other is to blame
+                with _pool(1) as pool:
+                    for job in _spread(pool, deque([one]), 1, deliver):
+                        deliver(job, None, WorkerDiedError("its worker process died, also where it ran alone"))
 
 
-def _in_pool(waiting: deque[Job], workers: int, deliver: Deliver) -> list[Job]:
-    """Run jobs until none is waiting or a worker dies; the jobs that were running then come back.
+def _spread(pool: Executor, waiting: deque[Job], most: int, deliver: Deliver) -> list[Job]:
+    """Run jobs until none is waiting or a worker is lost; the jobs that were running then come back.
 
-    No more jobs are submitted than there are workers: so those submitted are those that were running.
+    No more jobs are submitted than `most`, the number of workers: so those submitted are those that were running.
     """
     running: dict[Future[Any], Job] = {}
     lost: list[Job] = []
-    with _pool(workers) as pool:
-        while (waiting and not lost) or running:
-            try:
-                while waiting and not lost and len(running) < workers:
-                    running[pool.submit(waiting[0].function, *waiting[0].arguments())] = waiting[0]
-                    waiting.popleft()
-            except BrokenProcessPool:  # between two jobs
-                if not running:
-                    break
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job, error = running.pop(future), future.exception()
-                if isinstance(error, BrokenProcessPool):
-                    lost.append(job)
-                else:
-                    deliver(job, None if error else future.result(), error)
+    while (waiting and not lost) or running:
+        try:
+            while waiting and not lost and len(running) < most:
+                running[pool.submit(waiting[0].function, *waiting[0].arguments())] = waiting[0]
+                waiting.popleft()
+        except BrokenProcessPool:  # between two jobs
+            if not running:
+                break
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            job = running.pop(future)
+            error = CancelledError() if future.cancelled() else future.exception()
+            if isinstance(error, (BrokenProcessPool, CancelledError)):
+                lost.append(job)
+            else:
+                deliver(job, None if error else future.result(), error)
     return lost
 
 
@@ -157,30 +160,12 @@ class DaskScheduler:
             client = distributed.Client(self.address, timeout=self.patience)
         except (OSError, ValueError) as error:
             raise SlamError(f"no Dask scheduler answers at {self.address}: {error}") from error
-        waiting: deque[Job] = deque(jobs)
-        running: dict[Any, Job] = {}
+        gone = f"the Dask scheduler at {self.address} has gone; with a new one the same command goes on"
         with client:
-            while waiting or running:
-                with self._lost():
-                    free = max(1, 2 * sum(client.ncores().values())) - len(running)
-                for job in [waiting.popleft() for _ in range(min(free, len(waiting)))]:
-                    arguments = job.arguments()
-                    with self._lost():  # not pure: Dask must not take calls with equal arguments for one
-                        running[client.submit(job.function, *arguments, pure=False)] = job
-                with self._lost():
-                    done = distributed.wait(list(running), return_when="FIRST_COMPLETED").done
-                    failures = [(future, future.exception()) for future in done]
-                    ended = [(future, failed, None if failed else future.result()) for future, failed in failures]
-                for future, failed, value in ended:
-                    deliver(running.pop(future), value, failed)
-
-    @contextmanager
-    def _lost(self) -> Iterator[None]:
-        """Say in one line that the scheduler has gone."""
-        try:
-            yield
-        except (OSError, CancelledError, TimeoutError) as error:
-            raise SlamError(
-                f"the Dask scheduler at {self.address} has gone: {error or type(error).__name__}; "
-                "with a new one the same command goes on"
-            ) from error
+            try:  # not pure: Dask must not take calls with equal arguments for one
+                pool, most = client.get_executor(pure=False), max(1, 2 * sum(client.ncores().values()))
+                lost = _spread(pool, deque(jobs), most, deliver)
+            except (OSError, TimeoutError) as error:
+                raise SlamError(gone) from error
+        if lost:
+            raise SlamError(gone)

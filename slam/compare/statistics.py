@@ -40,9 +40,9 @@ class Verdict(StrEnum):
     LIKELY = "likely"
     OPEN = "open"
     EQUAL = "equal"
-    SINGLE = "single"
-    NONE = "none"
-    UNTESTED = "untested"
+    SINGLE = "one trial"
+    NONE = "no pair"
+    UNTESTED = ""
 
 
 @dataclass(frozen=True)
@@ -166,11 +166,6 @@ def interval(values: Array) -> tuple[float, float]:
         return float("nan"), float("nan")
     if np.ptp(values) == 0:  # no spread to resample
         return float(values[0]), float(values[0])
-    return _bootstrap(tuple(values.tolist()))
-
-
-@lru_cache(maxsize=4096)  # tables, report and the words on the terminal ask for the same
-def _bootstrap(values: tuple[float, ...]) -> tuple[float, float]:
     from scipy.stats import bootstrap
 
     options = {"confidence_level": LEVEL, "n_resamples": _RESAMPLES}
@@ -178,7 +173,7 @@ def _bootstrap(values: tuple[float, ...]) -> tuple[float, float]:
         warnings.simplefilter("ignore")  # BCa says so where it is not defined; then percentiles are taken
         for method in ("BCa", "percentile"):
             rng = np.random.default_rng(_SEED)
-            low, high = bootstrap((np.array(values),), np.mean, method=method, rng=rng, **options).confidence_interval
+            low, high = bootstrap((values,), np.mean, method=method, rng=rng, **options).confidence_interval
             if np.isfinite(low) and np.isfinite(high):
                 break
     return float(low), float(high)

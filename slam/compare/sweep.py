@@ -74,7 +74,7 @@ def sweep(
     told = on_done or (lambda trial: None)
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_json(out / SWEEP, {"plan": asdict(plan), "command": plan.command(), "versions": running_code()})
+    write_json(out / SWEEP, {"plan": asdict(plan), "versions": running_code()})
     trials = {trial.folder: trial for trial in plan.every}
 
     def keep(job: Job, files: Files | None, error: BaseException | None) -> None:

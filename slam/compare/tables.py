@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -15,7 +15,7 @@ from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
 from slam.run.outputs import csv_rows
-from slam.run.results import BY_KEY, COMPLETED, METRICS, Metric, object_metric
+from slam.run.results import BY_KEY, COMPLETED, METRICS, Metric
 
 DIFFERENCE_COLUMNS = (
     "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
@@ -35,16 +35,21 @@ class Group:
     compared: dict[str, dict[str, Difference]] = field(default_factory=dict)  # by key of the figure and by back end
 
     @property
+    def name(self) -> str:
+        """What the runs share, in words."""
+        variant = "" if self.variant.name == "surf" else f", {self.variant.name}"
+        return f"{self.sequence}{variant}, {self.mode}"
+
+    @property
     def trials(self) -> int:
         """Number of trials of each back end."""
         return len(next(iter(self.runs.values())))
 
     @property
     def metrics(self) -> list[Metric]:
-        """Share of the runs completed, then the figures that at least one run has, those of moving objects last."""
+        """Share of the runs completed, then the figures that at least one run has."""
         keys = {key for runs in self.runs.values() for run in runs for key in run.metrics}
-        others = [object_metric(key) for key in sorted(keys - set(BY_KEY))]
-        return [COMPLETED, *(m for m in METRICS if m.key in keys), *others]
+        return [COMPLETED, *(metric for metric in METRICS if metric.key in keys)]
 
     def values(self, backend: str, key: str) -> Array:
         """A figure by trial (N,), NaN where the run failed or has none."""
@@ -82,8 +87,7 @@ def groups(plan: Plan, runs: Sequence[Run]) -> list[Group]:
 def count_tests(every: Sequence[Group]) -> int:
     """Tests that p is adjusted for; with one trial of everything, as many as there would be with more."""
     found = [d for group in every for by_name in group.compared.values() for d in by_name.values()]
-    tests = sum(d.varies for d in found)
-    return tests or sum(d.better is not None for d in found)
+    return sum(d.varies for d in found) or sum(d.better is not None for d in found)
 
 
 def most_tests(plan: Plan) -> int:
@@ -92,29 +96,24 @@ def most_tests(plan: Plan) -> int:
     return len(plan.sequences) * len(plan.variants) * len(plan.modes) * (len(plan.backends) - 1) * figures
 
 
-def write_tables(plan: Plan, runs: Sequence[Run], out: Path) -> None:
+def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None:
     """Write runs.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
-    keys = [*BY_KEY, *sorted({key for run in runs for key in run.metrics} - set(BY_KEY))]
     stages = list(dict.fromkeys(stage for run in runs for stage in run.milliseconds))
-    times = [*RUN_COLUMNS, *(f"ms_{stage}" for stage in stages)]
-    every = groups(plan, runs)
-    for name, columns, rows in (
-        ("runs", (*RUN_COLUMNS, *keys), run_rows(runs, keys, _number)),
-        ("differences", DIFFERENCE_COLUMNS, [row for group in every for row in _difference_rows(group)]),
-        ("timings", times, [(*_head(r), *(_number(r.milliseconds.get(s, np.nan)) for s in stages)) for r in runs]),
-    ):
-        write_text(out / f"{name}.csv", csv_rows([columns, *rows]))
+    differences = [row for group in every for row in _difference_rows(group)]
+    tables: dict[str, list[tuple[object, ...]]] = {
+        "runs": [(*RUN_COLUMNS, *BY_KEY), *(_row(run, run.metrics, BY_KEY) for run in runs)],
+        "differences": [DIFFERENCE_COLUMNS, *differences],
+        "timings": [(*RUN_COLUMNS, *(f"ms_{s}" for s in stages)), *(_row(r, r.milliseconds, stages) for r in runs)],
+    }
+    for name, rows in tables.items():
+        write_text(out / f"{name}.csv", csv_rows(rows))
 
 
-def run_rows(runs: Sequence[Run], keys: Iterable[str], text: Callable[[float], str]) -> list[tuple[str, ...]]:
-    """A row per run: `RUN_COLUMNS`, and its figures by their keys, as `text` writes them."""
-    return [(*_head(run), *(text(run.metrics.get(key, np.nan)) for key in keys)) for run in runs]
-
-
-def _head(run: Run) -> tuple[str, ...]:
-    """Cells of `RUN_COLUMNS`."""
+def _row(run: Run, values: Mapping[str, float], keys: Iterable[str]) -> tuple[str, ...]:
+    """Cells of `RUN_COLUMNS`, and values by their keys."""
     t = run.trial
-    return t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
+    head = t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
+    return *head, *(_number(values.get(key, np.nan)) for key in keys)
 
 
 def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:

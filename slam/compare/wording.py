@@ -1,4 +1,4 @@
-"""What follows from paired trials in plain words: what may be concluded, how sure that is, and what cannot."""
+"""What follows from paired trials, for people: in sentences, and in rows of tables on the terminal and in reports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from slam.compare.plan import REPLAY
 from slam.compare.statistics import ALPHA, Difference, Verdict, certain_of, fewest
 from slam.compare.tables import Group, mean_and_sd
-from slam.run.results import number, verdict
+from slam.run.results import COMPLETED, Metric, verdict
 
 #: What a verdict means that says better or worse.
 STRENGTH = {
@@ -18,105 +18,91 @@ STRENGTH = {
     Verdict.LIKELY: f"likely (p ≤ {ALPHA:g}, not after Holm's adjustment)",
     Verdict.SINGLE: "in one trial, which cannot say whether that is chance",
 }
-_WORDS = {Verdict.SINGLE: "one trial", Verdict.NONE: "no pair", Verdict.UNTESTED: ""}
 
 _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
-_FACTOR = 3.0  # between two means, from which on it is said as a factor
 
 
 @dataclass(frozen=True)
-class Line:
-    """A line of a headline."""
+class Cell:
+    """One back end against the reference in one figure, in words."""
 
-    text: str  # who, and which figures; the badge says the rest
-    direction: str  # "better" or "worse", of the other back end against the reference; empty where neither
-    verdict: Verdict  # how sure that is
+    verdict: str  # how sure
+    direction: str  # "better", "worse"; empty where neither
+    mean: str
+    interval: str
+    p: str
+    p_holm: str
 
     @property
     def badge(self) -> str:
         """Direction and strength in two words."""
-        return badge(self.verdict, self.direction)
+        return f"{self.direction}: {self.verdict}" if self.direction else self.verdict
 
 
 @dataclass(frozen=True)
-class Conclusions:
-    """What can be said of a group, in the report and on the terminal."""
+class Row:
+    """A figure of all back ends: mean and standard deviation of each, and the others against the first."""
 
-    name: str  # of the group
-    verdict: list[str]  # which back end is better in what, a sentence for each but the reference
-    failed: str  # which runs failed; empty where none did
-    headlines: list[Line]  # what is certain and likely, and which main figures are open
-    honesty: list[str]  # one per back end, on its covariances
+    label: str
+    means: list[tuple[str, str]]
+    cells: list[Cell]
+    failed: list[int]  # runs of each back end, where the row counts them
 
 
-def conclusions(group: Group) -> Conclusions:
-    """What can be said of a group."""
+def row(group: Group, metric: Metric) -> Row:
+    """A row of a group's table."""
+    failed, label = [0] * len(group.runs), metric.title
+    means = []
+    for backend in group.runs:
+        mean, sd = (metric.scale * value for value in mean_and_sd(group.finite(backend, metric.key)))
+        means.append((shown(mean), f"± {shown(sd, mean)}" if np.isfinite(mean + sd) else ""))
+    if metric is COMPLETED:
+        failed, label = list(map(group.failures, group.runs)), metric.label
+        means = [(f"{group.trials - count} of {group.trials}", "") for count in failed]
+    return Row(label, means, list(map(_cell, group.differences(metric).values())), failed)
+
+
+def _cell(d: Difference) -> Cell:
+    direction = "" if d.better is None or d.verdict not in STRENGTH else "better" if d.better else "worse"
+    p, p_holm = (shown_p(p) if d.varies else "–" for p in (d.p, d.p_holm))
+    equal = direction and _is_trifle(d)
+    return Cell("less than 1 %" if equal else d.verdict.value, "" if equal else direction, *_difference(d), p, p_holm)
+
+
+def sentences(group: Group) -> list[str]:
+    """`in_short` of each back end but the reference."""
     first, *others = group.runs
-    own = {other: [group.differences(metric)[other] for metric in group.metrics] for other in others}
-    counts = [f"{n} of {group.trials} of {b}" for b in group.runs if (n := group.failures(b))]
-    failed = (
-        f"Runs failed, {', '.join(counts)}: a trial in which either failed is no pair, and the other figures speak of "
-        "the pairs alone."
-    )
-    means = {b: {m.key: mean_and_sd(group.finite(b, m.key))[0] for m in group.metrics} for b in group.runs}
-    honesty = {b: verdict(means[b], group.trials - group.failures(b)) for b in group.runs}
-    variant = "" if group.variant.name == "surf" else f", {group.variant.name}"
-    return Conclusions(
-        f"{group.sequence}{variant}, {group.mode}",
-        [in_short(differences, first, other) for other, differences in own.items()],
-        failed if counts else "",
-        [line for other, differences in own.items() for line in _headlines(differences, other)],
-        [f"{backend}: {text}." for backend, text in honesty.items() if text],
-    )
-
-
-def badge(sure: Verdict, direction: str) -> str:
-    """A verdict in two words: direction and strength."""
-    word = _WORDS.get(sure, sure.value)
-    return f"{direction}: {word}" if direction else word
-
-
-def direction(d: Difference) -> str:
-    """Whether the other back end is better or worse, as a badge says it; empty where nothing can be said."""
-    if d.better is None or d.verdict not in STRENGTH:
-        return ""
-    return "better" if d.better else "worse"
-
-
-def _headlines(differences: Sequence[Difference], other: str) -> list[Line]:
-    """What the other back end does better and worse than the reference, the surest first, and what remains open.
-
-    All that is certain or likely is named, in both directions; of the rest the main figures, but for those
-    that are perfect in every run.
-    """
-    lines = []
-    tested = [d for d in differences if direction(d) and (d.metric.main or d.verdict is not Verdict.SINGLE)]
-    for sure in STRENGTH:
-        for way in ("better", "worse"):
-            if own := [d for d in tested if (d.verdict, direction(d)) == (sure, way) and not is_trifle(d)]:
-                lines.append(Line(f"{other}: {'; '.join(map(_brief, own))}", way, sure))
-    if trifles := [_name(d) for d in tested if is_trifle(d)]:
-        lines.append(Line(f"{other}: less than {100 * _TRIFLE:g} % apart: {', '.join(trifles)}", "", Verdict.EQUAL))
-    perfect = [d.metric.better == "higher" and d.reference == 1 and d.verdict is Verdict.EQUAL for d in differences]
-    rest = [d for d, ideal in zip(differences, perfect) if d.metric.main and not ideal]
-    for kept, of in ((Verdict.OPEN, (Verdict.OPEN, Verdict.EQUAL)), (Verdict.NONE, (Verdict.NONE,))):
-        if names := [_name(d) for d in rest if d.verdict in of]:
-            lines.append(Line(f"{other}: {', '.join(names)}", "", kept))
-    return lines or [Line(f"{other}: errors (the true path is not known)", "", Verdict.NONE)]
+    return [in_short([group.differences(metric)[other] for metric in group.metrics], first, other) for other in others]
 
 
 def in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
     """Which of two back ends is better in what, in one sentence: in the main figures that can be told apart."""
     sure = (Verdict.CERTAIN, Verdict.LIKELY)
-    told = [d for d in differences if d.metric.main and d.verdict in sure and not is_trifle(d)]
+    told = [d for d in differences if d.metric.main and d.verdict in sure and not _is_trifle(d)]
     parts = []
     for better, first, second in ((True, other, reference), (False, reference, other)):
-        if names := [f"{_name(d)} ({d.verdict.value})" for d in told if d.better is better]:
+        if names := [f"{_name(d.metric)} ({d.verdict.value})" for d in told if d.better is better]:
             parts.append(f"{first} is better than {second} in {', '.join(names)}")
     return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
 
 
-def is_trifle(d: Difference) -> bool:
+def failed(group: Group) -> str:
+    """Which runs failed; empty where none did."""
+    counts = [f"{n} of {group.trials} of {backend}" for backend in group.runs if (n := group.failures(backend))]
+    text = f"Runs failed, {', '.join(counts)}: a trial in which either failed is no pair, and is in no other figure."
+    return text if counts else ""
+
+
+def honesty(group: Group) -> list[str]:
+    """Whether the covariances of each back end hold, by the means over its runs."""
+    said = {}
+    for backend in group.runs:
+        means = {metric.key: mean_and_sd(group.finite(backend, metric.key))[0] for metric in group.metrics}
+        said[backend] = verdict(means, group.trials - group.failures(backend))
+    return [f"{backend}: {text}." for backend, text in said.items() if text]
+
+
+def _is_trifle(d: Difference) -> bool:
     """Whether two means are so near that nobody would choose by them, however sure their difference is.
 
     Of shares such as that of tracked frames what they lack counts: 99.2 % is not equal to 100 %.
@@ -143,13 +129,9 @@ def caution(trials: int, tests: int) -> str:
         return ""
     more = f"{enough} trials are enough for all figures (--trials {enough})."
     if trials == 1:
-        return (
-            "One trial cannot tell a difference from chance: a recorded sequence has one, synthetic worlds have as "
-            f"many as are asked for. {more}"
-        )
+        return f"One trial cannot tell a difference from chance: a recorded sequence has no more. In worlds {more}"
     if trials < fewest(1):
-        chance = f"chance alone does as much in {200 / 2**trials:.2g} % of such comparisons"
-        return f"With {trials} trials nothing can be certain: even where all agree, {chance}. {more}"
+        return f"With {trials} trials nothing can be certain, even where all agree. {more}"
     few = certain_of(trials)
     at_most = "a single figure is" if few == 1 else f"up to {few} figures are"
     return f"With {trials} trials a difference that has the same sign in all is certain where {at_most} tested. {more}"
@@ -174,8 +156,8 @@ def shown(value: float, like: float | None = None) -> str:
     return f"{value:.{digits}f}".replace("-", "−")
 
 
-def shown_difference(d: Difference) -> tuple[str, str]:
-    """The mean difference and its interval for people, with the digits that the wider bound needs; a dash for none.
+def _difference(d: Difference) -> tuple[str, str]:
+    """The mean difference and its interval, with the digits that the wider bound needs; a dash for none.
 
     Of figures that should be one it is the ratio of the factors by which they are off.
     """
@@ -194,18 +176,6 @@ def shown_p(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
-def _name(d: Difference) -> str:
+def _name(metric: Metric) -> str:
     """A label that can stand in a list."""
-    return d.metric.label.replace(", ", " ").partition(" (")[0]
-
-
-def _brief(d: Difference) -> str:
-    """The figure from the reference's value to the other's, and the change: a factor where percentages are enormous."""
-    values = [shown(d.metric.scale * value) for value in (d.reference, d.other)]
-    text = f"{_name(d)} {' → '.join(values)}{d.metric.unit and f' {d.metric.unit}'}"
-    small, large = sorted((d.reference, d.other))
-    if d.metric.better != "lower" or d.reference <= 0:
-        return text
-    if small > 0 and large / small >= _FACTOR:
-        return f"{text} ({number(large / small)} times as {'much' if d.other > d.reference else 'little'})"
-    return f"{text} ({100 * (d.other / d.reference - 1):+.2g} %)".replace("(-", "(−")
+    return metric.label.replace(", ", " ").partition(" (")[0]

@@ -6,7 +6,7 @@ The colours are those of paper B, Fig. 10. Beside a frame, `GrowingMap` draws th
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -77,22 +77,21 @@ def with_legend(picture: np.ndarray, bodies: Sequence[MovingObject] = ()) -> np.
     import cv2
 
     bar = np.full((_LEGEND, picture.shape[1], 3), 255, np.uint8)
-    circles = [(_BEACON, "landmark"), (_NEW, "new landmark"), (_MOVING, "feature that moves")]
-    boxes = [(body_colour(body.id), f"body {body.id}") for body in bodies] or [(body_colour(1), "body")]
-    marks = [*((mark, "circle") for mark in circles), *((mark, "box") for mark in boxes)]
+    marks = [(_BEACON, "landmark", 0), (_NEW, "new landmark", 0), (_MOVING, "feature that moves", 0)]
+    marks += [(body_colour(body.id), f"body {body.id}", 2) for body in bodies] or [(body_colour(1), "body", 2)]
     at, middle = 12, _LEGEND // 2
-    for (colour, text), shape in [*marks, ((boxes[-1][0], "body, not seen"), "dashed box")]:
-        (width, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
-        if at + 20 + width > bar.shape[1]:
+    for colour, text, width in [*marks, (marks[-1][0], "body, not seen", 1)]:
+        (room, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
+        if at + 20 + room > bar.shape[1]:
             break
-        if shape == "circle":
-            cv2.circle(bar, (at, middle), 5, colour, 2, cv2.LINE_AA)
-        else:
-            for left, right in ((-6, 6),) if shape == "box" else ((-6, -1), (2, 7)):
+        if width:  # a box, of thin dashes where it is not seen
+            for left, right in ((-6, 6),) if width > 1 else ((-6, -1), (2, 7)):
                 for edge in (-5, 5):
-                    cv2.line(bar, (at + left, middle + edge), (at + right, middle + edge), colour, 1 + (shape == "box"))
+                    cv2.line(bar, (at + left, middle + edge), (at + right, middle + edge), colour, width)
+        else:
+            cv2.circle(bar, (at, middle), 5, colour, 2, cv2.LINE_AA)
         cv2.putText(bar, text, (at + 12, middle + height // 2), _FONT, 0.8 * _TEXT, _MOVING, 1, cv2.LINE_AA)
-        at += width + 36
+        at += room + 36
     return np.concatenate([picture, bar])
 
 
@@ -122,7 +121,9 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
 
     if not np.isfinite(corners).all():
         return
-    text = f"{thing.id}: {_state(thing)}"
+    speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
+    state = "not seen" if not thing.estimate.measured else f"{speed:.2f} m/s" if thing.moving else "at rest"
+    text = f"{thing.id}: {state}"
     (width, height), base = cv2.getTextSize(text, _FONT, _TEXT, 1)
     u, v = corners.min(axis=0)
     left, top = _pixel(u, v - 3, scale)
@@ -130,12 +131,6 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
     y = min(max(top, height), picture.shape[0] - base)
     cv2.rectangle(picture, (x, y - height), (x + width, y + base), _RING, cv2.FILLED)
     cv2.putText(picture, text, (x, y), _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
-
-
-def _state(body: MovingObject) -> str:
-    if not body.estimate.measured:
-        return "not seen"
-    return f"{float(np.linalg.norm(body.estimate.velocity[3:])):.2f} m/s" if body.moving else "at rest"
 
 
 def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
@@ -205,7 +200,7 @@ def output(path: Path) -> Output:
     return Output(path, "--draw", None if film else ["[0-9]" * _DIGITS + "*.png"], makes_folder=True)
 
 
-class FramePictures:
+class FramePictures(ExitStack):
     """Writes pictures of frames to a folder of PNG files, or to a video where the path ends in ``.mp4``.
 
     The video's rate is that of the first two frames; a single picture is shown for a second.
@@ -219,6 +214,7 @@ class FramePictures:
     """
 
     def __init__(self, path: Path, with_map: bool = False) -> None:
+        super().__init__()
         self.path, self._film = path, path.suffix.lower() == _FILM
         self._map = GrowingMap() if with_map else None
         self._first: tuple[float, np.ndarray] | None = None  # stamp and picture that wait for the video's rate
@@ -227,7 +223,8 @@ class FramePictures:
             raise SlamError(f"{path}: pictures go to a folder, or to a video FILE.mp4")
         if self._film:
             require_utf8(path)
-        with self._written(path):
+            self.callback(self._end)
+        with _written(path):
             (path.parent if self._film else path).mkdir(parents=True, exist_ok=True)
 
     def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
@@ -240,7 +237,7 @@ class FramePictures:
         picture = with_legend(picture, result.objects)
         if not self._film:
             file = self.path / f"{frame.index:0{_DIGITS}d}.png"
-            with self._written(file):
+            with _written(file):
                 write_png(file, picture)
         elif self._first is None:
             self._first = (frame.stamp, picture)
@@ -248,14 +245,6 @@ class FramePictures:
             if self._video is None:
                 self._open(1.0 / (frame.stamp - self._first[0]), self._first[1])
             self._video.write(picture)
-
-    @staticmethod
-    @contextmanager
-    def _written(path: Path) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise SlamError(f"{path}: cannot be written: {reason(error)}") from error
 
     def _open(self, rate: float, picture: np.ndarray) -> None:
         """Begin the video with the first picture."""
@@ -267,11 +256,16 @@ class FramePictures:
             raise SlamError(f"{self.path}: cannot be written")
         self._video.write(picture)
 
-    def __enter__(self) -> FramePictures:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def _end(self) -> None:
         if self._video is None and self._first is not None:
             self._open(1.0, self._first[1])
         if self._video is not None:
             self._video.release()
+
+
+@contextmanager
+def _written(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SlamError(f"{path}: cannot be written: {reason(error)}") from error

@@ -30,7 +30,6 @@ class RunOptions:
     save_map: Path | None = None  # file for the map at the end
     calibration: Path | None = None  # file with what is known of the rig's error, see `slam.calibration.saved`
     mono: bool = False  # use the left images alone
-    overlap: bool = True  # read and extract the next frame while the present one is estimated; same results
     live: bool = False  # take frames at their own rate, and leave out those that come too late; of a camera always
     source: str = ""  # the sequence as `slam.open_sequence` takes it, for ``config.json``; empty where not known
     format: str | None = None  # of the sequence; None for found out

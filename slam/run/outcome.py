@@ -57,12 +57,12 @@ def outcome(
     if frames < 1 or missed <= _MANY * frames:
         return ""
     frozen = 2 * record.repeated > missed
-    first = next((line for line in warnings if REPEATED not in line), "")
-    if not first and not frozen:
-        first = _cause(record, untracked, rig, in_map) or doubt
-        if not first and dropped < frames:  # where most came, the gaps are hardly all of it
-            first = _any_cause(record, rig, driving)
-    causes = [first] if first else []
+    cause = next((line for line in warnings if REPEATED not in line), "")
+    if not cause and not frozen:
+        cause = _starved(record, untracked, rig, in_map) or doubt
+        if not cause and dropped < frames:  # where most came, the gaps are hardly all of it
+            cause = _unexplained(record, rig, driving)
+    causes = [cause] if cause else []
     if frozen:
         causes.append(f"in {record.repeated} of them {REPEATED}")
     if dropped:
@@ -75,20 +75,19 @@ def outcome(
     return f"{counted}; likely cause: {'; and '.join(causes)}"
 
 
-def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:
+def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:
     """The first step that gave frames that were not tracked too little, and what to look at; empty where none did."""
     features, stereo = np.median(np.array(record.features)[untracked], axis=0)
+    without = set(record.without_right)
+    for row in untracked:  # ascending: without a right image, or after such without a tracked one between
+        without |= {row} if row - 1 in without else set()
+    missing = len(without.intersection(untracked))
     if features < ENOUGH_FEATURES:
         return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
     if 2 * record.hidden > len(untracked):
         return f"in {record.hidden} of them {HIDDEN}"
     if in_map:
         return "the camera is not where the map was made, or the place looks different now"
-    without, missing = set(record.without_right), 0
-    for row in untracked:  # ascending: without a right image, or after such without a tracked one between
-        if row in without or row - 1 in without:
-            without.add(row)
-            missing += 1
     if 2 * missing > len(untracked):
         return (
             f"{missing} of these {len(untracked)} frames have no right image or follow such, and nothing new can be "
@@ -102,7 +101,7 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
     return baseline_doubt(rig)
 
 
-def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
+def _unexplained(record: RunRecord, rig: StereoRig, driving: bool) -> str:
     """What may be the cause where each step gave enough, with what is known."""
     depth, speeds = _depth(record), _speeds(record)
     apart = f"the cameras are {rig.baseline:.3g} m apart"
@@ -119,10 +118,9 @@ def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
         most = f"{_rounded(way)} m/s and turned at up to {_rounded(np.degrees(turn))}°/s"
         moved = f" (where it was tracked the camera moved at up to {most})"
     return (
-        "features are found in both images, but not again in the next frame: "
-        f"{vehicle}frames too far apart{moved}, images that "
-        "are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of another "
-        f"camera or in another unit: by it {apart}"
+        f"features are found in both images, but not again in the next frame: {vehicle}frames too far apart{moved}, "
+        "images that are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of "
+        f"another camera or in another unit: by it {apart}"
     )
 
 

@@ -6,39 +6,43 @@ Drawn without pyplot: there is no state to share, and it is loaded faster.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import textwrap
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from slam.errors import ConfigurationError, SlamError
 from slam.files import noting_inputs, whole_file
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
-from slam.run.panels import error_panels, map_panels, path_panel, time_panel, wrapped
+from slam.run.panels import draw_errors, draw_maps, draw_paths, draw_times
 from slam.run.results import facts
 from slam.run.run_data import RunData
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+#: Pictures by name.
+KINDS = ("summary", "path", "map", "errors", "time")
 
 #: The picture that a run leaves.
 PICTURE = "summary.png"
 
-_MOST_MAPS = 3  # side by side in the summary
-_PAGE = 8.0  # [in] below which text is small, as in a paper
-_COLUMN = 5.0  # [in] below which panels do not stand side by side
-_STYLE: dict[str, Any] = {
-    "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 10, "legend.fontsize": 8, "svg.hashsalt": "slam",
-    "pdf.fonttype": 42, "text.parse_math": False,
-}  # fmt: skip
-_SMALL_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
-
 #: Widths that a picture may be given [mm].
 NARROWEST, WIDEST = 50.0, 1000.0
+
+_MOST_MAPS = 3  # side by side in the summary
+_PAGE = 8.0  # [in] below which text is small, as in a paper
+_LETTERS = 13  # an inch of the head holds
+_COLUMN = 5.0  # [in] below which panels do not stand side by side
+_STYLE: dict[str, Any] = {
+    "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 10, "legend.fontsize": 8, "legend.edgecolor": "none",
+    "svg.hashsalt": "slam", "pdf.fonttype": 42, "text.parse_math": False,
+}  # fmt: skip
+_SMALL_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
 
 #: What a file of a format says of itself: nothing that changes from run to run.
 _METADATA: dict[str, dict[str, Any]] = {
@@ -50,42 +54,40 @@ _METADATA: dict[str, dict[str, Any]] = {
 
 def plot_folders(
     folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None, overwrite: bool = False
-) -> list[tuple[Path, str]]:
-    """Draw finished runs, those of one sequence in one picture, as `plot` does; returns files and captions.
+) -> tuple[Path, str]:
+    """Draw finished runs of one sequence in one picture, as `plot` does; returns the file and its caption.
 
-    Without `out`, a PNG goes to the first folder of each sequence. Raises SlamError where a folder is none of a
-    finished run, or a file cannot be written.
+    Without `out`, a PNG goes to the first folder. Raises SlamError where a folder is none of a finished run, where runs
+    are of several sequences, or where a file cannot be written.
     """
     with noting_inputs() as inputs:
-        groups = _read(folders)
-    if out is not None and len(groups) > 1:
-        names = ", ".join(runs[0].sequence for runs in groups)
-        raise ConfigurationError(f"runs of {len(groups)} sequences ({names}) do not go into one file: leave out --out")
-    files = [out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png") for runs in groups]
-    require_outputs([Output(file, "--out", makes_folder=True) for file in files], inputs, overwrite)
-    return [(file, plot(runs, file, kind, width)) for runs, file in zip(groups, files)]
+        runs = _read(folders)
+    sequences = list(dict.fromkeys(run.sequence for run in runs))
+    if len(sequences) > 1:
+        raise ConfigurationError(
+            f"runs of {len(sequences)} sequences ({', '.join(sequences)}): draw those of one at a time"
+        )
+    file = out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png")
+    require_outputs([Output(file, "--out", makes_folder=True)], inputs, overwrite)
+    return file, plot(runs, file, kind, width)
 
 
 def leave_picture(folder: Path) -> None:
     """The picture of a run that has just ended; where there is nothing to draw a warning says so."""
     try:
-        plot(_read([folder])[0], folder / PICTURE)
+        plot(_read([folder]), folder / PICTURE)
     except SlamError as error:
         logging.getLogger(__name__).warning("no picture: %s", error)
 
 
-def _read(folders: Sequence[Path]) -> list[list[RunData]]:
-    """Finished runs by sequence, in the order given; each has the shortest name that tells it from the others."""
-    found: dict[str, list[RunData]] = {}
-    for folder in folders:
-        run = RunData.read(folder, folder.resolve().name)
-        found.setdefault(run.sequence, []).append(run)
-    for runs in found.values():
-        if len({run.backend for run in runs}) == len(runs):
-            runs[:] = [replace(run, name=run.backend) for run in runs]
-        elif len({run.name for run in runs}) < len(runs):
-            runs[:] = [replace(run, name=f"{run.name} ({i})") for i, run in enumerate(runs, start=1)]
-    return list(found.values())
+def _read(folders: Sequence[Path]) -> list[RunData]:
+    """Finished runs, in the order given; each has the shortest name that tells it from the others."""
+    runs = [RunData.read(folder, folder.resolve().name) for folder in folders]
+    if len({run.backend for run in runs}) == len(runs):
+        return [replace(run, name=run.backend) for run in runs]
+    if len({run.name for run in runs}) == len(runs):
+        return runs
+    return [replace(run, name=f"{run.name} ({i})") for i, run in enumerate(runs, start=1)]
 
 
 def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: float | None = None) -> str:
@@ -124,13 +126,13 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
 def drawn(runs: Sequence[RunData], kind: str, width: float | None, titles: bool = False) -> tuple[Figure, str]:
     """A picture, so wide [mm], and its titles in one text; maps side by side keep the names of their runs anyway."""
     with _style(width):
-        figure = KINDS[kind](runs, None if width is None else width / 25.4)
+        figure = _draw(kind, runs, None if width is None else width / 25.4)
         texts = [" ".join(axis.get_title().split()) for axis in figure.axes]
         if not titles:
             figure.suptitle("")
-            names = [run.name for run in runs] if kind == "map" and len(runs) > 1 else [""] * len(figure.axes)
-            for axis, name in zip(figure.axes, names if kind != "summary" else ()):
-                axis.set_title(name)
+            names = [run.name for run in runs] if kind == "map" and len(runs) > 1 else []
+            for i, axis in enumerate(figure.axes if kind != "summary" else ()):
+                axis.set_title(names[i] if i < len(names) else "")
     return figure, ". ".join([_title(runs), *filter(None, texts)]) + "."
 
 
@@ -141,63 +143,55 @@ def _style(width: float | None) -> AbstractContextManager[None]:
     return rc_context(_STYLE | (_SMALL_STYLE if width is not None and width / 25.4 < _PAGE else {}))
 
 
-def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
-    """All at a glance: path and maps above, errors and times below; in a column one below the other."""
-    maps = runs[:_MOST_MAPS]
-    column = width is not None and width < _COLUMN
-    width = width or max(10.0, 4.4 * (1 + len(maps)))
+def _layout(kind: str, maps: list[str], width: float | None) -> tuple[float, list[list[Any]], list[float]]:
+    """Width of a picture [in], names of its panels in rows, and heights of the rows [in].
+
+    Nested rows have margins of their own. In a narrow column panels stand one below the other.
+    """
+    column, count = width is not None and width < _COLUMN, len(maps)
+    if kind == "summary":
+        wide = width or max(10.0, 4.4 * (1 + count))
+        if column:
+            rows = [[[[name]]] for name in ("path", *maps, "key")] + [[[["position"], ["rotation"]]], [[["time"]]]]
+            return wide, rows, [0.9 * wide, *[0.95 * wide] * count, 1.0, 3.2, 2.6]
+        below = [["position", "time"], ["rotation", "time"]]
+        return wide, [[[["path", *maps]]], ["key"], [below]], [wide / (1 + count), 0.5, 4.2]
+    if kind == "map":
+        wide = width or 5.0 * count
+        if column:
+            return wide, [*([name] for name in maps), ["key"]], [*[wide] * count, 0.9]
+        return wide, [maps, ["key"] * count], [wide / count, 0.5]
+    if kind == "path":
+        return width or 5.0, [["path"]], [0.92 * (width or 5.0)]
+    if kind == "errors":
+        return width or 6.0, [["position"], ["rotation"]], [1.8, 1.8]
+    return width or 6.0, [["time"]], [2.6]
+
+
+def _draw(kind: str, runs: Sequence[RunData], width: float | None) -> Figure:
+    """The panels of a picture with all that is in them."""
+    from matplotlib.figure import Figure
+
+    maps = [f"map {k}" for k in range(len(runs[:_MOST_MAPS] if kind == "summary" else runs))]
+    wide, rows, heights = _layout(kind, maps, width)
     lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
-    text = "\n".join(wrapped(line, 1.1 * width) for line in lines)
-    head = 0.18 * (1 + text.count("\n"))
-    if column:
-        heights = [0.9 * width, 0.95 * width * len(maps), max(width, 4.8), 1.9 + 0.4 * len(runs)]
-        figure = _figure(width, sum(heights) + head)
-        first, second, left, right = np.asarray(figure.subfigures(4, 1, height_ratios=heights))
-        path_axis, map_axes = first.subplots(), list(second.subplots(len(maps), 1, squeeze=False).ravel())
-    else:
-        side = width / (1 + len(maps))
-        figure = _figure(width, 0.95 * side + 5.4 + head)
-        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(0.95 * side + 0.4, 5.0)))
-        left, right = np.asarray(below.subfigures(1, 2, width_ratios=(3, 2)))
-        path_axis, *map_axes = above.subplots(1, 1 + len(maps))
-    path_panel(path_axis, runs)
-    map_panels(map_axes, maps)
-    error_panels(left.subplots(4, 1, sharex=True), runs)
-    time_panel(right.subplots(), runs)
-    figure.suptitle(text, x=0.01, ha="left")
+    head = "\n".join(textwrap.fill(line, int(_LETTERS * wide)) for line in lines) if kind == "summary" else ""
+    figure = Figure(figsize=(wide, sum(heights) + (0.17 * head.count("\n") + 0.3 if head else 0.0)))
+    figure.set_layout_engine("constrained", w_pad=0.08)
+    panels: dict[str, Axes] = figure.subplot_mosaic(rows, height_ratios=heights)
+    if "path" in panels:
+        draw_paths(panels["path"], runs)
+    if "key" in panels:
+        draw_maps([panels[name] for name in maps], runs, panels["key"])
+    if "position" in panels:
+        draw_errors([panels["position"], panels["rotation"]], runs)
+    if "time" in panels:
+        draw_times(panels["time"], runs)
+    if head:
+        for axis in panels.values():
+            axis.set_title(textwrap.fill(axis.get_title(), int(_LETTERS * min(wide, 5.0))))
+        figure.suptitle(head, x=0.01, ha="left")
     return figure
-
-
-def _path(runs: Sequence[RunData], width: float | None) -> Figure:
-    figure = _figure(width or 5.0, 0.92 * (width or 5.0))
-    path_panel(figure.subplots(), runs)
-    return figure
-
-
-def _map(runs: Sequence[RunData], width: float | None) -> Figure:
-    rows, columns = (len(runs), 1) if width is not None and width < _COLUMN else (1, len(runs))
-    width = width or 5.0 * columns
-    figure = _figure(width, width / columns * rows + 0.3)
-    map_panels(list(figure.subplots(rows, columns, squeeze=False).ravel()), runs)
-    return figure
-
-
-def _errors(runs: Sequence[RunData], width: float | None) -> Figure:
-    figure = _figure(width or 6.0, max(width, 4.8) if width else 5.6)  # below 4.8 in the labels of the axes overlap
-    error_panels(figure.subplots(4, 1, sharex=True), runs)
-    return figure
-
-
-def _time(runs: Sequence[RunData], width: float | None) -> Figure:
-    figure = _figure(width or 6.0, 1.9 + 0.4 * len(runs))
-    time_panel(figure.subplots(), runs)
-    return figure
-
-
-#: Figures by name.
-KINDS: dict[str, Callable[[Sequence[RunData], float | None], Figure]] = {
-    "summary": _summary, "path": _path, "map": _map, "errors": _errors, "time": _time,
-}  # fmt: skip
 
 
 def _title(runs: Sequence[RunData]) -> str:
@@ -206,9 +200,3 @@ def _title(runs: Sequence[RunData]) -> str:
     frames = ", ".join(dict.fromkeys(f"{len(run.status)} frames" for run in runs))
     frames += "".join(f"; {name}: {count} not tracked" for name, count in lost.items() if count)
     return f"{runs[0].sequence}: {frames}"
-
-
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")

@@ -6,7 +6,6 @@ A row has the figure's name, unit, place in the summary, and which way is better
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,25 +18,25 @@ from slam.evaluation.metrics import chi_square_band
 
 @dataclass(frozen=True)
 class Metric:
-    """One figure of merit.
+    """One figure.
 
     Attributes:
         key: column of the tables.
         label: for people.
-        better: ``"lower"``, ``"higher"``, ``"one"`` (1 is honest; both ways off is worse), or ``""`` (neither).
-        main: one of those that a summary speaks of.
         unit: in which people see it.
         scale: of that unit, by the unit of the key.
-        place: keys of a run's summary one below the other; empty where the summary does not have it.
+        better: ``"lower"``, ``"higher"``, ``"one"`` (1 is honest; both ways off is worse), or ``""`` (neither).
+        place: keys of a run's summary one below the other; empty where it is not simply there.
+        main: one of those that a comparison's conclusions speak of.
     """
 
     key: str
     label: str
-    better: str = ""
-    main: bool = False
     unit: str = ""
     scale: float = 1.0
+    better: str = ""
     place: tuple[str, ...] = ()
+    main: bool = False
 
     @property
     def title(self) -> str:
@@ -56,13 +55,10 @@ def number(value: float) -> str:
     return (f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}").replace("-", "−")
 
 
-#: Share of the runs that came to their end: known of every run, also of those that have no other figure.
-COMPLETED = Metric("completed", "runs completed", "higher", True, "%", 100)
+_MM, _PERCENT, _DEG = ("mm", 1e3), ("%", 100.0), ("deg", 1.0)
+_ONLINE, _HONEST, _MOVING = ("accuracy", "online"), ("consistency",), ("objects", "features")
 
-_ONLINE, _FINAL, _HONEST = ("accuracy", "online"), ("accuracy", "final"), ("consistency",)
-_MM, _PERCENT, _FRAMES = ("mm", 1e3), ("%", 100.0), ("frames", 1.0)
-
-#: NEES by key, the best to judge by first (errors from the start add up): over what, place, whether it is a main one.
+#: NEES by key, the best to judge by first (errors from the start add up): over what, name in a summary, main or not.
 _NEES = {
     "nees_10m_per_dof": ("over 10 m", "NEES over 10 m", True),
     "nees_1m_per_dof": ("over 1 m", "NEES over 1 m", False),
@@ -71,93 +67,99 @@ _NEES = {
 }
 _FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
-#: In the order of the tables. Times are apart: they differ from run to run.
+#: Share of the runs that came to their end: known of every run, also of those that have no other figure.
+COMPLETED = Metric("completed", "runs completed", *_PERCENT, "higher", (), True)
+
+#: In the order of a comparison's tables. Times are apart: they differ from run to run.
 METRICS = (
-    Metric("ate_online_m", "ATE RMSE, online", "lower", True, *_MM, (*_ONLINE, "ATE RMSE [m]")),
-    Metric("ate_final_m", "ATE RMSE, final", "lower", True, *_MM, (*_FINAL, "ATE RMSE [m]")),
-    Metric("ate_without_loops_m", "ATE RMSE, online, loops left out", "lower", False, *_MM,
+    Metric("ate_online_m", "online path error (ATE)", *_MM, "lower", (*_ONLINE, "ATE RMSE [m]"), True),
+    Metric("ate_final_m", "final path error (ATE)", *_MM, "lower", ("accuracy", "final", "ATE RMSE [m]"), True),
+    Metric("ate_without_loops_m", "path error without loops (ATE)", *_MM, "lower",
            ("accuracy", "online without loops", "ATE RMSE [m]")),
     Metric("loops_closed", "loops closed", place=("loops", "closed")),
     Metric("loops_refused", "loops refused", place=("loops", "refused")),
-    Metric("rpe_1s_m", "RPE RMSE over 1 s", "lower", False, *_MM, (*_ONLINE, "RPE RMSE over 1 s [m]")),
-    Metric("rpe_1s_deg", "RPE RMSE over 1 s, rotation", "lower", False, "deg", 1.0,
+    Metric("rpe_1s_m", "drift in 1 s (RPE)", *_MM, "lower", (*_ONLINE, "RPE RMSE over 1 s [m]")),
+    Metric("rpe_1s_deg", "drift in 1 s, rotation (RPE)", *_DEG, "lower",
            (*_ONLINE, "RPE rotation RMSE over 1 s [deg]")),
-    Metric("segment_percent", "RPE by distance", "lower", False, "%", 1.0, (*_ONLINE, "segment error [%]")),
-    Metric("scale_error_percent", "scale error, absolute", "lower", False, "%", 1.0, (*_HONEST, "scale error [%]")),
-    Metric("scale_sigma_percent", "scale sigma (claimed)", "", False, "%", 1.0, (*_HONEST, "scale sigma [%]")),
-    *(Metric(key, f"NEES / 6 {over} (1 is right)", "one", main, place=(*_HONEST, name))
+    Metric("segment_percent", "drift by distance (RPE)", "%", 1.0, "lower", (*_ONLINE, "segment error [%]")),
+    Metric("scale_error_percent", "scale error", "%", 1.0, "lower", (*_HONEST, "scale error [%]")),
+    *(Metric(key, f"NEES / 6 {over} (1 is right)", "", 1.0, "one", (*_HONEST, name), main)
       for key, (over, name, main) in _NEES.items()),
-    *(Metric(f"{key}_left_out", f"stretches {over} not judged", "", False, *_PERCENT,
-             (*_HONEST, f"no covariance {over}")) for key, (over, _, _) in _NEES.items() if over != "from the start"),
-    Metric("nis_per_dof", "NIS / dof (up to 1 is right)",
-           place=(*_HONEST, "NIS per degree of freedom")),
-    Metric("landmark_error_m", "landmark error, median", "lower", True, *_MM),
-    Metric("landmark_error_90_m", "landmark error, 90 % below", "lower", False, *_MM),
-    Metric("association_precision", "association precision", "higher", False, *_PERCENT),
-    Metric("tracked", "frames tracked", "higher", True, *_PERCENT),
-    Metric("frames_lost", "frames lost", "", False, *_PERCENT),
-    Metric("frames_predicted", "frames predicted", "", False, *_PERCENT),
-    Metric("frames_failed", "frames failed", "", False, *_PERCENT),
+    Metric("nis_per_dof", "NIS / dof (up to 1 is right)", place=(*_HONEST, "NIS per degree of freedom")),
+    Metric("landmark_error_m", "median landmark error", *_MM, "lower", (), True),
+    Metric("landmark_error_90_m", "landmark error, 90 % are below", *_MM, "lower"),
+    Metric("association_precision", "association precision", *_PERCENT, "higher"),
+    Metric("tracked", "frames tracked", *_PERCENT, "higher", (), True),
     Metric("map_size", "landmarks in the map, mean"),
     Metric("used_per_frame", "observations used per frame"),
+    Metric("moving_precision", "moving features, precision", *_PERCENT, "higher", (*_MOVING, "precision")),
+    Metric("moving_recall", "moving features, recall", *_PERCENT, "higher", (*_MOVING, "recall")),
+    Metric("body_coverage", "moving bodies, frames found", *_PERCENT, "higher"),
+    Metric("body_error_m", "motion of a body, error", *_MM, "lower"),
+    Metric("body_error_deg", "motion of a body, rotation error", *_DEG, "lower"),
+    Metric("body_nees_per_dof", "NEES / 6 of bodies (1 is right)", "", 1.0, "one"),
 )  # fmt: skip
 
 BY_KEY = {metric.key: metric for metric in METRICS}
 
-#: Frames whose pose was not measured: they are in no figure of accuracy, and counted here. The share tracked is tested.
-UNTRACKED = ("frames_lost", "frames_predicted", "frames_failed")
-
-#: What a run's own table says besides, without a better or worse: above the other figures, and below them.
-_ABOVE = (
-    Metric("landmarks", "landmarks at the end", place=("landmarks",)),
-    Metric("path_m", "path length", unit="m", place=("path_length_m",)),
-    Metric("speed", "speed, median", unit="m/s", place=("speed_m_per_s",)),
-    Metric("sigma_m", "σ of the last position", "", False, *_MM, ("final_sigma_m",)),
+#: The rows of a run's own table, below "frames tracked"; those of `METRICS` by their keys.
+_OF_RUN = (
+    Metric("path_m", "path length", "m", place=("path_length_m",)),
+    Metric("speed", "speed, median", "m/s", place=("speed_m_per_s",)),
+    Metric("landmarks", "landmarks in the map at the end", place=("landmarks",)),
     Metric("bodies", "moving bodies found", place=("bodies",)),
-)
-_BELOW = (
+    *(BY_KEY[key] for key in ("body_coverage", "body_error_m", "loops_closed", "ate_online_m", "ate_final_m",
+                              "rpe_1s_m", "segment_percent")),
+    Metric("sigma_m", "claimed σ of the last position", *_MM, place=("final_sigma_m",)),
+    Metric("ratio", "errors over claimed σ (1 is right)"),
     Metric("dropped", "frames dropped", place=("live", "frames dropped")),
-    Metric("behind", "behind, median", unit="ms", place=("live", "milliseconds behind", "median")),
-    Metric("behind_most", "behind, most", unit="ms", place=("live", "milliseconds behind", "max")),
-    Metric("milliseconds", "stages of a frame, median", unit="ms", place=("milliseconds", "median_total")),
-    Metric("rate", "frames per second", place=("frames_per_second",)),
-    Metric("compiling", "kernels compiled, apart", unit="s", place=("compile_seconds",)),
-)
+    Metric("behind", "behind, median", "ms", place=("live", "milliseconds behind", "median")),
+    Metric("behind_most", "behind, most", "ms", place=("live", "milliseconds behind", "max")),
+    Metric("milliseconds", "time of a frame, median", "ms", place=("milliseconds", "median_total")),
+    Metric("compiling", "compiling, once", "s", place=("compile_seconds",)),
+)  # fmt: skip
 _COMPILED = 0.05  # compile times below this [s] are not worth a row
+_IN_PICTURE = ("path_m", "speed", "bodies", "loops_closed", "ate_online_m", "sigma_m")
 
-#: Figures of a comparison that a run's own table leaves out: shares of its status, which it shows in words.
-_NOT_OF_ONE_RUN = ("tracked", *UNTRACKED, "scale_sigma_percent")
+#: Figures of moving bodies, which are means over these, by their place in what is said of one.
+_OF_BODIES = {
+    "body_coverage": ("coverage",),
+    "body_error_m": ("ME", "translation median [m]"),
+    "body_error_deg": ("ME", "rotation median [deg]"),
+    "body_nees_per_dof": ("mean NEES",),
+}
 
-#: Of a moving body, what a run's own table says.
-_OF_BODIES = ("coverage", "ME translation median [m]", "ME rotation median [deg]")
 
-_BODY_NEES = "NEES / degree of freedom"
-_SHARES = ("precision", "recall", "F1", "coverage", "counted right")
-_UNITS = {"m": _MM, "deg": ("deg", 1.0), "frames": _FRAMES}
+_NOT_JUDGED = (
+    "covariances cannot be judged: they leave none for the motion between two poses, as where a back end claims the "
+    "same one for every frame"
+)
 
 
 def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str]]]:
     """The table of some runs for people: label with unit, and a text per run; what no run has is left out."""
     yield "frames tracked", list(map(_tracked, summaries))
-    found = [_placed((*_ABOVE, *_BELOW), s) | figures(s) for s in summaries]
-    for one in found:
-        if not one.get("compiling", 0.0) > _COMPILED:
-            one.pop("compiling", None)
-    bodies = dict.fromkeys(
-        key for f in found for key in f if key.startswith("object bodies") and key.endswith(_OF_BODIES)
-    )
-    for metric in (*_ABOVE, *METRICS, *map(object_metric, bodies), *_BELOW):
-        values = [one.get(metric.key, float("nan")) for one in found]
-        if metric.key not in _NOT_OF_ONE_RUN and np.isfinite(values).any():
-            yield metric.title, list(map(metric.show, values))
+    found = list(map(_of_run, summaries))
+    for metric in _OF_RUN:
+        if any(metric.key in one for one in found):
+            yield metric.title, [metric.show(one.get(metric.key, np.nan)) for one in found]
 
 
 def facts(summary: Mapping[str, Any]) -> str:
-    """What a run found, also where there is no truth, and whether its covariances hold, in one line for a picture."""
-    found = _placed(_ABOVE, summary) | figures(summary)
-    shown = (*_ABOVE[1:], BY_KEY["loops_closed"], BY_KEY["loops_refused"])
-    words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown if found.get(m.key)]
+    """What a run found, also where there is no truth, and whether its covariances hold, for the head of a picture."""
+    found = _of_run(summary) if summary else {}
+    shown = [m for m in _OF_RUN if m.key in _IN_PICTURE and found.get(m.key)]
+    words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
     return "; ".join([*words, *filter(None, [verdict_of_run(summary)])])
+
+
+def _of_run(summary: Mapping[str, Any]) -> dict[str, float]:
+    """The figures of a run's own table, by key."""
+    found = _placed(_OF_RUN, summary) | figures(summary)
+    ratios = _ratios(found)
+    left_out = [key for key, least in (("compiling", _COMPILED), ("loops_closed", 0)) if not found.get(key, 0) > least]
+    found |= {"ratio": next(iter(ratios.values()))} if ratios else {}
+    return {key: value for key, value in found.items() if key not in left_out}
 
 
 def _tracked(summary: Mapping[str, Any]) -> str:
@@ -171,34 +173,46 @@ def _measured(summary: Mapping[str, Any]) -> int:
     return int(status.get("tracked", 0) + status.get("started", 0))
 
 
+def _at(tree: Any, place: Sequence[str]) -> float | None:
+    """The number at a place of a summary; None where there is none."""
+    for key in place:
+        tree = tree.get(key) if isinstance(tree, Mapping) else None
+    return None if tree is None or isinstance(tree, Mapping) else float(tree)
+
+
 def _placed(metrics: Sequence[Metric], summary: Mapping[str, Any]) -> dict[str, float]:
     """What a summary says of some figures that have a place in it, by key."""
-    found = {}
-    for metric in metrics:
-        tree: Any = summary if metric.place else None
-        for key in metric.place:
-            tree = tree.get(key) if isinstance(tree, Mapping) else None
-        if tree is not None:
-            found[metric.key] = float(tree) / (6 if metric.key in _NEES else 1)
-    return found
+    values = ((metric.key, _at(summary, metric.place)) for metric in metrics if metric.place)
+    return {key: value / (6 if key in _NEES else 1) for key, value in values if value is not None}
 
 
 def figures(summary: Mapping[str, Any]) -> dict[str, float]:
-    """What a run's summary says, by key of `METRICS`, and ``object …`` figures; what it does not say is left out."""
+    """What a run's summary says, by key of `METRICS`; what it does not say is left out."""
     found = _placed(METRICS, summary)
-    for key in _NEES:
-        if found.get(f"{key}_left_out", 0.0) > _FEW:
+    for key, (over, _, _) in _NEES.items():
+        if (_at(summary, (*_HONEST, f"no covariance {over}")) or 0.0) > _FEW:
             found.pop(key, None)
     if "scale_error_percent" in found:
         found["scale_error_percent"] = abs(found["scale_error_percent"])
     if not found.get("loops_closed", 0) + found.get("loops_refused", 0):
         found = {key: value for key, value in found.items() if not key.startswith("loops")}
     if frames := summary.get("frames", 0):
-        status = summary.get("status", {})
         found["tracked"] = _measured(summary) / frames
-        found |= {key: status.get(key.removeprefix("frames_"), 0) / frames for key in UNTRACKED}
         found["used_per_frame"] = summary.get("observations", {}).get("used", 0) / frames
-    return {**found, **object_figures(summary)}
+    moved = [body for body in summary.get("objects", {}).get("bodies", {}).values() if body["frames in view"]]
+    if not moved:  # what is found of nothing is no figure
+        return {key: value for key, value in found.items() if not key.startswith("moving_")}
+    for key, place in _OF_BODIES.items():
+        values = [value for body in moved if (value := _at(body, place)) is not None]
+        if values:
+            found[key] = float(np.mean(values)) / (6 if key.startswith("body_nees") else 1)
+    return found
+
+
+def _ratios(found: Mapping[str, float]) -> dict[str, float]:
+    """How many times as large as claimed errors are, and over what; the one to judge by first."""
+    known = ((over, found.get(key, np.nan)) for key, (over, _, _) in _NEES.items())
+    return {over: float(np.sqrt(nees)) for over, nees in known if np.isfinite(nees)}
 
 
 def verdict(found: Mapping[str, float], runs: int = 1) -> str:
@@ -209,67 +223,26 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
         runs: how many. The band is that of as many independent values: it holds even if all frames of a run are as good
             as one, which errors of the rig make them.
     """
-    low, high = (bound / 6 for bound in chi_square_band(6, max(runs, 1)))
-    known = {over: found[key] for key, (over, _, _) in _NEES.items() if np.isfinite(found.get(key, np.nan))}
-    if not known:
+    low, high = (np.sqrt(bound / 6) for bound in chi_square_band(6, max(runs, 1)))
+    ratios = _ratios(found)
+    if not ratios:
         return ""
-    said = {w: "are too small" if v > high else "are too large" if v < low else "hold" for w, v in known.items()}
-    judged = next(iter(known))
-    others = [f"{w} {number(known[w])}: they {said[w]}" for w in known if said[w] != said[judged]]
-    word = "hold in part" if others and said[judged] == "hold" else said[judged]
+    said = {over: "too small" if r > high else "too large" if r < low else "right" for over, r in ratios.items()}
+    judged, ratio = next(iter(ratios.items()))
+    others = [f"{over} {number(ratios[over])} times: {word}" for over, word in said.items() if word != said[judged]]
+    word = f"are {said[judged]}" if said[judged] != "right" else "hold in part" if others else "hold"
     of = "runs" if runs == 1 else f"means of {runs} runs"
-    text = (
-        f"covariances {word}: NEES / 6 {judged} is {number(known[judged])} ({low:.2f} to {high:.2f} in 95 % of {of}); "
-        f"errors are {np.sqrt(known[judged]):.2f} times what they claim"
-    )
-    return "; ".join([text, *others])
+    times = f"{judged} errors are {number(ratio)} times what they claim ({low:.2f} to {high:.2f} in 95 % of {of})"
+    return "; ".join([f"covariances {word}: {times}", *others])
 
 
 def verdict_of_run(summary: Mapping[str, Any]) -> str:
-    """`verdict` on a run by its summary, with what it leaves out; empty where no NEES is known."""
-    text = verdict(figures(summary))
+    """`verdict` on a run by its summary, with what it leaves out; empty where no true path is known."""
+    text, honest = verdict(figures(summary)), summary.get("consistency") or {}
     if not text:
-        return ""
-    if "are too large" in text and summary["consistency"].get(EXACT):
+        return _NOT_JUDGED if honest.get("dof") else ""
+    if "are too large" in text and honest.get(EXACT):
         text += "; they count errors of the calibration, and this world's cameras have none"
     if left_out := summary["frames"] - _measured(summary):
         text += f"; not judged: {left_out} of {summary['frames']} frames, whose pose was not measured"
     return text
-
-
-def object_metric(key: str) -> Metric:
-    """A figure of moving objects by the key that `object_figures` gives it."""
-    text = key.removeprefix("object ")
-    label = f"objects: {text}"
-    if body := re.match(r"bodies (\d+) (ME (\w+))?", text):
-        label = f"body {body[1]}: {f'{body[3]} error,' if body[2] else ''}{text[body.end() :]}"
-    if key.endswith(_SHARES):
-        return Metric(key, label, "higher", False, *_PERCENT)
-    if key.endswith(_BODY_NEES):
-        return Metric(key, label, "one")
-    name, bracket, unit = label.removesuffix("]").rpartition(" [")
-    lower = "lower" if bracket or "false" in key else ""
-    return Metric(key, name, lower, False, *_UNITS[unit]) if unit in _UNITS else Metric(key, label, lower)
-
-
-def object_figures(summary: Mapping[str, Any]) -> dict[str, float]:
-    """Plain numbers that a run's summary has on moving objects, where something detects them.
-
-    What is found of the moving features has no value where no body has moved.
-    """
-    found = dict(_leaves("object", summary.get("objects")))
-    for key in [key for key in found if key.endswith(" mean NEES")]:
-        name = key.removesuffix("mean NEES")
-        found[name + _BODY_NEES] = found.pop(key) / found.pop(name + "dof", 6.0)
-    if not any(value for key, value in found.items() if key.endswith(" frames in view")):
-        found = {key: value for key, value in found.items() if not key.endswith(("precision", "recall", "F1"))}
-    return found
-
-
-def _leaves(name: str, tree: Any) -> Iterator[tuple[str, float]]:
-    """Numbers of a tree, named by the keys on the way to them."""
-    if isinstance(tree, Mapping):
-        for key, value in tree.items():
-            yield from _leaves(f"{name} {key}", value)
-    elif isinstance(tree, (int, float)) and not isinstance(tree, bool):
-        yield name, float(tree)

@@ -16,7 +16,7 @@ from slam.evaluation.metrics import align, associate
 from slam.evaluation.summary import rotation_errors
 from slam.evaluation.truth_error import interpolated, truth_covariances
 from slam.files import read_object, read_text
-from slam.geometry.se3 import Array, adjoint, hat, inverse, so3_exp
+from slam.geometry.se3 import Array, adjoint, hat, inverse, so3_exp, transform
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import printable
 from slam.run.schema import OLD_LANDMARKS, STAGES
@@ -34,7 +34,7 @@ class RunData:
     positions: Array  # of landmarks (N, 3) [m]
     covariances: Array  # of these (N, 3, 3) [m²]
     seen_last: np.ndarray  # which landmarks were measured in the last frame (N,)
-    deviations: Array  # of the online position in world axes [m] and of the rotation [deg], (F, 4), by pose
+    deviations: Array  # of the online position [m] and of the rotation [deg], all axes together, (F, 2), by pose
     measured: np.ndarray  # whether each pose of `online` was measured (F,), or is the motion model's alone
     status: list[str]  # of each frame
     milliseconds: dict[str, Array]  # by stage, of each frame [ms]
@@ -46,7 +46,6 @@ class RunData:
     truth_is_exact: bool  # whether the truth has no errors of its own: that of a world
     loops: np.ndarray  # rows of `final` whose places are the same (L, 2), the later one first
     refused: np.ndarray  # rows of `final` whose places only looked alike (L, 2), the later one first
-    keyframes: np.ndarray  # rows of `final` (K,)
     old: Array  # landmarks that had left the map before the end (M, 3) [m]
     bodies: Mapping[str, Array]  # where moving bodies were measured (B, 3) [m], by id
     summary: Mapping[str, Any]  # of the run; empty where there is none
@@ -70,14 +69,13 @@ class RunData:
         last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
         final = Trajectory.read_tum(folder / "trajectory_final.txt")
         located = [row for row in frames if row["sd_x"]]
+        sd = _numbers(located, ("sd_x", "sd_y", "sd_z", "sd_rotation"))
         config, stamps = read_object(folder / "config.json"), {row["frame"]: float(row["stamp"]) for row in frames}
-
-        def rows_at(stamps: Any) -> np.ndarray:
-            return np.searchsorted(final.stamps, np.array(stamps, float) - 1e-9).clip(0, max(len(final) - 1, 0))
 
         def pairs(column: str) -> np.ndarray:
             found = [(stamps[row["frame"]], stamps[row[column]]) for row in frames if (row[column] or "").isdigit()]
-            return rows_at(found).reshape(-1, 2)
+            rows = np.searchsorted(final.stamps, np.array(found, float).reshape(-1, 2) - 1e-9)
+            return rows.clip(0, max(len(final) - 1, 0))
 
         bodies: dict[str, list[list[float]]] = {}
         for _, body, position in read_objects(folder):
@@ -92,7 +90,7 @@ class RunData:
             positions=_numbers(landmarks, ("x", "y", "z")),
             covariances=upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
             seen_last=last_seen == int(frames[-1]["frame"]),
-            deviations=_numbers(located, ("sd_x", "sd_y", "sd_z", "sd_rotation")) * [1, 1, 1, np.degrees(1)],
+            deviations=np.column_stack([np.linalg.norm(sd[:, :3], axis=1), np.degrees(sd[:, 3])]),
             measured=np.array([row["status"] in ("started", "tracked") for row in located], bool),
             status=[row["status"] for row in frames],
             milliseconds={stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},
@@ -104,7 +102,6 @@ class RunData:
             truth_is_exact=config["format"] == "synthetic",
             loops=pairs("loop"),
             refused=pairs("refused"),
-            keyframes=rows_at([float(row["stamp"]) for row in frames if row["keyframe"] == "1"]),
             old=_numbers(_rows(old) if old.exists() else [], ("x", "y", "z")),
             bodies={body: np.array(positions) for body, positions in bodies.items()},
             summary=summary,
@@ -146,14 +143,15 @@ def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
     return np.array([[float(row[c] or "nan") for c in columns] for row in rows]).reshape(-1, len(columns))
 
 
-def _paired(run: RunData, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+def _paired(run: RunData) -> tuple[Trajectory, Trajectory]:
     """The online and the true path at common stamps, without poses of the truth that were not measured."""
-    own, true = associate(run.online, truth, 0.02, interpolated=True)
+    assert run.truth is not None
+    own, true = associate(run.online, run.truth, 0.02, interpolated=True)
     rows = np.flatnonzero(~interpolated(true, run.truth_noise))
     return (own.select(rows), true.select(rows)) if len(rows) else (own, true)
 
 
-def place_of_truth(run: RunData, truth: Trajectory) -> Array:
+def place_of_truth(run: RunData) -> Array:
     """Pose (4, 4) of the true path's world in the run's, in which both paths begin at the same position.
 
     It is turned by the first pose. A recorded one is turned a little further, so that the whole paths fit: an error of
@@ -161,7 +159,7 @@ def place_of_truth(run: RunData, truth: Trajectory) -> Array:
     What the paths do not tell, such as a turn about a straight path, stays as it was. Where no little turn makes them
     fit, the truth's orientations are in other axes, and the paths alone count.
     """
-    own, true = _paired(run, truth)
+    own, true = _paired(run)
     T, turn = np.eye(4), own.poses[0, :3, :3] @ true.poses[0, :3, :3].T
     T[:3, :3] = turn
     if not run.truth_is_exact:
@@ -179,27 +177,25 @@ def place_of_truth(run: RunData, truth: Trajectory) -> Array:
 
 
 def pose_errors(run: RunData) -> tuple[Array, Array, Array]:
-    """Time since the start (N,) [s], errors of the online pose and their standard deviations, (N, 4) each.
+    """Time since the start (N,) [s], errors of the online pose and their standard deviations, (N, 2) each.
 
-    The first three columns are the position along the axes of the run's world [m], see `place_of_truth`; the last one
-    is the angle of the rotation's error [deg]. Without a truth the errors are zero. Standard deviations are those that
-    the back end claims and those of the truth together, as the NEES from the start has them.
+    The columns are the distance from the true position [m], see `place_of_truth`, and the angle of the rotation's error
+    [deg]. Without a truth the errors are zero. Standard deviations are those of all axes together, that the back end
+    claims and that of the truth, as the NEES from the start has them.
     """
     if run.truth is None:
         stamps = run.online.stamps
-        return stamps - stamps[0], np.zeros((len(stamps), 4)), run.deviations
-    own, true = _paired(run, run.truth)
-    T = place_of_truth(run, run.truth)
-    expected = true.positions @ T[:3, :3].T + T[:3, 3]
+        return stamps - stamps[0], np.zeros((len(stamps), 2)), run.deviations
+    own, true = _paired(run)
+    off = np.linalg.norm(own.positions - transform(place_of_truth(run), true.positions), axis=1)
     turned = np.linalg.norm(rotation_errors(own, true, 0.0 if run.truth_is_exact else _TURNED), axis=1)
-    errors = np.column_stack([own.positions - expected, np.degrees(turned)])
     first, last = np.zeros(len(own), np.intp), np.arange(len(own))
     A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
-    P, R = truth_covariances(true, run.truth_noise, first, last, A), own.poses[:, :3, :3]
-    of_truth = np.diagonal(R @ P[:, 3:, 3:] @ np.swapaxes(R, 1, 2), axis1=1, axis2=2)
-    of_truth = np.column_stack([of_truth, np.degrees(1) ** 2 * np.trace(P[:, :3, :3], axis1=1, axis2=2)])
+    P = truth_covariances(true, run.truth_noise, first, last, A)
+    of_truth = np.column_stack([np.trace(P[:, i : i + 3, i : i + 3], axis1=1, axis2=2) for i in (3, 0)])
     claimed = run.deviations[np.searchsorted(run.online.stamps, own.stamps)]
-    return own.stamps - run.online.stamps[0], errors, np.sqrt(claimed**2 + np.maximum(of_truth, 0.0))
+    sigma = np.sqrt(claimed**2 + np.maximum(of_truth, 0.0) * [1, np.degrees(1) ** 2])
+    return own.stamps - run.online.stamps[0], np.column_stack([off, np.degrees(turned)]), sigma
 
 
 def well_known(run: RunData) -> np.ndarray:

@@ -96,7 +96,7 @@ def run(
     if live is not None:  # before its clock starts, with its first frame
         warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
     record = RunRecord() if record is None else record
-    results = _processed(system, frames, live, tuple(watches), options.overlap, record)
+    results = _processed(system, frames, live, tuple(watches), record)
     return _Run(sequence, options, system, record, live).drive(results, on_frame)
 
 
@@ -131,7 +131,6 @@ def _processed(
     frames: Iterator[StereoFrame],
     live: LiveFrames | None,
     watches: tuple[Watch, ...],
-    overlap: bool,
     record: RunRecord,
 ) -> Iterator[tuple[int, FrameResult]]:
     """Each frame's number and what the system did with it; a live run's time of reading is one of waiting, and 0."""
@@ -146,7 +145,7 @@ def _processed(
             reading[frame.index] = 1e3 * (time.perf_counter() - start) if live is None else 0.0
             yield frame
 
-    for frame, result in system.run(timed(), overlap):
+    for frame, result in system.run(timed()):
         result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
         if live is not None:
             record.ages.append(live.age(frame))

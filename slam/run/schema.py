@@ -27,14 +27,11 @@ FRAMES = {
     "body": "fixed to a moving body; when it is found the axes are the world's, the origin is the mean of its points",
 }
 
-#: Components of a covariance of six, in their order.
-TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 
+class Column(NamedTuple):
+    """A column: name, unit (empty for counts, words and ratios), what it holds, in which frame of coordinates."""
 
-class Columns(NamedTuple):
-    """Columns of one kind: names, the unit of all (empty for counts, words and ratios), what they hold, which frame."""
-
-    names: tuple[str, ...]
+    name: str
     unit: str
     text: str
 
@@ -44,10 +41,10 @@ def _upper(prefix: str, names: str) -> str:
     return " ".join(f"{prefix}{a}{b}" for i, a in enumerate(names) for b in names[i:])
 
 
-def _table(*rows: str) -> tuple[Columns, ...]:
-    """Rows of ``names | unit | meaning``."""
+def _table(*rows: str) -> tuple[Column, ...]:
+    """Rows of ``names | unit | meaning``; columns whose names stand in one row share unit and meaning."""
     cells = ([cell.strip() for cell in row.split("|")] for row in rows)
-    return tuple(Columns(tuple(names.split()), unit, text) for names, unit, text in cells)
+    return tuple(Column(name, unit, text) for names, unit, text in cells for name in names.split())
 
 
 _POSE = _table(
@@ -70,7 +67,7 @@ FRAME_TABLE = _table(
     "nis nis_dof | | normalised innovation squared of the measurements used, and its degrees of freedom",
     "sd_x sd_y sd_z | m | standard deviations of the position, along the axes of the world",
     "sd_rotation | rad | standard deviation of the orientation, all three axes together",
-    f"{' '.join(f'ms_{stage}' for stage in STAGES)} | ms | wall time of each stage: {', '.join(STAGE_NAMES.values())}",
+    *(f"ms_{stage} | ms | wall time of a stage: {text}" for stage, text in STAGE_NAMES.items()),
 )
 
 LANDMARK_TABLE = _table(
@@ -101,10 +98,10 @@ OBJECT_TABLE = _table(
 #: Landmarks that had left the map before the end.
 OLD_LANDMARKS = "landmarks_old.csv"
 
-OLD_TABLE = LANDMARK_TABLE[:2]
+OLD_TABLE = LANDMARK_TABLE[:4]  # id, x, y, z
 
 #: Files that are tables, with their columns.
-TABLES: dict[str, tuple[Columns, ...]] = {
+TABLES: dict[str, tuple[Column, ...]] = {
     "trajectory.txt": _POSE,
     "trajectory_final.txt": _POSE,
     "truth.txt": _POSE,
@@ -130,9 +127,9 @@ FILES = {
 }
 
 
-def header(table: tuple[Columns, ...]) -> tuple[str, ...]:
+def header(table: tuple[Column, ...]) -> tuple[str, ...]:
     """Names of all columns of a table."""
-    return tuple(name for columns in table for name in columns.names)
+    return tuple(column.name for column in table)
 
 
 def schema(config: SystemConfig, frontend: object, backend: object) -> dict[str, Any]:
@@ -140,25 +137,7 @@ def schema(config: SystemConfig, frontend: object, backend: object) -> dict[str,
     settings = descriptions(config, "")
     for section, part in (("frontend", frontend), ("backend", backend)):
         settings |= descriptions(getattr(part, "config", None), section)
-    files = {name: {"meaning": text} | _columns(name) for name, text in FILES.items()}
+    files: dict[str, dict[str, Any]] = {name: {"meaning": text} for name, text in FILES.items()}
+    for name, table in TABLES.items():
+        files[name]["columns"] = [{"name": c.name, "unit": c.unit, "meaning": c.text} for c in table]
     return {"files": files, "frames": FRAMES, "settings": settings}
-
-
-def _columns(name: str) -> dict[str, Any]:
-    """The columns of a table, one by one; nothing for other files."""
-    if name not in TABLES:
-        return {}
-    every = [(column, columns) for columns in TABLES[name] for column in columns.names]
-    return {"columns": [{"name": column, **_described(column, columns)} for column, columns in every]}
-
-
-def _described(name: str, columns: Columns) -> dict[str, str]:
-    """Unit and meaning of one column: its very components, where it is of a covariance, and its very stage."""
-    if name[0] == "c" and name[1:].isdigit():
-        row, column = (int(digit) for digit in name[1:])
-        unit = ("rad²", "rad·m", "m²")[(row > 2) + (column > 2)]
-        text = f"covariance of {TWIST[row]} and {TWIST[column]} of the pose, r rotation and t translation, body axes"
-        return {"unit": unit, "meaning": text}
-    if name.removeprefix("ms_") in STAGE_NAMES:
-        return {"unit": columns.unit, "meaning": f"wall time of a stage: {STAGE_NAMES[name.removeprefix('ms_')]}"}
-    return {"unit": columns.unit, "meaning": columns.text}

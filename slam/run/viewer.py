@@ -27,7 +27,8 @@ from slam.system import StereoSlam
 LIVE = "live"
 
 _SIGMAS = 2.0
-_SEEN, _UNSEEN, _NEW, _PATH, _TRUTH = (229, 57, 53), (124, 179, 66), (255, 235, 59), (21, 101, 192), (120, 120, 120)
+_SEEN, _UNSEEN, _NEW, _PATH, _TRUTH = (40, 53, 147), (159, 168, 218), (255, 235, 59), (21, 101, 192), (120, 120, 120)
+_MEASURED = (0, 230, 118)  # in images
 _PLACE, _CLOSED, _REFUSED = (0, 137, 123), (142, 36, 170), (240, 98, 146)
 _MOVING = (255, 145, 0)
 _MAP_EVERY = 10  # frames between two pictures of the whole map, whose covariances take their time
@@ -79,7 +80,7 @@ class Viewer:
         if image.dtype == np.uint8 and self._rig is not None:
             self.log("/camera/image", rr.Image(image).compress(jpeg_quality=80))
         for name, rows, colour in (
-            ("measured", result.matched_features, _SEEN),
+            ("measured", result.matched_features, _MEASURED),
             ("new", result.added_features, _NEW),
             ("moving", result.moving_features, _MOVING),
         ):
@@ -96,15 +97,13 @@ class Viewer:
             self.show_map(whole.positions, whole.covariances, np.isin(whole.ids, result.matched))
 
     def show_map(self, positions: Array, covariances: Array, seen: np.ndarray) -> None:
-        """Landmarks (N, 3) with the 2σ ellipsoids of their covariances (N, 3, 3), red where they are seen."""
+        """Landmarks (N, 3) with the 2σ ellipsoids of their covariances (N, 3, 3), dark where they are seen."""
         values, vectors = np.linalg.eigh(covariances.reshape(-1, 3, 3))
         vectors *= np.sign(np.linalg.det(vectors))[:, None, None]
-        half = _SIGMAS * np.sqrt(np.maximum(values, 0))
+        half, turned = _SIGMAS * np.sqrt(np.maximum(values, 0)), quaternion(vectors)
         for name, rows, colour in (("seen", seen, _SEEN), ("not_seen", ~seen, _UNSEEN)):
-            shapes = self.rr.Ellipsoids3D(
-                centers=positions[rows], half_sizes=half[rows], quaternions=quaternion(vectors[rows]), colors=colour
-            )
-            self.log(f"/map/{name}", shapes)
+            shape = {"centers": positions[rows], "half_sizes": half[rows], "quaternions": turned[rows]}
+            self.log(f"/map/{name}", self.rr.Ellipsoids3D(**shape, colors=colour))
 
     def show_pose(self, number: int, stamp: float, T_world_left: Array) -> None:
         """The camera alone."""
@@ -116,9 +115,8 @@ class Viewer:
         self.log("/camera", self._transform(T_world_left))
         if self._rig is not None:
             left = self._rig.left
-            K = [[left.fu, 0, left.u0], [0, left.fv, left.v0], [0, 0, 1]]
-            pinhole = rr.Pinhole(image_from_camera=K, resolution=[left.width, left.height], image_plane_distance=0.2)
-            self.log("/camera/image", pinhole)
+            size = {"resolution": [left.width, left.height], "image_plane_distance": 0.2}
+            self.log("/camera/image", rr.Pinhole(image_from_camera=left.K, **size))
         self.log("/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
 
     def _show_places(self, system: StereoSlam) -> None:
@@ -129,8 +127,7 @@ class Viewer:
         self.log("/places/path", rr.LineStrips3D([at[atlas.prior_count :]], colors=_PLACE))
         closed = [(loop.first, loop.second) for loop in atlas.loops]
         for name, pairs, colour in (("closed", closed, _CLOSED), ("refused", atlas.refused, _REFUSED)):
-            strips = at[np.array(pairs, int).reshape(-1, 2)]
-            self.log(f"/places/loops_{name}", rr.LineStrips3D(strips, colors=colour))
+            self.log(f"/places/loops_{name}", rr.LineStrips3D(at[np.array(pairs, int).reshape(-1, 2)], colors=colour))
 
     def _transform(self, T: Array) -> Any:
         return self.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])

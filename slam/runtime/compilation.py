@@ -66,6 +66,7 @@ def kernel(function: Callable[..., Any]) -> Any:
             return function
         index = compiled._cache._cache_file  # Numba has no public way to say that a kernel depends on other files
         index._source_stamp = (index._source_stamp, stamp(function, kernel))
+        compile_clock.kernels += not os.path.exists(index._index_path)  # noqa: PTH110 for each of some hundred
         return compiled
     except (RuntimeError, AttributeError) as error:
         _LOG.warning("set NUMBA_CACHE_DIR to a folder, or the kernels are compiled in every run: %s", error)
@@ -73,25 +74,22 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 class _Notice(event.Listener):
-    """Says once that kernels are being compiled, takes the time, and keeps the garbage collector from slowing it."""
+    """Says that kernels are being compiled, takes the time, and keeps the garbage collector from slowing it."""
 
     def __init__(self) -> None:
-        self._said = False
         self._collects = False
 
     def on_start(self, event: Any) -> None:
-        if not _is_own(event):
+        if not (_is_own(event) and compile_clock.change(1)):
             return
-        first = compile_clock.change(1)
-        if not self._said:
-            self._said = True
-            _LOG.info(
-                "compiling kernels that are not cached yet: one to three minutes for all of them, once; "
-                "`slam warm-up` does it beforehand"
-            )
-        if first:
-            self._collects = gc.isenabled()
-            gc.disable()
+        compile_clock.begun += 1
+        if compile_clock.watch is not None:
+            compile_clock.watch(compile_clock.begun, max(compile_clock.begun, compile_clock.kernels))
+        elif compile_clock.begun == 1:
+            text = "compiling kernels, once on this machine, at most %d; `slam warm-up` does it beforehand"
+            _LOG.warning(text, max(1, compile_clock.kernels))
+        self._collects = gc.isenabled()
+        gc.disable()
 
     def on_end(self, event: Any) -> None:
         if _is_own(event) and compile_clock.change(-1) and self._collects:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from threading import RLock
 
 
@@ -11,6 +12,10 @@ class CompileClock:
 
     Reading the clock needs no lock. For why a block stands on the lock's own line, see `slam.runtime.blas`.
     """
+
+    kernels = 0  # that are not cached, of the modules loaded so far
+    begun = 0  # of them, compiled or being compiled here
+    watch: Callable[[int, int], None] | None = None  # is told both numbers whenever one begins
 
     def __init__(self) -> None:
         self._lock = RLock()

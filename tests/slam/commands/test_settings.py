@@ -73,6 +73,16 @@ def test_a_mistyped_setting_is_answered_with_those_that_can_be_set(setting, word
         require_settable(["frontend.feature=3"], SystemConfig().to_json(), "surf")
 
 
+def test_settings_may_be_a_dict():
+    given = {"map.max_landmarks": 300, "objects.mode": "off", "backend.lag": 8}
+    texts = [f"{key}={value}" for key, value in given.items()]
+    assert SystemConfig().with_settings(given) == SystemConfig().with_settings(texts)
+    assert SystemConfig().with_settings({}) == SystemConfig()
+    for wrong in ({"map.colour": 1}, {3: 1}, {"map.max_landmarks": "many"}):
+        with pytest.raises(ConfigurationError, match="setting"):
+            SystemConfig().with_settings(wrong)
+
+
 def test_a_setting_of_an_earlier_version_is_one_line():
     for tree, words in (
         (

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import json
+
 import pytest
 
+from slam.commands import compare as command
 from slam.commands.compare import compare, variants_of
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
 from slam.compare.statistics import certain_of, fewest
@@ -45,6 +48,15 @@ def test_bad_plans(arguments, word):
 def test_no_more_workers_than_anybody_has(tmp_path):
     with pytest.raises(ConfigurationError, match="at most 1024 workers"):
         compare(Plan(("synthetic:desk",), ("ekf",)), tmp_path, workers=10**9)
+
+
+def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
+    """It was told by a time of a frame from another machine."""
+    times = {"milliseconds": {"total": 100.0, "read": 60.0, "extract": 20.0}}
+    monkeypatch.setattr(command, "run_trial", lambda trial: {"result.json": json.dumps(times)})
+    plan = Plan(("synthetic:aisle", "/data"), ("ekf", "window"), trials=3)
+    frames = {"synthetic:aisle": 50, "/data": 40}
+    assert command._seconds(plan, frames) == pytest.approx(2 * (3 * 50 + 40) * (0.1 + 0.02))  # replay: without images
 
 
 def test_variants():

@@ -33,7 +33,7 @@ def tables(folder):
 def swept(out, scheduler, on_done=None):
     """The runs of the plan; their tables are written."""
     runs = sweep(PLAN, out, scheduler, on_done)
-    write_tables(PLAN, runs, out)
+    write_tables(groups(PLAN, runs), runs, out)
     return runs
 
 
@@ -122,7 +122,7 @@ def test_a_failed_run_is_counted_never_dropped(again):
     assert (group.failures("ekf"), group.failures("smoother")) == (0, 1)
     d = group.differences(BY_KEY["ate_online_m"])["smoother"]
     assert (d.pairs, d.missing) == (1, 1)
-    text = write_report(PLAN, runs, again, "here").read_text()
+    text = write_report(PLAN, groups(PLAN, runs), runs, again, "here").read_text()
     assert "1 of 8 runs failed" in text
     assert "ValueError: no way" in text
     assert (again / "runs.csv").read_text().count("failed: ValueError: no way") == 1

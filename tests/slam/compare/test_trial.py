@@ -10,7 +10,7 @@ from slam.data import Estimate, FrameResult, FrameStatus, StereoFeatures, Update
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.run.results import BY_KEY, UNTRACKED, figures
+from slam.run.results import BY_KEY, figures
 from slam.run.summary import RunRecord, results_of
 
 N, SIGMA = 120, 0.01
@@ -54,13 +54,12 @@ def test_the_figures_are_those_of_the_summary():
     found, _ = measured({})
     expected = consistency(path, covariances, SEQUENCE)
     assert found["nees_per_dof"] == pytest.approx(expected["mean NEES"] / 6)
-    assert "nees_10m_per_dof" not in found and found["nees_10m_per_dof_left_out"] > 0.5  # independent errors
+    assert "nees_10m_per_dof" not in found  # independent errors: hardly a stretch has a covariance
     assert "nees_100m_per_dof" not in found  # the path is too short
     assert found["scale_error_percent"] == pytest.approx(abs(expected["scale error [%]"]))
     assert found["rpe_1s_m"] == evaluate(path, SEQUENCE)["RPE RMSE over 1 s [m]"]
     assert found["nis_per_dof"] == pytest.approx(2.0)
     assert found["tracked"] == 1
-    assert all(found[key] == 0 for key in UNTRACKED)
     assert set(found) <= set(BY_KEY)
 
 
@@ -77,12 +76,11 @@ def test_frames_that_are_not_tracked_are_counted_and_left_out_of_the_accuracy():
     honest = consistency(path.select(rows), covariances[rows], SEQUENCE)["mean NEES"]
     assert found["nees_per_dof"] == pytest.approx(honest / 6)
     assert found["tracked"] == pytest.approx(97 / 120)
-    assert [found[key] for key in UNTRACKED] == pytest.approx([2 / 120, 20 / 120, 1 / 120])
     np.testing.assert_array_equal(np.isfinite(series[:, 1]), rows & (np.arange(N) > 0))
     assert np.nanmean(series[:, 1]) / 6 == pytest.approx(found["nees_per_dof"])
 
 
 def test_nothing_tracked_gives_no_accuracy_and_is_no_fault():
     found, _ = measured({k: FrameStatus.FAILED for k in range(N)})
-    assert (found["tracked"], found["frames_failed"]) == (0, 1)
+    assert found["tracked"] == 0
     assert not {"ate_online_m", "nees_per_dof", "rpe_1s_m"} & set(found)
