@@ -135,6 +135,7 @@ def run_command(
     from slam.run import drawing
     from slam.run import viewer as viewing
     from slam.run.runner import run
+    from slam.run.summary import RunRecord
     from slam.run.warm_up import compile_kernels
     from slam.sequences import is_live, with_mask
 
@@ -153,6 +154,7 @@ def run_command(
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
         written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
         require_outputs(written, [*inputs, *options.inputs], overwrite)
+        gathered = RunRecord()  # its time of compiling begins here
         if options.config.objects.mode != "off":
             compile_kernels(options.backend)
         seen = watches(stack, opened, viewer, draw, draw_map)
@@ -160,7 +162,7 @@ def run_command(
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
         end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress(*shown_as)), folder, until))
-        summary = run(opened, options, end_of_frame, watches=seen, until=until)
+        summary = run(opened, options, end_of_frame, watches=seen, until=until, record=gathered)
     finish(summary, written, picture, quiet)
 
 

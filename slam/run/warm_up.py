@@ -83,7 +83,11 @@ def compile_kernels(backend: str) -> None:
     try:
         images = open_sequence(_IMAGES)
         create("frontends", "surf", images.rig).extract(next(iter(images)))
-        process.wait()
+        compile_clock.change(1)
+        try:
+            process.wait()
+        finally:
+            compile_clock.change(-1)
     finally:
         process.kill()
         process.wait()

@@ -116,7 +116,9 @@ class _Notice(event.Listener):
         first = compile_clock.change(1)
         if not self._said:
             self._said = True
-            _LOG.info("compiling kernels that are not cached yet, once on this machine; `slam warm-up` does it beforehand")
+            _LOG.info(
+                "compiling kernels that are not cached yet, once on this machine; `slam warm-up` does it beforehand"
+            )
         if first:
             self._collects = gc.isenabled()
             gc.disable()
