@@ -121,7 +121,7 @@ def column_times(M, i, v):
 
 @helper
 def assign(M, out):
-    """Copy a matrix: ``out[:] = M`` makes Numba compile messages about shapes, which takes as long as a large kernel."""
+    """Copy a matrix: ``out[:] = M`` makes Numba compile messages about shapes, for as long as a large kernel."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[i, j] = M[i, j]

@@ -42,7 +42,7 @@ _INNER: dict[str, Any] = {**_NUMPY, "no_cpython_wrapper": True, "no_cfunc_wrappe
 class _Inlined(JITCodeLibrary):
     """A helper's code as it was written: it is optimised and made machine code where it is inlined, and only there.
 
-    Numba would do both for each helper too, and again for every helper that calls it: half of all compiling.
+    Numba would do both for each helper too, and again for every helper that calls it: half of the time of deep kernels.
     """
 
     codegen = property(lambda self: SimpleNamespace(set_env=lambda *_: None))  # Python never calls this code
