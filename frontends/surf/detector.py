@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.filters import Filters
+from frontends.surf.localisation import bends, newton_step
 from slam.runtime.compilation import helper, kernel, vector_helper
 
 #: fixed: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
@@ -98,7 +99,7 @@ def _mark_peaks(above, before, row, after, below, rival, threshold, mask):
 @helper
 def _neighbourhood(space, j, pixels, stride, filters, layer, row):
     """Fill the 3x3x3 responses around a peak of a layer; False as soon as one of them is not below it."""
-    _, ring, _, _, _, slots, cube, _ = space
+    _, ring, _, _, _, slots, cube, _, _ = space
     step = filters.step
     inner = ring.shape[0]
     v = ring[layer - 1, slots[1], j]
@@ -124,31 +125,9 @@ def _neighbourhood(space, j, pixels, stride, filters, layer, row):
 
 
 @helper
-def _newton_step(c, offset):
-    """Offset (x, y, layer) of the extremum of a quadratic through the 3x3x3 responses; False where out of reach."""
-    v = c[1, 1, 1]
-    gx, gy, gs = 0.5 * (c[1, 1, 0] - c[1, 1, 2]), 0.5 * (c[1, 0, 1] - c[1, 2, 1]), 0.5 * (c[0, 1, 1] - c[2, 1, 1])
-    xx, yy = c[1, 1, 0] - 2 * v + c[1, 1, 2], c[1, 0, 1] - 2 * v + c[1, 2, 1]
-    ss = c[0, 1, 1] - 2 * v + c[2, 1, 1]
-    xy = 0.25 * (c[1, 2, 2] - c[1, 2, 0] - c[1, 0, 2] + c[1, 0, 0])
-    xs = 0.25 * (c[2, 1, 2] - c[2, 1, 0] - c[0, 1, 2] + c[0, 1, 0])
-    ys = 0.25 * (c[2, 2, 1] - c[2, 0, 1] - c[0, 2, 1] + c[0, 0, 1])
-    cxx, cxy, cxs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - xs * yy
-    det = xx * cxx + xy * cxy + xs * cxs
-    if det == 0.0:
-        return False
-    cyy, cys, css = xx * ss - xs * xs, xy * xs - xx * ys, xx * yy - xy * xy
-    offset[0] = (cxx * gx + cxy * gy + cxs * gs) / det
-    offset[1] = (cxy * gx + cyy * gy + cys * gs) / det
-    offset[2] = (cxs * gx + cys * gy + css * gs) / det
-    still = offset[0] == 0.0 and offset[1] == 0.0 and offset[2] == 0.0
-    return not still and abs(offset[0]) <= 1.0 and abs(offset[1]) <= 1.0 and abs(offset[2]) <= 1.0
-
-
-@helper
 def _collect(space, pixels, stride, filters, layer, row, out, found):
     """Candidates among the marked columns of a row, appended to `out`; returns how many `out` holds then."""
-    _, _, _, words, mask, _, cube, offset = space
+    _, _, _, words, mask, _, cube, curvature, offset = space
     step, size = filters.step, filters.sizes[layer]
     ds = size - filters.sizes[layer - 1]
     centre = filters.centre[layer]
@@ -158,12 +137,15 @@ def _collect(space, pixels, stride, filters, layer, row, out, found):
         for j in range(8 * word, 8 * word + 8):
             if mask[j] == 0 or not _neighbourhood(space, j, pixels, stride, filters, layer, row):
                 continue
-            if not _newton_step(cube, offset):
+            bends(cube, curvature)
+            newton_step(cube, curvature, offset)
+            x, y, up = offset[0], offset[1], offset[2]
+            if not (abs(x) <= 1.0 and abs(y) <= 1.0 and abs(up) <= 1.0) or (x == 0.0 and y == 0.0 and up == 0.0):
                 continue
             x0, y0 = step * (j - centre), step * (row - centre)
-            out[found, 0] = x0 + 0.5 * (size - 1) + step * offset[0]
-            out[found, 1] = y0 + 0.5 * (size - 1) + step * offset[1]
-            out[found, 2] = np.rint(size + offset[2] * ds)
+            out[found, 0] = x0 + 0.5 * (size - 1) + step * x
+            out[found, 1] = y0 + 0.5 * (size - 1) + step * y
+            out[found, 2] = np.rint(size + up * ds)
             out[found, 3] = cube[1, 1, 1]
             at = np.uint64(y0 * stride + x0)
             _, out[found, 4] = _response_at(pixels, at, filters.offsets, filters.weights, layer)
@@ -211,7 +193,7 @@ def _scan(integral, phases, filters, threshold, first_row, last_row):
     words = np.zeros((columns + 7) // 8, np.uint64)
     buffer, responses, mask = np.empty(3 * step * phases.shape[2], np.int32), ring.reshape(-1), words.view(np.uint8)
     slots = np.empty(3, np.int64)
-    space = buffer, ring, responses, words, mask, slots, np.empty((3, 3, 3)), np.empty(3)
+    space = buffer, ring, responses, words, mask, slots, np.empty((3, 3, 3)), np.empty((3, 3)), np.empty(3)
     # At most one strict maximum in each 2x2 block of a layer.
     out = np.empty((max(16, (last_row - first_row + 2) * (columns + 1) // 4 * inner), COLUMNS))
     pixels, phases_shape, phases = integral.reshape(-1), phases.shape, phases.reshape(-1)

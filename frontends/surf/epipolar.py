@@ -226,7 +226,8 @@ def _search(image, shape, band, y, first, last, own, limits, space):
     It correlates with at least the first of `limits`, and clearly better than any rival: ``(1 - height) / (1 - rival)``
     is at most the second, with the third taken from the rival's side as what noise may do. Heights are the correlations
     with the best places between columns: a wrong place of a repeated pattern that happens to lie on a whole column
-    looks better than the true one that does not.
+    looks better than the true one that does not. Between any two columns there may be one: beside lines far apart
+    correlations are a plateau by the lines along the row, and a crossing stands out of it for less than a column.
     """
     scores, (min_correlation, uniqueness, unresolved), (rows, stride) = space.scores, limits, shape
     count, one = last - first + 1, np.float32(1.0)  # no literal number: Numba would compile a helper again for it
@@ -245,12 +246,10 @@ def _search(image, shape, band, y, first, last, own, limits, space):
         least, own_place = np.float32(_CONTENDER) * harmless, best if better else -1
         for j in range(count):
             s, itself = scores[j], j == own_place
-            if s < least and not itself:
+            if not itself and (s < least or abs(first + j - found) <= _NEIGHBOURS):
                 continue
             before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
-            if not itself and (s < before or s < after or abs(first + j - found) <= _NEIGHBOURS):
-                continue
-            side = 1 if after >= before or first + j == _HALF else -1
+            side = -1 if s >= before > after and first + j > _HALF else 1
             top = _height(image, stride, v, first + j, own, s, side, space)
             if itself:
                 height = top

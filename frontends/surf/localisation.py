@@ -100,8 +100,8 @@ def _sample(pixels, stride, x, y, size, bend, space, cube):
 
 
 @helper
-def _bends_down(c, curvature):
-    """Minus the Hessian (3, 3) of the responses, in units of the differences, factorised; False if no maximum."""
+def bends(c, curvature):
+    """Minus the Hessian (3, 3) of 3x3x3 responses, as cube[size, y, x], in units of their distances, factorised."""
     v = 2.0 * c[1, 1, 1]
     curvature[0, 0] = v - c[1, 1, 0] - c[1, 1, 2]
     curvature[1, 1] = v - c[1, 0, 1] - c[1, 2, 1]
@@ -110,7 +110,15 @@ def _bends_down(c, curvature):
     curvature[2, 0] = 0.25 * (c[0, 1, 2] + c[2, 1, 0] - c[2, 1, 2] - c[0, 1, 0])
     curvature[2, 1] = 0.25 * (c[0, 2, 1] + c[2, 0, 1] - c[2, 2, 1] - c[0, 0, 1])
     factorise(curvature, 3)
-    return curvature[0, 0] > 0.0 and curvature[1, 1] > 0.0 and curvature[2, 2] > 0.0
+
+
+@helper
+def newton_step(c, curvature, step):
+    """The way (3,) from the middle of 3x3x3 responses to their extremum, of what `bends` has made of their Hessian."""
+    step[0], step[1], step[2] = c[1, 1, 2] - c[1, 1, 0], c[1, 2, 1] - c[1, 0, 1], c[2, 1, 1] - c[0, 1, 1]
+    for k in range(3):
+        step[k] *= 0.5
+    solve_factorised(curvature, 3, step)
 
 
 @kernel
@@ -144,11 +152,11 @@ def localise(integral, uv, size, reach):
             # The curvature changes little on the way: it is measured twice, at the start and after two steps.
             bend = k == 0 or k == 2
             _sample(pixels, stride, u, v, s, bend, space, cube)
-            if bend and not _bends_down(cube, curvature):
+            if bend:
+                bends(cube, curvature)
+            if not (curvature[0, 0] > 0.0 and curvature[1, 1] > 0.0 and curvature[2, 2] > 0.0):  # no maximum
                 break
-            step[0], step[1] = 0.5 * (cube[1, 1, 2] - cube[1, 1, 0]), 0.5 * (cube[1, 2, 1] - cube[1, 0, 1])
-            step[2] = 0.5 * (cube[2, 1, 1] - cube[0, 1, 1])
-            solve_factorised(curvature, 3, step)
+            newton_step(cube, curvature, step)
             largest = max(abs(step[0]), abs(step[1]), abs(step[2]))
             shrink = 1.0 if largest <= 1.0 else 1.0 / largest
             u += shrink * step[0] * _STEP * s

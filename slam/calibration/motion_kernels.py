@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import column_times, factorise, invert_symmetric, row_times, solve_factorised, square
+from slam.kernels.linear import assign, column_times, factorise, invert_symmetric, row_times, solve_factorised, square
 from slam.kernels.se3 import exp
 from slam.runtime.compilation import helper, kernel
 
@@ -34,14 +34,15 @@ def fit(first, second, R, t, focal, noise, median):
     rest, weighted = np.empty(3), np.empty(3)
     for _ in range(20):  # 20: iterations at most
         _linearise(first, second, points, R, t, focal, noise, *at)
+        total = 0.0
         for p in range(n):
             weights[p] = square(information[p], residual[p])
-        ordered = np.sort(weights)
-        if n == 0 or not np.isfinite(ordered[n - 1]):  # NaN is sorted to the end
+            total += weights[p]
+        if n == 0 or not np.isfinite(total):
             last = np.inf
             break
         # 0.2: no less than a fifth of the configured noise
-        scale = max(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]) / median, 0.2 * 0.2)
+        scale = max(np.median(weights) / median, 0.2 * 0.2)
         step[:] = 0.0
         H[:] = 0.0
         for p in range(n):
@@ -58,7 +59,7 @@ def fit(first, second, R, t, focal, noise, median):
         factorise(H, 6)
         solve_factorised(H, 6, step)
         exp(step, turn)
-        before[:] = R
+        assign(R, before)
         for i in range(3):
             t[i] += step[3 + i]
             for j in range(3):

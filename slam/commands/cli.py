@@ -137,7 +137,7 @@ def run_command(
     quiet: _Quiet = False,
 ) -> None:
     """Run one sequence through one back end."""
-    from slam.commands.display import progress
+    from slam.commands.display import compiling, progress
     from slam.commands.run import finish, frame_count, prepare, run_folder, title, watches
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
@@ -145,7 +145,8 @@ def run_command(
     from slam.run import drawing
     from slam.run import viewer as viewing
     from slam.run.runner import run
-    from slam.run.warm_up import compiled_in_background
+    from slam.run.summary import RunRecord
+    from slam.run.warm_up import compile_kernels
     from slam.sequences import is_live, with_mask
 
     sequence = None if sequence is None else with_mask(sequence, mask)
@@ -163,14 +164,16 @@ def run_command(
         options = replace(options, out=folder, record=record, save_map=save_map, live=live)
         written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
         require_outputs(written, [*inputs, *options.inputs], overwrite)
+        gathered = RunRecord()  # its time of compiling begins here
         if options.config.objects.mode != "off":
-            stack.enter_context(compiled_in_background(options.backend))
+            with compiling(quiet):
+                compile_kernels(options.backend)
         seen = watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
         end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress(*shown_as)), folder, until))
-        summary = run(opened, options, end_of_frame, watches=seen, until=until)
+        summary = run(opened, options, end_of_frame, watches=seen, until=until, record=gathered)
     finish(summary, written, picture, quiet)
 
 
@@ -340,9 +343,12 @@ def list_command(
 def warm_up_command(quiet: _Quiet = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
     from slam.commands.display import compiling
-    from slam.run.warm_up import compiled_in_background, warm_up
+    from slam.run.warm_up import compile_kernels, warm_up
+    from slam.runtime.compile_clock import compile_clock
 
-    with compiled_in_background(ONLINE[-1]), compiling(quiet):
-        seconds = warm_up()
+    with compiling(quiet):
+        compile_kernels(ONLINE[-1])
+        warm_up()
+    seconds = compile_clock.seconds()
     if not quiet:
         print(f"kernels compiled in {seconds:.0f} s" if seconds else "all kernels were compiled already")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from slam.commands.display import print_summary, progress
+from slam.commands.display import compiling, print_summary, progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.files import write_png
@@ -18,7 +18,7 @@ from slam.run.outputs import NAMES
 from slam.run.plots import PICTURE, plot
 from slam.run.run_data import RunData
 from slam.run.runner import run
-from slam.run.warm_up import compiled_in_background
+from slam.run.warm_up import compile_kernels
 from slam.sequences import open_sequence
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.
@@ -43,16 +43,17 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
     sequence = open_sequence(_WORLD.format(frames))
     sequence.keep_images()  # type: ignore[attr-defined]
-    with compiled_in_background(ONLINE[-1]):
-        for backend in ONLINE:
-            config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-            with progress(len(sequence), f"aisle · {backend}", quiet) as tell:
+    with compiling(quiet):
+        compile_kernels(ONLINE[-1])
+    for backend in ONLINE:
+        config = SystemConfig.for_kind(sequence.kind, "surf", backend)
+        with progress(len(sequence), f"aisle · {backend}", quiet) as tell:
 
-                def seen(result: FrameResult, tell: Callable[[FrameResult], None] = tell) -> None:
-                    tell(result)
-                    shown[any(thing.estimate.measured for thing in result.objects)] = result
+            def seen(result: FrameResult, tell: Callable[[FrameResult], None] = tell) -> None:
+                tell(result)
+                shown[any(thing.estimate.measured for thing in result.objects)] = result
 
-                summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
+            summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
     plot([RunData.read(out / backend, backend) for backend in ONLINE], out / PICTURE)
     last = shown.get(True, shown.get(False))
     if last is not None:

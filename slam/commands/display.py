@@ -44,9 +44,9 @@ def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
     kernels = bar.add_task(_COMPILING, total=None, status="", visible=False)
     task = bar.add_task(title, total=total, status="")
 
-    def compiling(begun: int, of: int) -> None:
+    def compiling(done: int, of: int) -> None:
         bar.start()
-        bar.update(kernels, completed=begun, total=of, visible=True)
+        bar.update(kernels, completed=done, total=of, visible=True)
 
     def frame(result: FrameResult) -> None:
         bar.start()
@@ -79,9 +79,9 @@ def compiling(quiet: bool = False) -> Iterator[None]:
     bar = _bar(quiet=quiet)
     task = bar.add_task(_COMPILING, total=None)
 
-    def tell(begun: int, of: int) -> None:
+    def tell(done: int, of: int) -> None:
         bar.start()
-        bar.update(task, completed=begun, total=of)
+        bar.update(task, completed=done, total=of)
 
     with _watching(tell):
         try:

@@ -120,6 +120,14 @@ def column_times(M, i, v):
 
 
 @helper
+def assign(M, out):
+    """Copy a matrix: ``out[:] = M`` makes Numba compile messages about shapes, for as long as a large kernel."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = M[i, j]
+
+
+@helper
 def multiply(A, B, out):
     """``A B`` of matrices (3, 3)."""
     for i in range(3):

@@ -6,13 +6,13 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 
 from slam.data import FrameResult
-from slam.registry import ONLINE
+from slam.registry import ONLINE, create, resolve
 from slam.runtime.compile_clock import compile_clock
 from slam.runtime.cores import available_cores
 from slam.sequences import open_sequence
@@ -24,6 +24,8 @@ _SCENES = (_IMAGES, f"{_IMAGES}&rig=toedin")
 
 #: Cars that move, as features without images; a body is found in the seventh frame.
 _BODIES = "synthetic:street?frames=9&density=5"
+
+_POLL = 0.2  # cost: between two looks at what the other process has compiled [s]
 
 
 def warm_up(*backends: str, until: threading.Event | None = None) -> float:
@@ -65,27 +67,33 @@ def _with_bodies(backend: str) -> Iterator[FrameResult]:
     yield from (system.process_features(seen.features) for seen in world.observe())  # type: ignore[attr-defined]
 
 
-@contextmanager
-def compiled_in_background(backend: str) -> Iterator[None]:
-    """Where nothing is compiled yet, a second process compiles the kernels of back end and moving objects meanwhile.
+def compile_kernels(backend: str) -> None:
+    """Where nothing is compiled yet, compile what a run needs in two processes: Numba compiles one function at a time.
 
-    Numba compiles one function at a time in a process, and the first frame waits for the front end's kernels anyway.
-    What the second process has made is loaded from Numba's cache; what is not there in time is compiled here. It ends
-    with the block, or when it is done.
+    This one takes the front end's kernels, another one those of the back end and of moving objects, about twice as
+    long, which are then loaded from Numba's cache. No kernel is compiled by both.
     """
     from slam.objects.scene_kernels import groups_apart
 
     folder = groups_apart.stats.cache_path if hasattr(groups_apart, "stats") else None  # without Numba's compiler
     cold = folder is not None and not any(Path(folder).glob("scene_kernels.groups_apart-*.nbi"))
     if available_cores() < 2 or not cold:
-        yield
         return
+    resolve("backends", backend)  # its kernels count from here on
     command = [sys.executable, "-P", "-m", __name__, backend]  # -P: no module of the working folder
     paths, nowhere = os.pathsep.join(filter(None, sys.path)), subprocess.DEVNULL
     environment = {**os.environ, "PYTHONPATH": paths}
     process = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=environment)
     try:
-        yield
+        images = open_sequence(_IMAGES)
+        create("frontends", "surf", images.rig).extract(next(iter(images)))
+        compile_clock.change(1)
+        try:
+            while process.poll() is None:
+                compile_clock.tell()
+                time.sleep(_POLL)
+        finally:
+            compile_clock.change(-1)
     finally:
         process.kill()
         process.wait()

@@ -16,6 +16,7 @@ import gc
 import logging
 import os
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 from slam.errors import ConfigurationError
@@ -25,6 +26,7 @@ from slam.runtime.sources import makes_arrays, stamp
 try:
     from numba import njit
     from numba.core import event
+    from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
 except ValueError as error:
     if not any(name.startswith("NUMBA_") for name in os.environ):
@@ -37,7 +39,35 @@ _NUMPY: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is no ex
 _INNER: dict[str, Any] = {**_NUMPY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True}
 
 
-class _Disjoint(Compiler):
+class _Inlined(JITCodeLibrary):
+    """A helper's code as it was written: it is optimised and made machine code where it is inlined, and only there.
+
+    Numba would do both for each helper too, and again for every helper that calls it: half of the time of deep kernels.
+    """
+
+    codegen = property(lambda self: SimpleNamespace(set_env=lambda *_: None))  # Python never calls this code
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        self._ensure_finalized()
+        return 0
+
+
+class _Helper(Compiler):
+    """Compiles helpers."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.state.library = _Inlined(self.state.targetctx.codegen(), "helper")
+
+
+class _Disjoint(_Helper):
     """Compiles for arrays of which none that is written to shares memory with another."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -45,16 +75,17 @@ class _Disjoint(Compiler):
         self.state.flags.noalias = True
 
 
-def _helper(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def _helper(compiler: type[Compiler] = _Helper, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """A decorator of helpers."""
-    return lambda function: njit(**options, **_INNER, _nrt=makes_arrays(function))(function)
+    options = {**options, **_INNER, "pipeline_class": compiler}
+    return lambda function: njit(**options, _nrt=makes_arrays(function))(function)
 
 
 helper = _helper()
 #: Sums may be reordered, so that loops run on vector registers; always the same way, whatever the number of threads.
 vector_helper = _helper(fastmath=True)
 #: The same for loops over so many arrays that looking for shared memory would keep them from vector registers.
-disjoint_vector_helper = _helper(fastmath=True, pipeline_class=_Disjoint)
+disjoint_vector_helper = _helper(_Disjoint, fastmath=True)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -66,7 +97,7 @@ def kernel(function: Callable[..., Any]) -> Any:
             return function
         index = compiled._cache._cache_file  # Numba has no public way to say that a kernel depends on other files
         index._source_stamp = (index._source_stamp, stamp(function, kernel))
-        compile_clock.kernels += not os.path.exists(index._index_path)  # noqa: PTH110 for each of some hundred
+        compile_clock.expect(index._index_path)
         return compiled
     except (RuntimeError, AttributeError) as error:
         _LOG.warning("set NUMBA_CACHE_DIR to a folder, or the kernels are compiled in every run: %s", error)
@@ -77,17 +108,15 @@ class _Notice(event.Listener):
     """Says that kernels are being compiled, takes the time, and keeps the garbage collector from slowing it."""
 
     def __init__(self) -> None:
+        self._said = False
         self._collects = False
 
     def on_start(self, event: Any) -> None:
         if not (_is_own(event) and compile_clock.change(1)):
             return
-        compile_clock.begun += 1
-        if compile_clock.watch is not None:
-            compile_clock.watch(compile_clock.begun, max(compile_clock.begun, compile_clock.kernels))
-        elif compile_clock.begun == 1:
-            text = "compiling kernels, once on this machine, at most %d; `slam warm-up` does it beforehand"
-            _LOG.warning(text, max(1, compile_clock.kernels))
+        if not compile_clock.tell() and not self._said:
+            _LOG.warning("compiling kernels, once on this machine; `slam warm-up` does it beforehand")
+        self._said = True
         self._collects = gc.isenabled()
         gc.disable()
 

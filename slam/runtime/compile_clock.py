@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from threading import RLock
@@ -13,11 +14,10 @@ class CompileClock:
     Reading the clock needs no lock. For why a block stands on the lock's own line, see `slam.runtime.blas`.
     """
 
-    kernels = 0  # that are not cached, of the modules loaded so far
-    begun = 0  # of them, compiled or being compiled here
-    watch: Callable[[int, int], None] | None = None  # is told both numbers whenever one begins
+    watch: Callable[[int, int], None] | None = None  # is told how many kernels are compiled, of how many
 
     def __init__(self) -> None:
+        self._missing: list[str] = []  # files in Numba's cache that kernels of the loaded modules did not have
         self._lock = RLock()
         self._state = 0, 0.0, 0.0  # compilations under way (they nest), since when, and the time before [s]
 
@@ -29,6 +29,18 @@ class CompileClock:
         """Wall time in which something was compiled [s]."""
         under_way, since, before = self._state
         return before + (time.perf_counter() - since if under_way else 0.0)
+
+    def expect(self, file: str) -> None:
+        """A kernel was loaded which is compiled where this file of Numba's cache is missing."""
+        if not os.path.exists(file):  # noqa: PTH110 for each of some hundred kernels
+            self._missing.append(file)
+
+    def tell(self) -> bool:
+        """Tell the watch how many kernels have been compiled, here or by another process; whether there is a watch."""
+        if self.watch is None:
+            return False
+        self.watch(sum(map(os.path.exists, self._missing)), max(1, len(self._missing)))
+        return True
 
     def _change(self, by: int, now: float) -> bool:
         under_way, since, before = self._state

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import row_times, turn
+from slam.kernels.linear import assign, row_times, turn
 from slam.kernels.se3 import transform_back
 from slam.kernels.stereo import by_pose, residual
 from slam.runtime.compilation import helper, kernel
@@ -156,14 +156,14 @@ def rig_points(column, place, E, pose_of, cross, first, order, inverse, own, X):
     out, v, d = np.zeros((len(place), 3, m)), np.empty((3, m)), np.empty((3, m))
     for p in range(len(place)):
         if place[p] >= 0:
-            d[:] = X[3 * place[p] : 3 * place[p] + 3]
+            assign(X[3 * place[p] : 3 * place[p] + 3], d)
         elif place[p] == ELIMINATED:
             v[:] = 0.0
             for o in range(first[p], first[p + 1]):
                 at = column[pose_of[order[o]]]
                 for half in range(0, 6 if at >= 0 else 0, 3):
                     add_product(cross[order[o], half : half + 3], X[at + half : at + half + 3], 3, 1.0, v)
-            d[:] = own[p]
+            assign(own[p], d)
             add_product(inverse[p], v, 3, -1.0, d)
         else:
             continue
