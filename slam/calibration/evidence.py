@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam.calibration.model import RESIDUAL, RigModel
+from slam.calibration.prior import field_variance
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array
@@ -25,14 +26,18 @@ class Evidence(NamedTuple):
         """The same with `factor` times the information."""
         return Evidence(*(factor * x for x in self))
 
-    def with_error(self, variance: Array) -> Evidence:
-        """The same with another independent error of this variance (n,) in each parameter.
+    def with_error(self, variance: Array, fields: float = 0.0) -> Evidence:
+        """The same with further errors: of the parameters, and by residual fields, which are then marginalised.
 
-        ``(S⁻¹ + V)⁻¹ = (1 + S V)⁻¹ S``, which needs no inverse of S.
+        The estimate ``S⁻¹ e`` gets the covariance ``S⁻¹ + V + φ S⁻¹ C Cᵀ S⁻¹``, with V the `variance` (n,) of the
+        parameters and φ that of each coefficient of the fields, so the information is ``S (S + S V S + φ C Cᵀ)⁻¹ S``,
+        which needs no inverse of S.
         """
-        # Applied to a vector and two matrices, so it is formed once.
-        reduced = np.linalg.inv(np.eye(len(self.e)) + self.S * variance)
-        return Evidence(*(reduced @ x for x in self))
+        total = self.S + (self.S * variance) @ self.S + fields * self.cross @ self.cross.T
+        # 1e-12: numerics, of what nothing shows
+        total[np.diag_indices(len(total))] += 1e-12 * np.diag(self.S) + np.finfo(float).tiny
+        gain = np.linalg.solve(0.5 * (total + total.T), self.S).T
+        return Evidence(gain @ self.S, gain @ self.e, (0.0 if fields else 1.0) * gain @ self.cross)
 
     def __add__(self, other: Evidence) -> Evidence:  # type: ignore[override]
         """The product of both likelihoods."""
@@ -43,9 +48,12 @@ class RecordingEvidence(NamedTuple):
     """The evidence of one recording, without any prior."""
 
     whole: Evidence  # of its rows and its motion
-    # of its motion alone, from which the scale of the calibration's errors follows: rows have errors of their own
-    motion: Evidence
     residual: float  # scale of the residual fields by its rows, from 0 to 1
+
+    @property
+    def fields(self) -> float:
+        """Variance of each coefficient of the residual fields [focal lengths²]."""
+        return field_variance(self.residual)
 
 
 class Accumulator:
@@ -96,7 +104,7 @@ class Accumulator:
 
         About a solution that the prior holds elsewhere all gradients point the same way, which is no scatter.
 
-        `mean` (n,) is near that solution or not; `covariance` (n, n) is without residual fields.
+        `mean` (n,) is near that solution or not; `covariance` (n, n) is what weighs the parameters.
         """
         count = len(self._blocks)
         if self._sum is None or count < 2 or self._in_last < self._length:  # it changes slowly: once a block is enough

@@ -107,11 +107,11 @@ def along(model: RigModel, *names: str) -> Array:
     return np.array([float(name in names) for name in model.names])
 
 
-def residual_variance() -> float:
-    """Variance of each coefficient of the residual fields [focal lengths²]."""
+def field_variance(scale: float = 1.0) -> float:
+    """Variance of each coefficient of the residual fields [focal lengths²], at their scale from 0 to 1."""
     # 2e-4: Root mean square over the image of errors that no lens model describes [focal lengths]: a fifth of a pixel
     # at 1000 px.
-    return 2e-4**2 / len(RESIDUAL)
+    return (scale * 2e-4) ** 2 / len(RESIDUAL)
 
 
 def systematic_variance(model: RigModel, error: float) -> Array:

@@ -23,9 +23,9 @@ def test_the_posterior_is_that_of_the_whole_mixture():
     likelihood = np.exp(-0.5 * ((theta - 0.25) / 0.15) ** 2)
     p = likelihood * sum(np.exp(-0.5 * (theta / sigma) ** 2) / sigma for sigma in sigmas)
     p /= p.sum()
-    mean, found = p @ theta, solve(Prior(NONE, sigmas[:, None, None] ** 2), 0.0, evidence(0.25, 0.15))
+    mean, found = p @ theta, solve(Prior(NONE, sigmas[:, None, None] ** 2), evidence(0.25, 0.15))
     assert found.mean[0] == pytest.approx(mean, rel=1e-6)
-    assert found.inner[0, 0] == pytest.approx(p @ (theta - mean) ** 2, rel=1e-6)
+    assert found.covariance[0, 0] == pytest.approx(p @ (theta - mean) ** 2, rel=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.3, 1.0])
@@ -53,8 +53,8 @@ def test_errors_that_last_are_counted_as_such(length):
         for x in errors:
             sums.add(evidence(x, 1.0))
         for _ in range(5):
-            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6)), 0.0, sums.total())
-            sums.update_inflation(solution.mean, solution.inner)
+            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6)), sums.total())
+            sums.update_inflation(solution.mean, solution.covariance)
         z.append(solution.mean[0] / np.sqrt(solution.covariance[0, 0]))
     # Half a block and less is counted in full; the prior on the inflation holds a part back.
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.9
@@ -67,20 +67,21 @@ def test_a_prior_that_contradicts_all_blocks_is_no_scatter():
     for x in 5.0 + rng.standard_normal(400):
         sums.add(evidence(x, 1.0))
         sums.update_inflation(mean, np.full((1, 1), 0.01))
-        mean = solve(narrow, 0.0, sums.total()).mean
+        mean = solve(narrow, sums.total()).mean
     assert sums.inflation < 2.0
     assert mean[0] > 2.5  # of 5, by 400 measurements against a prior worth 100
 
 
-def test_what_an_error_of_the_whole_recording_leaves():
-    """Information (S⁻¹ + V)⁻¹, and the same mean."""
-    S = np.array([[4.0, 1.0], [1.0, 2.0]])
-    mean = np.array([0.3, -0.2])
-    left = Evidence(S, S @ mean, np.zeros((2, 1))).with_error(np.array([0.5, 2.0]))
-    np.testing.assert_allclose(np.linalg.inv(left.S), np.linalg.inv(S) + np.diag([0.5, 2.0]))
-    np.testing.assert_allclose(np.linalg.solve(left.S, left.e), mean)
-    nothing = Evidence(np.zeros((2, 2)), np.zeros(2), np.zeros((2, 1))).with_error(np.ones(2))
-    assert not nothing.S.any()
+def test_what_errors_of_parameters_and_fields_leave():
+    """Information (S⁻¹ + V + φ S⁻¹ C Cᵀ S⁻¹)⁻¹, and the same mean."""
+    S, C = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([[0.5, 0.1, 0.0], [0.2, 0.0, 0.4]])
+    mean, V, W = np.array([0.3, -0.2]), np.array([0.5, 2.0]), np.linalg.inv(S)
+    for fields in (0.0, 3.0):
+        left = Evidence(S, S @ mean, C).with_error(V, fields)
+        np.testing.assert_allclose(np.linalg.inv(left.S), W + np.diag(V) + fields * W @ C @ C.T @ W)
+        np.testing.assert_allclose(np.linalg.solve(left.S, left.e), mean)
+    nothing = Evidence(np.zeros((2, 2)), np.zeros(2), np.zeros((2, 1))).with_error(np.ones(2), 1.0)
+    assert not nothing.S.any() and not nothing.e.any()
 
 
 @pytest.mark.parametrize("dof", [1, 3])

@@ -46,9 +46,7 @@ def test_two_recordings_of_one_rig(made):
     assert tree["agreement"].startswith("The recordings agree")
     assert all(word in printed for word in ("apart", "roll", "no uncertainty"))
     assert tree["judgement"] in " ".join(printed.split())
-    assert (
-        tree["judgement"].startswith("By this the calibration is off by") and "a good calibration" in tree["judgement"]
-    )
+    assert tree["judgement"].startswith("By this the calibration is off by")
     model = RigModel(slam.open_sequence(WORLD).rig)
     factors = {"left_cx": (model.focal, "px"), "right_f": (100, "%"), "left_k1": (1000, "10⁻³"), "yaw": (1000, "mrad")}
     for row in [row for row in tree["parameters"] if row["name"] in factors]:
