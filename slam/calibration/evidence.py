@@ -24,7 +24,7 @@ class Evidence(NamedTuple):
 
     def scaled(self, factor: float) -> Evidence:
         """The same with `factor` times the information."""
-        return Evidence(*(factor * x for x in self))
+        return Evidence(factor * self.S, factor * self.e, factor * self.cross)
 
     def with_error(self, variance: Array, fields: float = 0.0) -> Evidence:
         """The same with further errors: of the parameters, and by residual fields, which are then marginalised.
@@ -41,7 +41,7 @@ class Evidence(NamedTuple):
 
     def __add__(self, other: Evidence) -> Evidence:  # type: ignore[override]
         """The product of both likelihoods."""
-        return Evidence(*(a + b for a, b in zip(self, other)))
+        return Evidence(self.S + other.S, self.e + other.e, self.cross + other.cross)
 
 
 class RecordingEvidence(NamedTuple):
@@ -115,26 +115,11 @@ class Accumulator:
         for S, e, _ in self._blocks:
             gradient = e - S @ own
             scatter += float(gradient @ covariance @ gradient)
-            terms += float(np.sum(S * covariance))
+            terms += float(np.vdot(S, covariance))
         if terms > 0:
             ratio = scatter / (terms * (1 - 1 / count))
             weight = terms / self.inflation * (count - 1)  # parameters that the data determine, for each block
             self.inflation = max(1.0, (_PRIOR_TERMS * self._prior + weight * ratio) / (_PRIOR_TERMS + weight))
-
-
-def student_weights(squared: Array, dof: int, least: float) -> Array:
-    """Weights (N,) of residuals by Student's t distribution, as factors on their information.
-
-    Args:
-        squared: squared residuals (N,), in units of a covariance of unknown scale.
-        dof: dimension of a residual.
-        least: least scale, as a standard deviation. The squared scale is the median of `squared` over that of χ².
-    """
-    if not len(squared):
-        return squared
-    scale = max(median(squared) / chi_square_limit(dof, 0.5), least**2)
-    # 4.0: degrees of freedom of Student's t, with tails like those of matches, a few of which are wrong
-    return np.asarray((4.0 + dof) / (4.0 + squared / scale) / scale)
 
 
 def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> tuple[Evidence, Evidence]:
@@ -148,8 +133,11 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
         left camera's fields have the same effect with opposite sign.
     """
     A, fields = model.vertical(points), model.residual_vertical(points)
-    residual = vertical + A @ parameters
-    weights = student_weights(residual**2, 1, 0.03)[:, None]  # 0.03: of a row [px], the least that is believed
+    squared = np.square(vertical + A @ parameters)
+    # Weights by Student's t distribution of four degrees of freedom, with tails like those of matches.
+    # 0.03: standard deviation of a row [px], the least that is believed
+    scale = max(median(squared) / chi_square_limit(1, 0.5), 0.03**2)
+    weights = (5.0 / (4.0 + squared / scale) / scale)[:, None]
     both = np.column_stack([A, fields[:, -len(RESIDUAL) :]])
     weighted, n = both * weights, A.shape[1]
     S, e = weighted.T @ both, -(weighted.T @ vertical)
