@@ -59,7 +59,8 @@ class SelfCalibration:
             self._prior = resumed_prior(self.model, mean, covariance)
             self._own_prior = resumed_prior(self.model, mean, covariance + np.diag(self._systematic))
             start = self._own_prior.covariances.mean(axis=0)
-        self._own = RigPosterior(self._prior.mean, start)  # of the errors in this recording
+        self._own = RigPosterior(self._prior.mean, start)  # of the errors in this recording, without residual fields
+        self._by_fields = np.zeros_like(start)  # covariance (n, n) of its mean by unknown residual fields
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
@@ -84,7 +85,7 @@ class SelfCalibration:
     @property
     def covariance(self) -> Array:
         """Of the present posterior (n, n)."""
-        return self._own.covariance + np.diag(self._systematic)
+        return self._own.covariance + self._by_fields + np.diag(self._systematic)
 
     @property
     def posterior(self) -> RigPosterior:
@@ -241,14 +242,16 @@ class SelfCalibration:
 
     def _update(self) -> None:
         """Update the posterior by Bayes' rule from all pairs of views and all rows so far."""
-        rows, moved = self._rows.total(), self._moved()
-        assert rows is not None and moved is not None  # because there are pairs
-        sharp = np.linalg.inv(self._prior.information[-1] + rows.S + moved.S)
         for part in (self._rows, self._motion):
-            part.update_inflation(self._own.mean, sharp)
+            part.update_inflation(self._own.mean, self._own.covariance)
+        moved = self._moved()
+        assert moved is not None  # because there are pairs
         found = self.evidence()
         assert found is not None
-        self._own = solve(self._own_prior, found.whole.with_error(0.0 * self._systematic, found.fields))
+        # The correction is to explain this recording, so it may take up what the residual fields do here.
+        self._own = solve(self._own_prior, moved, found.whole)
+        effect = self._own.covariance @ found.whole.cross
+        self._by_fields = found.fields * effect @ effect.T
 
 
 def _mean_variance(changes: Array, covariance: Array) -> float:

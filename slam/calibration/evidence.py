@@ -48,7 +48,7 @@ class RecordingEvidence(NamedTuple):
     """The evidence of one recording, without any prior."""
 
     whole: Evidence  # of its rows and its motion
-    residual: float  # scale of the residual fields by its rows, from 0 to 1
+    residual: float  # scale of the residual fields by its rows
 
     @property
     def fields(self) -> float:

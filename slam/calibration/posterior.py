@@ -67,7 +67,7 @@ def solve(prior: Prior, evidence: Evidence, known: Evidence | None = None) -> Ri
 
 
 def residual_scale(prior: Prior, rows: Evidence) -> float:
-    """Scale of the residual fields, from 0 to 1, by the vertical disparities that the parameters do not explain.
+    """Scale of the residual fields by the vertical disparities that the parameters do not explain.
 
     It is the root mean square of the possible scales, weighted by their marginal likelihood. Fields along the rows,
     which cannot be observed as directly, are taken to be as large as those across. Errors of neighbouring frames are

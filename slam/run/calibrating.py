@@ -159,7 +159,7 @@ def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: flo
     beside = f"the noise of a frame's {matched:.0f} features leaves {left:.2f} px"
     if max(off) < left:
         word = f"good: {beside}"
-    elif (off < 2 * sigma).all():
+    elif (off <= 2 * sigma).all():
         word = "no more than is uncertain: longer recordings, with turns, say more"
     elif max(off) < noise:
         word = f"worth correcting, as runs do by default: {beside}"
