@@ -12,7 +12,7 @@ from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence, 
 from slam.calibration.joint import joint_calibration
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
-from slam.calibration.posterior import RigPosterior, residual_scale, solve
+from slam.calibration.posterior import RigPosterior, residual_likelihoods, solve
 from slam.calibration.prior import FOCALS, along, factory_prior, prior_information, resumed_prior, systematic_variance
 from slam.calibration.saved import SavedCalibration, rig_numbers
 from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
@@ -196,7 +196,7 @@ class SelfCalibration:
         moved, rows = self._moved(), self._rows.total()
         if moved is None or rows is None or self._fields is None:
             return None
-        return RecordingEvidence(rows + moved, residual_scale(self._prior, self._fields))
+        return RecordingEvidence(rows + moved, residual_likelihoods(self._prior, self._fields))
 
     def _moved(self) -> Evidence | None:
         """The evidence of motion: of the pairs, and of the incomplete one."""

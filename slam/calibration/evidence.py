@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam.calibration.model import RESIDUAL, RigModel
-from slam.calibration.prior import field_variance
+from slam.calibration.prior import RESIDUAL_SCALES, field_variance
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array
@@ -48,12 +48,23 @@ class RecordingEvidence(NamedTuple):
     """The evidence of one recording, without any prior."""
 
     whole: Evidence  # of its rows and its motion
-    residual: float  # scale of the residual fields by its rows
+    scales: Array  # log-likelihoods (K,) of the scales of the residual fields by its rows
+
+    @property
+    def residual(self) -> float:
+        """Scale of the residual fields."""
+        return residual_scale(self.scales)
 
     @property
     def fields(self) -> float:
         """Variance of each coefficient of the residual fields [focal lengths²]."""
         return field_variance(self.residual)
+
+
+def residual_scale(logs: Array) -> float:
+    """Root mean square of the possible scales of residual fields, weighted by their log-likelihoods (K,)."""
+    weights = np.exp(logs - logs.max())
+    return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
 
 
 class Accumulator:

@@ -8,7 +8,7 @@ from operator import add
 
 import numpy as np
 
-from slam.calibration.evidence import RecordingEvidence
+from slam.calibration.evidence import RecordingEvidence, residual_scale
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import solve
 from slam.calibration.prior import Prior, factory_prior, field_variance, systematic_variance
@@ -42,7 +42,8 @@ def joint_calibration(
     """
     if not evidence:
         raise CalibrationError("calibration: in no recording was there a motion that shows the rig's errors")
-    variance, residual = systematic_variance(model, systematic), max(part.residual for part in evidence)
+    variance = systematic_variance(model, systematic)
+    residual = residual_scale(np.sum([part.scales for part in evidence], axis=0))
     # The scales of the prior follow from the evidence as it is: the systematic errors would excuse a bad calibration.
     together, known = (
         reduce(add, parts).with_error(0.0 * variance, field_variance(residual))

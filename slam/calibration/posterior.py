@@ -66,12 +66,12 @@ def solve(prior: Prior, evidence: Evidence, known: Evidence | None = None) -> Ri
     return RigPosterior(prior.mean + step, 0.5 * (covariance + covariance.T))
 
 
-def residual_scale(prior: Prior, rows: Evidence) -> float:
-    """Scale of the residual fields by the vertical disparities that the parameters do not explain.
+def residual_likelihoods(prior: Prior, rows: Evidence) -> Array:
+    """Log-likelihoods (K,) of `RESIDUAL_SCALES` by the vertical disparities that the parameters do not explain.
 
-    It is the root mean square of the possible scales, weighted by their marginal likelihood. Fields along the rows,
-    which cannot be observed as directly, are taken to be as large as those across. Errors of neighbouring frames are
-    taken to be independent; where they are not, the fields and so the uncertainty are overestimated.
+    Fields along the rows, which cannot be observed as directly, are taken to be as large as those across. Errors of
+    neighbouring frames are taken to be independent; where they are not, the fields and so the uncertainty are
+    overestimated.
 
     `rows` is the evidence of the parameters and of the fields across the rows (n + k).
     """
@@ -83,6 +83,4 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
     values, vectors = np.linalg.eigh(A)
     variances = 2 * field_variance() * np.square(RESIDUAL_SCALES)[:, None]  # of both cameras
     added = 1 + variances * np.maximum(values, 0)
-    logs = 0.5 * np.sum(np.square(vectors.T @ g) * variances / added - np.log(added), axis=1)
-    weights = np.exp(logs - logs.max())
-    return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
+    return np.asarray(0.5 * np.sum(np.square(vectors.T @ g) * variances / added - np.log(added), axis=1))

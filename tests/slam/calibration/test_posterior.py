@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.calibration.evidence import Accumulator, Evidence, row_evidence
+from slam.calibration.evidence import Accumulator, Evidence, residual_scale, row_evidence
 from slam.calibration.model import RigModel
-from slam.calibration.posterior import residual_scale, solve
+from slam.calibration.posterior import residual_likelihoods, solve
 from slam.calibration.prior import Prior, factory_prior
 from tests.slam.calibration.drives import CAR, parameters, residual_fields
 
@@ -37,8 +37,9 @@ def test_how_large_the_residual_fields_are_is_seen_in_the_rows(scale):
         vertical = -model.vertical(points) @ theta - model.residual_vertical(points) @ fields
         found = row_evidence(model, points, vertical + 0.1 * rng.standard_normal(300), theta)[1]
         rows = found if rows is None else rows + found
-    assert residual_scale(factory_prior(model), rows) == pytest.approx(scale, rel=0.4)
-    assert residual_scale(factory_prior(model), rows.scaled(1e-9)) > 0.4  # where they say nothing
+    said, nothing = (residual_likelihoods(factory_prior(model), rows.scaled(factor)) for factor in (1.0, 1e-9))
+    assert residual_scale(said) == pytest.approx(scale, rel=0.4)
+    assert residual_scale(nothing) > 0.4  # where they say nothing
 
 
 @pytest.mark.parametrize("length", [1, 4, 10])

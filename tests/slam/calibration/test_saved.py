@@ -10,7 +10,7 @@ import slam
 from slam.calibration import RigModel, SelfCalibration, SelfCalibrationConfig
 from slam.calibration.evidence import Evidence, RecordingEvidence
 from slam.calibration.joint import agreement, agreement_in_words, joint_calibration
-from slam.calibration.prior import factory_prior
+from slam.calibration.prior import RESIDUAL_SCALES, factory_prior
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
@@ -143,7 +143,8 @@ def shown(model, depths, theta, fields, rng):
     points = model.focal * rng.uniform([-0.8, -0.25, depths[0]], [0.8, 0.25, depths[1]], (200, 3))
     A = np.concatenate([model.field(points)[:, 2], model.vertical(points)]) / 0.05
     F = np.concatenate([residual_field(model, points)[:, 2], model.residual_vertical(points)]) / 0.05
-    return RecordingEvidence(Evidence(A.T @ A, A.T @ (A @ theta - F @ fields), A.T @ F), 1.0)
+    scales = -1e3 * np.abs(np.arange(len(RESIDUAL_SCALES)) - 6)  # that of the fields is known
+    return RecordingEvidence(Evidence(A.T @ A, A.T @ (A @ theta - F @ fields), A.T @ F), scales)
 
 
 def test_errors_that_no_parameter_holds_do_not_drive_recordings_apart():
@@ -159,7 +160,7 @@ def test_errors_that_no_parameter_holds_do_not_drive_recordings_apart():
     root, focal = np.linalg.cholesky(prior.covariances[0]), parameters(left_f=0.5, right_f=0.5)
     nees, off, wider = [], [], []
     for _ in range(20):
-        theta, fields = root @ rng.standard_normal(len(root)), -residual_fields(rng)
+        theta, fields = root @ rng.standard_normal(len(root)), -RESIDUAL_SCALES[6] * residual_fields(rng)
         recordings = [shown(model, depths, theta, fields, rng) for depths in ((0, 0.02), (0.05, 0.12))]
         found = [joint_calibration(model, prior, some, 0.01).posterior for some in (recordings, *zip(recordings))]
         errors = [p.mean - theta for p in found]
