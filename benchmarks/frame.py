@@ -201,7 +201,7 @@ def rows(size: Size, times: dict[str, Times]) -> Iterable[list[str]]:
         if name != SIFT and seen.sum() > 2 and sequence.ground_truth is not None:
             path = Trajectory(stamps[seen], np.array([p for p in t.poses if p is not None]))
             own, true = associate(path, sequence.ground_truth, 0.02, interpolated=True)
-            ate = f"{1e3 * absolute_errors(own, true).translation_statistics.rmse:.1f}"
+            ate = f"{1e3 * absolute_errors(own, true).rmse:.1f}"
         figures = [f"{x:.2f}" for r in ratios for x in ((np.nan, np.nan) if r is None else r)]
         lost = "–" if name == SIFT else str(int((~seen).sum()))
         yield [size.name, name, *(f"{x:.0f}" for x in medians[name]), *figures, lost, ate]

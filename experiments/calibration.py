@@ -88,7 +88,7 @@ def show_drives(drives: Mapping[str, Path], out: Path, frames: int | None) -> No
     sequences = [open_sequence(f) for f in drives.values()]
     quiet = nullcontext(lambda _: None)
     result = calibrate(sequences, out / "rig.json", lambda *_: quiet, (), (0, frames), overwrite=True)
-    apart = result.agreed.largest if result.agreed is not None else np.full(len(result.units), np.nan)
+    apart = np.full(len(result.units), np.nan) if result.apart is None else result.apart
     rows = [
         [
             result.kept.posterior.names[i], unit,
@@ -97,8 +97,7 @@ def show_drives(drives: Mapping[str, Path], out: Path, frames: int | None) -> No
         ]
         for i, (factor, unit) in enumerate(result.units) if np.isfinite(apart[i])
     ]  # fmt: skip
-    words = "" if result.agreed is None else result.agreed.words
-    show(out / "drives.json", ("parameter", "unit", *drives, "apart [sigma]"), rows, 2, words)
+    show(out / "drives.json", ("parameter", "unit", *drives, "apart [sigma]"), rows, 2, result.agreed)
 
 
 def main() -> int:

@@ -123,7 +123,7 @@ def run(index: int, backend: str, noise_seed: int | None = None) -> Errors:
         poses.append(result.estimate.T_world_left)
     path = Trajectory(np.array(stamps), np.array(poses))
     own, true = associate(path, data.sequence.ground_truth, interpolated=True)
-    camera = absolute_errors(own, true).translation_statistics.rmse
+    camera = absolute_errors(own, true).rmse
     bodies = [] if score is None else list(score.summary()["bodies"].values())
     moved = [b["ME"]["translation RMSE [m]"] for b in bodies if b.get("ME")]
     covered = float(np.mean([b["coverage"] or 0.0 for b in bodies])) if bodies else 0.0

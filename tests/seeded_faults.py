@@ -204,8 +204,8 @@ FAULTS = (
     ),
     Fault(
         "the spread between the prior's scales is left out", "slam/calibration/posterior.py",
-        "inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)",
-        "inner = np.tensordot(weights, covariances, axes=1)",
+        "covariance = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)",
+        "covariance = np.tensordot(weights, covariances, axes=1)",
         "tests/slam/calibration/test_posterior.py tests/slam/calibration",
     ),
 )  # fmt: skip

@@ -9,9 +9,10 @@ import numpy as np
 from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.correction import Revision, RigCorrection
 from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence, row_evidence
+from slam.calibration.joint import joint_calibration
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
-from slam.calibration.posterior import RigPosterior, Solution, residual_scale, solve
+from slam.calibration.posterior import RigPosterior, residual_likelihoods, solve
 from slam.calibration.prior import FOCALS, along, factory_prior, prior_information, resumed_prior, systematic_variance
 from slam.calibration.saved import SavedCalibration, rig_numbers
 from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
@@ -45,18 +46,21 @@ class SelfCalibration:
         self.rig = rig
         self.config = config
         self.model = RigModel(rig)
-        self._kept = kept is not None
+        self._kept = kept
+        self._systematic = systematic_variance(self.model, config.systematic)
         if kept is None:
-            self._prior, residual = factory_prior(self.model), 1.0
+            self._prior = self._own_prior = factory_prior(self.model)
             start = self._prior.covariances[-1]
         else:
             kept.require_fits(rig)
             if not config.enabled:
                 raise ConfigurationError("a kept calibration needs self_calibration.enabled=true")
-            self._prior = resumed_prior(self.model, kept.posterior.mean, kept.posterior.covariance)
-            start, residual = self._prior.covariances.mean(axis=0), kept.residual
-        self._solution = Solution(self._prior.mean, start, start, residual)
-        self._systematic = systematic_variance(self.model, config.systematic)
+            mean, covariance = kept.posterior.mean, kept.posterior.covariance
+            self._prior = resumed_prior(self.model, mean, covariance)
+            self._own_prior = resumed_prior(self.model, mean, covariance + np.diag(self._systematic))
+            start = self._own_prior.covariances.mean(axis=0)
+        self._own = RigPosterior(self._prior.mean, start)  # of the errors in this recording, without residual fields
+        self._by_fields = np.zeros_like(start)  # covariance (n, n) of its mean by unknown residual fields
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
@@ -81,13 +85,12 @@ class SelfCalibration:
     @property
     def covariance(self) -> Array:
         """Of the present posterior (n, n)."""
-        covariance = self._solution.covariance
-        return covariance if self._kept else covariance + np.diag(self._systematic)  # else it is in the evidence
+        return self._own.covariance + self._by_fields + np.diag(self._systematic)
 
     @property
     def posterior(self) -> RigPosterior:
-        """The present posterior of the rig's error."""
-        return RigPosterior(self._solution.mean.copy(), self.covariance)
+        """The present posterior of the rig's error in this recording."""
+        return RigPosterior(self._own.mean.copy(), self.covariance)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
@@ -104,13 +107,13 @@ class SelfCalibration:
         """
         if not self.config.enabled:
             return None
-        variance = _mean_variance(self._far, self._solution.inner)
-        known = self._kept or (variance <= 0.5 * self._unknown and self._motion_agrees())
-        mean = self._solution.mean if known else np.zeros_like(self._solution.mean)
+        variance = _mean_variance(self._far, self._own.covariance)
+        known = self._kept is not None or (variance <= 0.5 * self._unknown and self._motion_agrees())
+        mean = self._own.mean if known else np.zeros_like(self._own.mean)
         step = mean - self.applied.parameters
         if not step.any():
             return None
-        focal = self._focal @ self._solution.inner @ self._focal
+        focal = self._focal @ self._own.covariance @ self._focal
         changes = np.square(self._far @ step).mean() / variance, (self._focal @ step) ** 2 / focal
         if max(changes) <= least**2:
             return None
@@ -119,7 +122,7 @@ class SelfCalibration:
 
     def _motion_agrees(self) -> bool:
         """Whether the evidence of motion is likelier with the posterior mean than with the calibration as delivered."""
-        motion, mean = self._moved(), self._solution.mean
+        motion, mean = self._moved(), self._own.mean
         if motion is None:
             return False
         return bool(motion.e @ mean - 0.5 * mean @ motion.S @ mean > 1)  # a fitted parameter's gain (Akaike)
@@ -147,7 +150,7 @@ class SelfCalibration:
             return
         # 250: features of a frame whose rows are used: more add little
         some = np.linspace(0, len(view) - 1, min(len(view), 250)).astype(int)
-        rows, fields = row_evidence(self.model, view.points[some], view.vertical[some], self._solution.mean)
+        rows, fields = row_evidence(self.model, view.points[some], view.vertical[some], self._own.mean)
         self._rows.add(rows)
         self._fields = fields if self._fields is None else self._fields + fields
         self._compare(view)
@@ -193,7 +196,7 @@ class SelfCalibration:
         moved, rows = self._moved(), self._rows.total()
         if moved is None or rows is None or self._fields is None:
             return None
-        return RecordingEvidence(rows + moved, moved, residual_scale(self._prior, self._fields))
+        return RecordingEvidence(rows + moved, residual_likelihoods(self._prior, self._fields))
 
     def _moved(self) -> Evidence | None:
         """The evidence of motion: of the pairs, and of the incomplete one."""
@@ -204,8 +207,11 @@ class SelfCalibration:
         return part if complete is None else complete + part
 
     def kept(self) -> SavedCalibration:
-        """The present posterior, as a prior for further recordings of the rig."""
-        return SavedCalibration(self.posterior, rig_numbers(self.rig), self._solution.residual)
+        """What is known of the rig, as a prior for further recordings of it."""
+        found = self.evidence()
+        if found is None:
+            return self._kept or SavedCalibration(self.posterior, rig_numbers(self.rig))
+        return joint_calibration(self.model, self._prior, [found], self.config.systematic)
 
     def summary(self) -> dict[str, Any]:
         """The result as plain types."""
@@ -219,7 +225,7 @@ class SelfCalibration:
 
     def _evidence(self, first: View, second: View, matched: Rows) -> Evidence | None:
         """The evidence of a pair of views with matched features; None without a solution."""
-        mean = self._solution.mean
+        mean = self._own.mean
         pair = pair_of(self.model, first, second, mean, self._noise, self._seen, matched)
         if len(pair.first) < self.config.minimum_common:
             self.unsolved += 1
@@ -237,13 +243,15 @@ class SelfCalibration:
     def _update(self) -> None:
         """Update the posterior by Bayes' rule from all pairs of views and all rows so far."""
         for part in (self._rows, self._motion):
-            part.update_inflation(self._solution.mean, self._solution.inner)
+            part.update_inflation(self._own.mean, self._own.covariance)
+        moved = self._moved()
+        assert moved is not None  # because there are pairs
         found = self.evidence()
-        assert found is not None  # because there are pairs
-        if self._kept:
-            self._solution = solve(self._prior, found.residual, found.whole.with_error(self._systematic))
-        else:
-            self._solution = solve(self._prior, found.residual, found.motion, found.whole)
+        assert found is not None
+        # The correction is to explain this recording, so it may take up what the residual fields do here.
+        self._own = solve(self._own_prior, moved, found.whole)
+        effect = self._own.covariance @ found.whole.cross
+        self._by_fields = found.fields * effect @ effect.T
 
 
 def _mean_variance(changes: Array, covariance: Array) -> float:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam.calibration.model import RESIDUAL, RigModel
+from slam.calibration.prior import RESIDUAL_SCALES, field_variance
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array
@@ -23,29 +24,47 @@ class Evidence(NamedTuple):
 
     def scaled(self, factor: float) -> Evidence:
         """The same with `factor` times the information."""
-        return Evidence(*(factor * x for x in self))
+        return Evidence(factor * self.S, factor * self.e, factor * self.cross)
 
-    def with_error(self, variance: Array) -> Evidence:
-        """The same with another independent error of this variance (n,) in each parameter.
+    def with_error(self, variance: Array, fields: float = 0.0) -> Evidence:
+        """The same with further errors: of the parameters, and by residual fields, which are then marginalised.
 
-        ``(S⁻¹ + V)⁻¹ = (1 + S V)⁻¹ S``, which needs no inverse of S.
+        The estimate ``S⁻¹ e`` gets the covariance ``S⁻¹ + V + φ S⁻¹ C Cᵀ S⁻¹``, with V the `variance` (n,) of the
+        parameters and φ that of each coefficient of the fields, so the information is ``S (S + S V S + φ C Cᵀ)⁻¹ S``,
+        which needs no inverse of S.
         """
-        # Applied to a vector and two matrices, so it is formed once.
-        reduced = np.linalg.inv(np.eye(len(self.e)) + self.S * variance)
-        return Evidence(*(reduced @ x for x in self))
+        total = self.S + (self.S * variance) @ self.S + fields * self.cross @ self.cross.T
+        # 1e-12: numerics, of what nothing shows
+        total[np.diag_indices(len(total))] += 1e-12 * np.diag(self.S) + np.finfo(float).tiny
+        gain = np.linalg.solve(0.5 * (total + total.T), self.S).T
+        return Evidence(gain @ self.S, gain @ self.e, (0.0 if fields else 1.0) * gain @ self.cross)
 
     def __add__(self, other: Evidence) -> Evidence:  # type: ignore[override]
         """The product of both likelihoods."""
-        return Evidence(*(a + b for a, b in zip(self, other)))
+        return Evidence(self.S + other.S, self.e + other.e, self.cross + other.cross)
 
 
 class RecordingEvidence(NamedTuple):
     """The evidence of one recording, without any prior."""
 
     whole: Evidence  # of its rows and its motion
-    # of its motion alone, from which the scale of the calibration's errors follows: rows have errors of their own
-    motion: Evidence
-    residual: float  # scale of the residual fields by its rows, from 0 to 1
+    scales: Array  # log-likelihoods (K,) of the scales of the residual fields by its rows
+
+    @property
+    def residual(self) -> float:
+        """Scale of the residual fields."""
+        return residual_scale(self.scales)
+
+    @property
+    def fields(self) -> float:
+        """Variance of each coefficient of the residual fields [focal lengths²]."""
+        return field_variance(self.residual)
+
+
+def residual_scale(logs: Array) -> float:
+    """Root mean square of the possible scales of residual fields, weighted by their log-likelihoods (K,)."""
+    weights = np.exp(logs - logs.max())
+    return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
 
 
 class Accumulator:
@@ -96,7 +115,7 @@ class Accumulator:
 
         About a solution that the prior holds elsewhere all gradients point the same way, which is no scatter.
 
-        `mean` (n,) is near that solution or not; `covariance` (n, n) is without residual fields.
+        `mean` (n,) is near that solution or not; `covariance` (n, n) is what weighs the parameters.
         """
         count = len(self._blocks)
         if self._sum is None or count < 2 or self._in_last < self._length:  # it changes slowly: once a block is enough
@@ -107,26 +126,11 @@ class Accumulator:
         for S, e, _ in self._blocks:
             gradient = e - S @ own
             scatter += float(gradient @ covariance @ gradient)
-            terms += float(np.sum(S * covariance))
+            terms += float(np.vdot(S, covariance))
         if terms > 0:
             ratio = scatter / (terms * (1 - 1 / count))
             weight = terms / self.inflation * (count - 1)  # parameters that the data determine, for each block
             self.inflation = max(1.0, (_PRIOR_TERMS * self._prior + weight * ratio) / (_PRIOR_TERMS + weight))
-
-
-def student_weights(squared: Array, dof: int, least: float) -> Array:
-    """Weights (N,) of residuals by Student's t distribution, as factors on their information.
-
-    Args:
-        squared: squared residuals (N,), in units of a covariance of unknown scale.
-        dof: dimension of a residual.
-        least: least scale, as a standard deviation. The squared scale is the median of `squared` over that of χ².
-    """
-    if not len(squared):
-        return squared
-    scale = max(median(squared) / chi_square_limit(dof, 0.5), least**2)
-    # 4.0: degrees of freedom of Student's t, with tails like those of matches, a few of which are wrong
-    return np.asarray((4.0 + dof) / (4.0 + squared / scale) / scale)
 
 
 def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> tuple[Evidence, Evidence]:
@@ -140,8 +144,11 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
         left camera's fields have the same effect with opposite sign.
     """
     A, fields = model.vertical(points), model.residual_vertical(points)
-    residual = vertical + A @ parameters
-    weights = student_weights(residual**2, 1, 0.03)[:, None]  # 0.03: of a row [px], the least that is believed
+    squared = np.square(vertical + A @ parameters)
+    # Weights by Student's t distribution of four degrees of freedom, with tails like those of matches.
+    # 0.03: standard deviation of a row [px], the least that is believed
+    scale = max(median(squared) / chi_square_limit(1, 0.5), 0.03**2)
+    weights = (5.0 / (4.0 + squared / scale) / scale)[:, None]
     both = np.column_stack([A, fields[:, -len(RESIDUAL) :]])
     weighted, n = both * weights, A.shape[1]
     S, e = weighted.T @ both, -(weighted.T @ vertical)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 
-from slam.calibration.evidence import RecordingEvidence
+from slam.calibration.evidence import RecordingEvidence, residual_scale
 from slam.calibration.model import RigModel
-from slam.calibration.posterior import RigPosterior, solve
-from slam.calibration.prior import factory_prior, residual_variance, systematic_variance
+from slam.calibration.posterior import solve
+from slam.calibration.prior import Prior, factory_prior, field_variance, systematic_variance
 from slam.calibration.saved import SavedCalibration, rig_numbers
 from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
@@ -20,15 +21,19 @@ from slam.geometry.se3 import Array
 _AGREES, _DIFFERS = 2.0, 3.0
 
 
-def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> SavedCalibration:
+def joint_calibration(
+    model: RigModel, prior: Prior, evidence: Sequence[RecordingEvidence], systematic: float
+) -> SavedCalibration:
     """The calibration of a rig from several recordings.
 
-    Each recording has a systematic error of its own, which averages out over recordings but not within one, and is
-    added to its evidence. For a single recording that error is added to the posterior instead, and the scale of the
-    calibration's errors follows from its motion, as in its own run.
+    Each recording has a systematic error of its own, which is added to its evidence and averages out over recordings.
+    The residual fields are the rig's: all recordings share them, so they are marginalised after the recordings have
+    been added up, and before the prior comes in. Left out until then, they would make recordings contradict each other
+    in combinations that each of them hardly shows, such as a focal length that both cameras share.
 
     Args:
         model: the parameters' meaning.
+        prior: of the parameters.
         evidence: of each recording, without any prior.
         systematic: error of rows and disparities that all frames of a recording may share [px].
 
@@ -37,48 +42,21 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
     """
     if not evidence:
         raise CalibrationError("calibration: in no recording was there a motion that shows the rig's errors")
-    first, variance, prior = evidence[0], systematic_variance(model, systematic), factory_prior(model)
-    if len(evidence) == 1:
-        solution = solve(prior, first.residual, first.motion, first.whole)
-        covariance = solution.covariance + np.diag(variance)
-    else:
-        whole = [part.whole for part in evidence]
-        known = [part.with_error(variance) for part in whole]
-        residual = max(part.residual for part in evidence)
-        solution = solve(prior, residual, sum(whole[1:], whole[0]), sum(known[1:], known[0]))
-        covariance = solution.covariance
-    posterior = RigPosterior(solution.mean, 0.5 * (covariance + covariance.T))
-    return SavedCalibration(posterior, rig_numbers(model.rig), solution.residual)
+    variance = systematic_variance(model, systematic)
+    residual = residual_scale(np.sum([part.scales for part in evidence], axis=0))
+    # The scales of the prior follow from the evidence as it is: the systematic errors would excuse a bad calibration.
+    together, known = (
+        reduce(add, parts).with_error(0.0 * variance, field_variance(residual))
+        for parts in ([part.whole for part in evidence], [part.whole.with_error(variance) for part in evidence])
+    )
+    return SavedCalibration(solve(prior, together, known), rig_numbers(model.rig), residual)
 
 
-@dataclass(frozen=True, eq=False)
-class Agreement:
-    """Differences between recordings, each by its own evidence."""
+def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> Array | None:
+    """The largest difference of two recordings in each parameter (n,) [standard deviations], by their own evidence.
 
-    # the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN if fewer than two
-    # determine it
-    largest: Array
-
-    @property
-    def words(self) -> str:
-        """The result in a line."""
-        known = np.isfinite(self.largest)
-        if not known.any():
-            return "Nothing can be said of whether the recordings agree: no parameter is shown by two of them."
-        worst = int(np.nanargmax(self.largest))
-        least = f"the largest difference is {self.largest[worst]:.1f} sigma, in {RigModel.names[worst]}"
-        differing = ", ".join(name for name, z in zip(RigModel.names, self.largest) if z > _AGREES)
-        if not differing:
-            return (
-                f"The recordings agree in all {known.sum()} of {len(known)} parameters that two of them show: {least}."
-            )
-        if self.largest[worst] <= _DIFFERS:
-            return f"The recordings agree, but for {differing}, where chance may do it: {least}."
-        return f"The recordings do not agree in {differing}: {least}. Is it one rig, and has it not changed?"
-
-
-def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> Agreement | None:
-    """Compare recordings in pairs; None for a single recording. For the arguments see `joint_calibration`.
+    NaN where fewer than two determine the parameter; None for a single recording. For the arguments see
+    `joint_calibration`.
 
     The prior, which they share, is no evidence of agreement. So each parameter's marginal posterior is divided by the
     prior, which gives that parameter's likelihood by the recording alone, with the others marginalised. A recording
@@ -90,14 +68,27 @@ def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic
     before = 1 / np.diag(prior)
     means, informations = [], []
     for recording in evidence:
-        part = recording.whole.with_error(variance)
+        part = recording.whole.with_error(variance, recording.fields)
         covariance = np.linalg.inv(np.linalg.inv(prior) + part.S)
-        moved = recording.residual * covariance @ part.cross
-        after = 1 / (np.diag(covariance) + residual_variance() * np.square(moved).sum(axis=1))
+        after = 1 / np.diag(covariance)
         said = np.where(after > 2 * before, after - before, np.nan)  # more than the prior does
         means.append(after * (covariance @ part.e) / said)
         informations.append(said)
     first, second = np.triu_indices(len(evidence), 1)
     mean, own = np.array(means), 1 / np.array(informations)
-    z = np.abs(mean[first] - mean[second]) / np.sqrt(own[first] + own[second])
-    return Agreement(np.fmax.reduce(z, axis=0))
+    return np.asarray(np.fmax.reduce(np.abs(mean[first] - mean[second]) / np.sqrt(own[first] + own[second]), axis=0))
+
+
+def agreement_in_words(largest: Array) -> str:
+    """The result of `agreement` in a line."""
+    known = np.isfinite(largest)
+    if not known.any():
+        return "Nothing can be said of whether the recordings agree: no parameter is shown by two of them."
+    worst = int(np.nanargmax(largest))
+    least = f"the largest difference is {largest[worst]:.1f} sigma, in {RigModel.names[worst]}"
+    differing = ", ".join(name for name, z in zip(RigModel.names, largest) if z > _AGREES)
+    if not differing:
+        return f"The recordings agree in all {known.sum()} of {len(known)} parameters that two of them show: {least}."
+    if largest[worst] <= _DIFFERS:
+        return f"The recordings agree, but for {differing}, where chance may do it: {least}."
+    return f"The recordings do not agree in {differing}: {least}. Is it one rig, and has it not changed?"

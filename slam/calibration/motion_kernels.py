@@ -22,8 +22,8 @@ def linearise(first, second, points, R, t, focal, noise):
 def fit(first, second, R, t, focal, noise, median):
     """Gauss-Newton of `slam.calibration.motion.fit_motion`; see there for the arguments.
 
-    Points are weighted as in `slam.calibration.evidence.student_weights`, `median` being that of χ². Returns the fields
-    of `slam.calibration.motion.Fit`, and the last change of a predicted point [px], infinite where there is no
+    Points are weighted by Student's t distribution of four degrees of freedom, `median` being that of χ². Returns the
+    fields of `slam.calibration.motion.Fit`, and the last change of a predicted point [px], infinite where there is no
     solution.
     """
     n, last = len(first), np.inf

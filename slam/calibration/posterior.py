@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
-from slam.calibration.prior import RESIDUAL_SCALES, Prior, residual_variance
+from slam.calibration.prior import RESIDUAL_SCALES, Prior, field_variance
 from slam.geometry.se3 import Array
 
 
@@ -40,17 +40,7 @@ class RigPosterior:
         return {"parameters": parameters, "covariance": self.covariance.tolist()}
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Posterior of the parameters."""
-
-    mean: Array  # (n,)
-    inner: Array  # covariance (n, n) without residual fields
-    covariance: Array  # including the effect of unknown residual fields on the mean (n, n)
-    residual: float  # scale of the residual fields, from 0 to 1
-
-
-def solve(prior: Prior, residual: float, evidence: Evidence, known: Evidence | None = None) -> Solution:
+def solve(prior: Prior, evidence: Evidence, known: Evidence | None = None) -> RigPosterior:
     """Posterior, averaged over the unknown scales of the calibration's errors.
 
     The scales are weighted by their marginal likelihood, so that a calibration without evidence against it is left
@@ -58,7 +48,6 @@ def solve(prior: Prior, residual: float, evidence: Evidence, known: Evidence | N
 
     Args:
         prior: of the parameters.
-        residual: scale of the residual fields, from 0 to 1 (see `residual_scale`).
         evidence: of the data, from which the prior's scales follow.
         known: evidence of which the parameters' posterior is computed; None if it is `evidence`.
     """
@@ -66,25 +55,23 @@ def solve(prior: Prior, residual: float, evidence: Evidence, known: Evidence | N
     fits = np.linalg.solve(information, np.broadcast_to(e[:, None], (len(information), len(e), 1)))[..., 0] @ e
     logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(information)[1] + fits)
     weights = np.exp(logs - logs.max())
-    weights /= weights.sum()
     known = evidence if known is None else known
     likely = weights > 1e-12  # numerics: of a scale, beside the likeliest
-    prior_information, weights = prior.information[likely], weights[likely]
-    covariances = np.linalg.inv(prior_information + known.S)
+    weights = weights[likely] / weights[likely].sum()
+    covariances = np.linalg.inv(prior.information[likely] + known.S)
     steps = covariances @ (known.e - known.S @ prior.mean)
     step = weights @ steps
     off = steps - step
-    inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
-    moved = residual * np.tensordot(weights, covariances, axes=1) @ known.cross
-    return Solution(prior.mean + step, inner, inner + residual_variance() * moved @ moved.T, residual)
+    covariance = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
+    return RigPosterior(prior.mean + step, 0.5 * (covariance + covariance.T))
 
 
-def residual_scale(prior: Prior, rows: Evidence) -> float:
-    """Scale of the residual fields, from 0 to 1, by the vertical disparities that the parameters do not explain.
+def residual_likelihoods(prior: Prior, rows: Evidence) -> Array:
+    """Log-likelihoods (K,) of `RESIDUAL_SCALES` by the vertical disparities that the parameters do not explain.
 
-    It is the root mean square of the possible scales, weighted by their marginal likelihood. Fields along the rows,
-    which cannot be observed as directly, are taken to be as large as those across. Errors of neighbouring frames are
-    taken to be independent; where they are not, the fields and so the uncertainty are overestimated.
+    Fields along the rows, which cannot be observed as directly, are taken to be as large as those across. Errors of
+    neighbouring frames are taken to be independent; where they are not, the fields and so the uncertainty are
+    overestimated.
 
     `rows` is the evidence of the parameters and of the fields across the rows (n + k).
     """
@@ -94,8 +81,6 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
     A = rows.S[n:, n:] - shared.T @ gain
     g = rows.e[n:] - gain.T @ rows.e[:n] - (rows.S[n:, :n] - gain.T @ rows.S[:n, :n]) @ prior.mean
     values, vectors = np.linalg.eigh(A)
-    variances = 2 * residual_variance() * np.square(RESIDUAL_SCALES)[:, None]  # of both cameras
+    variances = 2 * field_variance() * np.square(RESIDUAL_SCALES)[:, None]  # of both cameras
     added = 1 + variances * np.maximum(values, 0)
-    logs = 0.5 * np.sum(np.square(vectors.T @ g) * variances / added - np.log(added), axis=1)
-    weights = np.exp(logs - logs.max())
-    return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
+    return np.asarray(0.5 * np.sum(np.square(vectors.T @ g) * variances / added - np.log(added), axis=1))

@@ -23,8 +23,9 @@ SIGMAS = {
 }  # fmt: skip
 
 
-#: Possible scales of a rig's fields relative to that, equally probable a priori.
-RESIDUAL_SCALES = np.geomspace(0.05, 1.0, 7)
+#: Possible scales of a rig's residual fields, see `field_variance`, equally probable a priori: from none to a pixel at
+#: 1000 px. Rows tell which it is, so the range matters only where it is too narrow.
+RESIDUAL_SCALES = np.geomspace(0.05, 5.0, 10)
 
 #: Errors that a chess board does bound: the mean over the image of the disparity of far points, and of the vertical
 #: disparity [focal lengths].
@@ -107,11 +108,10 @@ def along(model: RigModel, *names: str) -> Array:
     return np.array([float(name in names) for name in model.names])
 
 
-def residual_variance() -> float:
-    """Variance of each coefficient of the residual fields [focal lengths²]."""
-    # 2e-4: Root mean square over the image of errors that no lens model describes [focal lengths]: a fifth of a pixel
-    # at 1000 px.
-    return 2e-4**2 / len(RESIDUAL)
+def field_variance(scale: float = 1.0) -> float:
+    """Variance of each coefficient of the residual fields [focal lengths²], at their scale."""
+    # 2e-4: root mean square over the image at a scale of 1 [focal lengths]: a fifth of a pixel at 1000 px
+    return (scale * 2e-4) ** 2 / len(RESIDUAL)
 
 
 def systematic_variance(model: RigModel, error: float) -> Array:

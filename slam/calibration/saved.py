@@ -13,6 +13,7 @@ import numpy as np
 
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import RigPosterior
+from slam.calibration.prior import RESIDUAL_SCALES
 from slam.errors import CalibrationError
 from slam.files import expanded, read_text, write_text
 from slam.geometry.rig import StereoRig
@@ -52,7 +53,7 @@ class SavedCalibration:
     Attributes:
         posterior: estimated corrections of the rig as calibrated.
         rig: numbers of the rig as calibrated, to recognise it, see `rig_numbers`.
-        residual: scale, from 0 to 1, of the errors that no parameter describes (see `slam.calibration.prior`).
+        residual: scale of the errors that no parameter describes (see `slam.calibration.prior`).
     """
 
     posterior: RigPosterior
@@ -105,8 +106,8 @@ class SavedCalibration:
         symmetric = np.allclose(covariance, covariance.T, rtol=1e-6, atol=0)
         if not symmetric or np.linalg.eigvalsh(covariance).min() <= 0:
             raise CalibrationError("calibration: its covariance is none")
-        if not isinstance(residual, (int, float)) or not 0 <= residual <= 1:
-            raise CalibrationError("calibration: residual_scale must lie in 0..1")
+        if not isinstance(residual, (int, float)) or not 0 <= residual <= RESIDUAL_SCALES[-1]:
+            raise CalibrationError(f"calibration: residual_scale must lie in 0..{RESIDUAL_SCALES[-1]:g}")
         return cls(RigPosterior(mean, covariance), rig, float(residual))
 
 

@@ -22,7 +22,7 @@ from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 from slam.settings import require_settable
 
-_COLUMNS = 3  # most recordings with a column of their own
+_NARROW, _COLUMN = 42, 17  # characters of the table, and of each recording's column in it
 
 
 def calibrate(
@@ -61,22 +61,25 @@ def calibrate(
 
 def _print(done: Calibrated) -> None:
     """The table, and what it says."""
-    console, joint, agreed = Console(), done.kept.posterior, done.agreed
-    shown = done.found if len(done.found) <= _COLUMNS else ()
+    console, joint, apart = Console(), done.kept.posterior, done.apart
+    if not console.is_terminal:  # a file or a pipe is not 80 columns wide
+        console = Console(width=_NARROW + _COLUMN * (1 + len(done.found)))
+    fits = _NARROW + _COLUMN * len(done.found) <= console.width
+    shown = done.found if fits else ()
     table = Table(title="corrections: mean ± standard deviation", show_lines=False)
     table.add_column("parameter")
     table.add_column("unit")
-    for name in ("all", *(f"({number})" for number in range(1, len(shown) + 1)), *(["apart"] if agreed else [])):
+    for name in ("all", *(f"({number})" for number in range(1, len(shown) + 1)), *([] if apart is None else ["apart"])):
         table.add_column(name, justify="right", no_wrap=True)
     for row, (name, (factor, unit)) in enumerate(zip(joint.names, done.units)):
         beliefs = [joint, *(one.posterior for one in shown)]
         cells = [f"{factor * p.mean[row]:.2f} ± {factor * p.sigma[row]:.2f}" for p in beliefs]
-        if agreed is not None:
-            cells.append(f"{agreed.largest[row]:.1f} σ" if np.isfinite(agreed.largest[row]) else "–")
+        if apart is not None:
+            cells.append(f"{apart[row]:.1f} σ" if np.isfinite(apart[row]) else "–")
         table.add_row(name, unit, *cells)
     console.print(table)
     for number, one in enumerate(done.found, 1):
         tells = "" if one.evidence is not None else ": no motion that shows anything, left out"
         console.print(f"({number}) {one.name}: {one.frames} frames, {one.pairs} pairs of views{tells}", markup=False)
-    for text in filter(None, (done.judgement, agreed and agreed.words)):
+    for text in filter(None, (done.judgement, done.agreed)):
         console.print(text, markup=False, highlight=False)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.errors import TrajectoryError
-from slam.geometry.alignment import Alignment, align
+from slam.geometry.alignment import align
 from slam.geometry.se3 import Array, inverse, log, pose, rotation_angle, so3_exp, so3_log
 from slam.geometry.stamps import pair
 from slam.geometry.trajectory import Trajectory
@@ -27,32 +27,6 @@ KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 _ROUNDING = 1e-6  # [s] by which a stamp may differ that was written to a file and read again
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Of a set of errors, all in the errors' unit; `count` of them."""
-
-    rmse: float
-    mean: float
-    median: float
-    std: float
-    min: float
-    max: float
-    count: int
-
-    @classmethod
-    def of(cls, errors: Array) -> Statistics:
-        """Statistics of errors (N,).
-
-        Raises:
-            TrajectoryError: there is none.
-        """
-        if not len(errors):
-            raise TrajectoryError("no errors to sum up: nothing could be compared")
-        rmse = float(np.sqrt(np.mean(errors**2)))
-        mean, median, std = float(np.mean(errors)), float(np.median(errors)), float(np.std(errors))
-        return cls(rmse, mean, median, std, float(np.min(errors)), float(np.max(errors)), len(errors))
-
-
 @dataclass(frozen=True, eq=False)
 class PathErrors:
     """Errors of poses, or of relative motions, row by row.
@@ -60,42 +34,20 @@ class PathErrors:
     Attributes:
         translation: (N,) [m].
         rotation: (N,) [deg].
-        alignment: what was applied to the estimate before; None where nothing was.
     """
 
     translation: Array
     rotation: Array
-    alignment: Alignment | None = None
 
     @property
-    def translation_statistics(self) -> Statistics:
-        """Of the translation [m]."""
-        return Statistics.of(self.translation)
+    def rmse(self) -> float:
+        """Root mean square of the translation [m]."""
+        return float(np.sqrt(np.mean(self.translation**2)))
 
     @property
-    def rotation_statistics(self) -> Statistics:
-        """Of the rotation [deg]."""
-        return Statistics.of(self.rotation)
-
-
-@dataclass(frozen=True, eq=False)
-class SegmentErrors:
-    """Errors over stretches of the path, a row each.
-
-    Attributes:
-        lengths: length of the stretch that was asked for (M,) [m].
-        translation: translation error by length (M,) [%].
-        rotation: rotation error by length (M,) [deg/m].
-    """
-
-    lengths: Array
-    translation: Array
-    rotation: Array
-
-    @property
-    def mean_translation(self) -> float:
-        """Mean over all stretches of all lengths [%]; NaN where there is none."""
-        return float(np.mean(self.translation)) if len(self.lengths) else float("nan")
+    def rotation_rmse(self) -> float:
+        """The same of the rotation [deg]."""
+        return float(np.sqrt(np.mean(self.rotation**2)))
 
 
 def associate(
@@ -178,16 +130,15 @@ def absolute_errors(
         TrajectoryError: the lengths differ, or there is no pose.
     """
     _require_pairs(estimate, truth, 1)
-    alignment = align(estimate, truth, with_scale) if aligned else None
-    if alignment is not None:
-        estimate = alignment.apply_trajectory(estimate)
+    if aligned:
+        estimate = align(estimate, truth, with_scale).apply_trajectory(estimate)
     distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
     turn = np.swapaxes(truth.poses[:, :3, :3], 1, 2) @ estimate.poses[:, :3, :3]
-    return PathErrors(distance, np.degrees(rotation_angle(turn)), alignment)
+    return PathErrors(distance, np.degrees(rotation_angle(turn)))
 
 
-def relative_errors(estimate: Trajectory, truth: Trajectory, delta: int = 1, overlapping: bool = True) -> PathErrors:
-    """RPE over `delta` frames, from every frame or, with ``overlapping=False``, from every `delta`-th.
+def relative_errors(estimate: Trajectory, truth: Trajectory, delta: int = 1) -> PathErrors:
+    """RPE over `delta` frames, from every frame.
 
     Raises:
         TrajectoryError: the lengths differ, there are not more than `delta` poses, or `delta` is not positive.
@@ -195,41 +146,44 @@ def relative_errors(estimate: Trajectory, truth: Trajectory, delta: int = 1, ove
     if delta < 1:
         raise TrajectoryError(f"RPE: delta must be at least 1 frame, got {delta}")
     _require_pairs(estimate, truth, delta + 1)
-    first = np.arange(0, len(truth) - delta, 1 if overlapping else delta)
-    return PathErrors(*_motion_errors(estimate, truth, first, first + delta))
+    first = np.arange(len(truth) - delta)
+    return _motion_errors(estimate, truth, first, first + delta)
 
 
-def segment_errors(estimate: Trajectory, truth: Trajectory, lengths: Sequence[float] | None = None) -> SegmentErrors:
+def segment_errors(estimate: Trajectory, truth: Trajectory, lengths: Sequence[float] | None = None) -> Array:
     """Errors over stretches of the true path of given lengths, as KITTI's odometry benchmark has them.
 
     From every tenth frame a stretch reaches to the first frame that lies farther along the path than its length;
-    starts from which the path is too short give none. `lengths` defaults to `segment_lengths` of the path.
+    starts from which the path is too short give none.
+
+    Args:
+        estimate: the estimated path.
+        truth: the true path.
+        lengths: of the stretches [m]; by default KITTI's 100 to 800 m for a path of at least 1 km, else eight lengths
+            up to four fifths of the path.
+
+    Returns:
+        rows (M, 3) of the length asked for [m], and of errors by length: translation [%] and rotation [deg/m].
 
     Raises:
         TrajectoryError: the lengths of the two paths differ or there is no pose, or a length is not positive.
     """
     _require_pairs(estimate, truth, 1)
-    lengths = segment_lengths(truth.length) if lengths is None else lengths
+    if lengths is None:
+        whole = truth.length if truth.length > 1e-6 else 0.0
+        lengths = KITTI_LENGTHS if whole >= 1000 else [whole * i / 10 for i in range(1, 9) if whole]
     if any(not length > 0 for length in lengths):
         raise TrajectoryError(f"segments: lengths must be positive, got {list(lengths)}")
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).cumsum()])
     starts = np.arange(0, len(truth), 10)
-    rows = []
+    rows = [np.zeros((0, 3))]
     for length in lengths:
         ends = np.searchsorted(along, along[starts] + length, side="right")
         inside = ends < len(truth)
-        translation, rotation = _motion_errors(estimate, truth, starts[inside], ends[inside])
-        rows.append((np.full(len(translation), length), 100 * translation / length, rotation / length))
-    if not rows:
-        return SegmentErrors(*(np.zeros(0) for _ in range(3)))
-    return SegmentErrors(*(np.concatenate(column) for column in zip(*rows)))
-
-
-def segment_lengths(path_length: float) -> tuple[float, ...]:
-    """KITTI's 100 to 800 m for a path of at least 1 km, else eight lengths up to four fifths of the path."""
-    if path_length >= 1000:
-        return KITTI_LENGTHS
-    return tuple(path_length * i / 10 for i in range(1, 9)) if path_length > 1e-6 else ()
+        errors = _motion_errors(estimate, truth, starts[inside], ends[inside])
+        asked = np.full(len(errors.translation), length)
+        rows.append(np.column_stack([asked, 100 * errors.translation / length, errors.rotation / length]))
+    return np.concatenate(rows)
 
 
 def _require_pairs(estimate: Trajectory, truth: Trajectory, count: int) -> None:
@@ -239,12 +193,16 @@ def _require_pairs(estimate: Trajectory, truth: Trajectory, count: int) -> None:
         raise TrajectoryError(f"{len(estimate)} poses are too few, {count} are needed")
 
 
-def _motion_errors(estimate: Trajectory, truth: Trajectory, first: np.ndarray, last: np.ndarray) -> tuple[Array, Array]:
-    """Translation [m] and rotation [deg] of the errors of the motions between rows `first` and `last`."""
+def _motion_errors(estimate: Trajectory, truth: Trajectory, first: np.ndarray, last: np.ndarray) -> PathErrors:
+    """Of the motions between rows `first` and `last`."""
     true = inverse(truth.poses[first]) @ truth.poses[last]
     estimated = inverse(estimate.poses[first]) @ estimate.poses[last]
-    error = inverse(true) @ estimated
-    return np.linalg.norm(error[:, :3, 3], axis=1), np.degrees(rotation_angle(error[:, :3, :3]))
+    return error_sizes(inverse(true) @ estimated)
+
+
+def error_sizes(E: Array) -> PathErrors:
+    """Of error motions (N, 4, 4)."""
+    return PathErrors(np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angle(E[:, :3, :3])))
 
 
 def pose_residuals(estimated: Array, true: Array) -> Array:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import FrameResult, StereoFeatures
-from slam.evaluation.metrics import PathErrors
+from slam.evaluation.metrics import PathErrors, error_sizes
 from slam.geometry.pnp import MINIMAL_POINTS
-from slam.geometry.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
+from slam.geometry.se3 import Array, inverse, log, so3_exp, so3_log
 from slam.object_data import MovingObject
 
 _SINGULAR = 1e-9  # numerics: smallest eigenvalue of a matrix of correlations that counts
@@ -33,12 +33,7 @@ def motion_errors(estimated: Array, true: Array, delta: int = 1) -> PathErrors:
     H = estimated[delta:] @ inverse(estimated[:-delta])
     G = true[delta:] @ inverse(true[:-delta])
     before = true[:-delta]
-    return _of_motions(inverse(before) @ inverse(H) @ G @ before)
-
-
-def _of_motions(E: Array) -> PathErrors:
-    """Of error motions (N, 4, 4)."""
-    return PathErrors(np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angle(E[:, :3, :3])))
+    return error_sizes(inverse(before) @ inverse(H) @ G @ before)
 
 
 def _summed(errors: PathErrors) -> dict[str, float]:
@@ -63,7 +58,7 @@ def body_alignment(estimated: Array, true: Array) -> Array:
 
 def absolute_pose_errors(estimated: Array, true: Array) -> PathErrors:
     """Errors ``(T_estimated D)⁻¹ T_true`` of poses (N, 4, 4) after one change D of body frame for all."""
-    return _of_motions(inverse(estimated @ body_alignment(estimated, true)) @ true)
+    return error_sizes(inverse(estimated @ body_alignment(estimated, true)) @ true)
 
 
 def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:

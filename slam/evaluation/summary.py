@@ -39,7 +39,7 @@ def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
     pairs = with_truth(estimate, sequence)
     if pairs is not None:
         mounting = getattr(sequence, "truth_noise", TruthNoise()).mounting
-        for part in (_absolute, partial(_from_start, mounting=mounting), _relative, _over_a_second, _segments):
+        for part in (_absolute, partial(_from_start, mounting=mounting), _relative, _segments):
             figures.update(_where_possible(part, *pairs))
         figures["poses with truth"] = float(len(pairs[0]))
     return figures
@@ -67,8 +67,8 @@ def _where_possible(part: Callable[..., dict[str, float]], *arguments: object) -
 
 
 def _absolute(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    ate = absolute_errors(own, true).translation_statistics
-    return {"ATE RMSE [m]": ate.rmse, "ATE max [m]": ate.max}
+    errors = absolute_errors(own, true)
+    return {"ATE RMSE [m]": errors.rmse, "ATE max [m]": float(errors.translation.max())}
 
 
 def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array:
@@ -98,27 +98,20 @@ def _from_start(own: Trajectory, true: Trajectory, mounting: float) -> dict[str,
 
 
 def _relative(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    rpe = relative_errors(own, true)
-    return {
-        "RPE RMSE [m/frame]": rpe.translation_statistics.rmse,
-        "RPE rotation RMSE [deg/frame]": rpe.rotation_statistics.rmse,
-    }
-
-
-def _over_a_second(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    """RPE over as many frames as come nearest to a second; nothing for a shorter path."""
-    delta = max(1, round(1.0 / float(np.median(np.diff(own.stamps)))))
-    if len(own) <= delta:
-        return {}
-    rpe = relative_errors(own, true, delta)
-    return {
-        "RPE RMSE over 1 s [m]": rpe.translation_statistics.rmse,
-        "RPE rotation RMSE over 1 s [deg]": rpe.rotation_statistics.rmse,
-    }
+    """RPE from frame to frame, and over as many frames as come nearest to a second if the path has so many."""
+    second = max(1, round(1.0 / float(np.median(np.diff(own.stamps)))))
+    figures = {}
+    for name, unit, frames in (("", "/frame", 1), (" over 1 s", "", second)):
+        if len(own) > frames:
+            errors = relative_errors(own, true, frames)
+            figures[f"RPE RMSE{name} [m{unit}]"] = errors.rmse
+            figures[f"RPE rotation RMSE{name} [deg{unit}]"] = errors.rotation_rmse
+    return figures
 
 
 def _segments(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    return {"segment error [%]": segment_errors(own, true).mean_translation}
+    errors = segment_errors(own, true)[:, 1]
+    return {"segment error [%]": float(errors.mean()) if len(errors) else float("nan")}
 
 
 def consistency(

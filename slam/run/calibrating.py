@@ -12,9 +12,9 @@ import numpy as np
 
 from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
-from slam.calibration.correction import RigCorrection
 from slam.calibration.evidence import RecordingEvidence
-from slam.calibration.joint import Agreement, agreement, joint_calibration
+from slam.calibration.joint import agreement, agreement_in_words, joint_calibration
+from slam.calibration.prior import factory_prior
 from slam.calibration.saved import rig_difference, rig_numbers
 from slam.config import SystemConfig
 from slam.data import FrameResult
@@ -33,11 +33,15 @@ _SETTINGS = ("objects.mode=off",)
 
 #: What a parameter of each unit is multiplied by in the table, and its unit there; of pure numbers by name.
 _SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}
-_SHARES = {"f": "%", "aspect": "%", "down": "% of baseline", "forward": "% of baseline"}
+_SHARES = "f", "aspect", "down", "forward"  # shown in per cent
 
 _NO_PAIRS = (
     "no two views far enough apart were compared: rows alone say next to nothing of disparities; "
     "take longer recordings in which the camera moves on"
+)
+_UNSOLVED = (
+    "most views agree on no motion ({unsolved} pairs; {pairs} do): is the calibration of these cameras, and of "
+    "images of this size?"
 )
 
 _AWAY = 50.0  # baselines at which the error of the depth is said
@@ -53,6 +57,8 @@ class Found:
     name: str
     frames: int  # how many there were
     pairs: int  # of views that show motion
+    unsolved: int  # pairs of views for which no motion was found
+    matched: float  # number of landmarks found again in a frame, the median
     posterior: RigPosterior  # from this recording alone
     evidence: RecordingEvidence | None  # without any prior; None where no motion was seen
 
@@ -63,8 +69,9 @@ class Calibrated:
 
     found: Sequence[Found]  # by each
     kept: SavedCalibration  # by all together
-    agreed: Agreement | None  # whether they agree; None where one alone shows motion
-    judgement: str  # how good the calibration was, in a line
+    apart: Array | None  # how far two differ at most, see `agreement`; None where one alone shows motion
+    agreed: str  # the same in a line; empty for None
+    judgement: str  # how good the calibration was, in a line; empty where that cannot be said
     off: float  # RMS distance [px] of the corrected calibration's pixels from the corrected pixels
     warning: str  # why little can be expected of it; empty for none
     units: Sequence[tuple[float, str]]  # of each parameter, a factor for people, and the unit that it then has
@@ -113,15 +120,19 @@ def calibrate(
     found = [_run(sequence, config, frames, show) for sequence, config in zip(sequences, configs)]
     model, systematic = RigModel(rig), configs[0].self_calibration.systematic
     evidence = [one.evidence for one in found if one.evidence is not None]
-    kept, agreed = joint_calibration(model, evidence, systematic), agreement(model, evidence, systematic)
+    kept = joint_calibration(model, factory_prior(model), evidence, systematic)
+    apart = agreement(model, evidence, systematic)
+    agreed = "" if apart is None else agreement_in_words(apart)
     corrected = corrected_rig(model, kept.posterior.mean)
-    warning = "" if any(one.pairs for one in found) else _NO_PAIRS
-    judgement = _judged(model, kept.posterior.mean, configs[0].models.pixel_sigma)
+    pairs, unsolved = sum(one.pairs for one in found), sum(one.unsolved for one in found)
+    warning = _UNSOLVED.format(pairs=pairs, unsolved=unsolved) if unsolved > pairs else "" if pairs else _NO_PAIRS
+    matched = float(np.median([one.matched for one in found]))
+    judgement = "" if unsolved > pairs else _judged(model, kept.posterior, configs[0].models.pixel_sigma, matched)
     tree = kept.to_json() | {
         "recordings": [
             {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
         ],
-        "agreement": None if agreed is None else agreed.words,
+        "agreement": agreed or None,
         "judgement": judgement,
         "warnings": [warning] if warning else [],
     }
@@ -132,25 +143,32 @@ def calibrate(
         write_kalibr(kalibr, corrected.rig)
     off = float(np.hypot(corrected.left_off, corrected.right_off))
     units = [_unit(name, unit, model.focal) for name, unit in zip(model.names, model.units)]
-    return Calibrated(found, kept, agreed, judgement, off, warning, units)
+    return Calibrated(found, kept, apart, agreed, judgement, off, warning, units)
 
 
-def _judged(model: RigModel, parameters: Array, noise: float) -> str:
-    """What the errors of a calibration do to pixels and depths, and whether that is much beside a pixel's noise."""
-    camera = model.rig.rectified.rig.left
-    across, down = (np.linspace(0.1, 0.9, 9) * size for size in (camera.width, camera.height))
-    left = np.stack(np.meshgrid(across, down), axis=2).reshape(-1, 2)
-    far = camera.fu / _AWAY  # disparity [px]
-    right = left - [far, 0.0]
-    changed = np.concatenate(RigCorrection(model, parameters).pixels(left, right), axis=1) - np.hstack([left, right])
-    disparity = float(np.sqrt(np.mean((changed[:, 0] - changed[:, 2]) ** 2)))
-    rows = float(np.sqrt(np.mean((changed[:, 1] - changed[:, 3]) ** 2)))
-    share = max(disparity, rows) / noise
-    word = "good" if share < 0.2 else "worth correcting, as runs do by default" if share < 1 else "bad: calibrate anew"
+def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: float) -> str:
+    """What the errors of a calibration do to pixels and depths, and whether that is much beside the noise.
+
+    The noise [px] of a feature averages out over those of a frame, `matched` of them; the rig's error is in all alike.
+    """
+    points = model.far() + np.array([0.0, 0.0, model.focal / _AWAY])
+    fields = np.stack([model.field(points)[:, 2], model.vertical(points)])  # of disparity and rows (2, N, n)
+    off = np.sqrt(np.square(fields @ posterior.mean).mean(axis=1))
+    sigma = np.sqrt((fields @ posterior.covariance * fields).sum(axis=2).mean(axis=1))
+    left = noise / np.sqrt(max(matched, 1.0))
+    beside = f"the noise of a frame's {matched:.0f} features leaves {left:.2f} px"
+    if max(off) < left:
+        word = f"good: {beside}"
+    elif (off <= 2 * sigma).all():
+        word = "no more than is uncertain: longer recordings, with turns, say more"
+    elif max(off) < noise:
+        word = f"worth correcting, as runs do by default: {beside}"
+    else:
+        word = f"bad: calibrate anew. The noise of one feature is {noise:g} px"
     return (
-        f"By this the calibration is off by {disparity:.2f} px in disparity and {rows:.2f} px in rows (RMS over the "
-        f"image), so that at {_AWAY:g} baselines depths are {100 * disparity / far:.1f} % wrong. This is {word}; "
-        f"the noise of a feature is {noise:g} px, and a good calibration is off by less than a fifth of it."
+        f"By this the calibration is off by {off[0]:.2f} ± {sigma[0]:.2f} px in disparity and {off[1]:.2f} ± "
+        f"{sigma[1]:.2f} px in rows (RMS over the image), so that at {_AWAY:g} baselines depths are "
+        f"{100 * off[0] * _AWAY / model.focal:.1f} % wrong. This is {word}."
     )
 
 
@@ -158,8 +176,7 @@ def _unit(name: str, unit: str, focal: float) -> tuple[float, str]:
     """What a parameter is multiplied by to be shown, and the unit that it then has."""
     if unit == "focal lengths":
         return focal, "px"
-    share = _SHARES.get(name.removeprefix("left_").removeprefix("right_"))
-    return (100.0, share) if share else _SHOWN[unit]
+    return (100.0, "%") if name.removeprefix("left_").removeprefix("right_") in _SHARES else _SHOWN[unit]
 
 
 def _config(sequence: StereoSequence, settings: Sequence[str]) -> SystemConfig:
@@ -173,10 +190,11 @@ def _config(sequence: StereoSequence, settings: Sequence[str]) -> SystemConfig:
 def _run(sequence: StereoSequence, config: SystemConfig, frames: tuple[int, int | None], show: Show) -> Found:
     """What one recording says."""
     system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=config)
-    count = 0
+    matched = []
     with show(sequence, len(range(len(sequence))[slice(*frames)])) as on_frame:
         for _, result in system.run(sequence.frames(*frames)):
             on_frame(result)
-            count += 1
+            matched.append(len(result.matched))
     own = system.calibration
-    return Found(sequence.name, count, own.pairs, own.posterior, own.evidence())
+    middle = float(np.median(matched)) if matched else 0.0
+    return Found(sequence.name, len(matched), own.pairs, own.unsolved, middle, own.kept().posterior, own.evidence())

@@ -54,7 +54,7 @@ def test_the_smoother_is_nearly_as_good_as_the_optimum():
         backend = make(recording.rig, recording.models, **options)
         for _ in replay(recording, backend, guess=False):
             pass
-        errors.append(absolute_errors(backend.trajectory(), sequence.ground_truth).translation_statistics.rmse)
+        errors.append(absolute_errors(backend.trajectory(), sequence.ground_truth).rmse)
     best, whole, ours = errors
     # One short run scatters about the optimum in both directions.
     assert whole < 1.2 * best and ours < 1.5 * best, errors

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam.calibration import RigCorrection, RigModel, SelfCalibration, SelfCalibrationConfig
 from slam.calibration.model import RESIDUAL
-from slam.calibration.prior import residual_variance
+from slam.calibration.prior import field_variance
 from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -16,7 +16,7 @@ CAR = StereoRig.rectified_pair(720, 610, 173, 0.54, 1242, 375)
 
 def residual_fields(rng):
     """Coefficients of fields as large as the estimator takes them to be."""
-    return np.sqrt(residual_variance()) * rng.standard_normal(4 * len(RESIDUAL))
+    return np.sqrt(field_variance()) * rng.standard_normal(4 * len(RESIDUAL))
 
 
 def residual_field(model, points):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.calibration import RigModel, SelfCalibrationConfig
+from slam.calibration import RigModel, RigPosterior, SelfCalibrationConfig
 from slam.calibration.followed import BASELINE, FollowedErrors
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
@@ -141,8 +141,7 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
     revised = None
     for k, T in enumerate(truth):
         if k == 19:
-            known = system.calibration._solution
-            system.calibration._solution = replace(known, mean=mean, inner=1e-4 * known.inner)
+            system.calibration._own = RigPosterior(mean, 1e-4 * system.calibration._own.covariance)
             system.calibration._motion_agrees = lambda: True
         result = system.process_features(with_error(cloud.features(T, k / 30)[0], mean))
         revised = result.revision or revised

@@ -2,11 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
-from slam.calibration.evidence import Accumulator, Evidence, row_evidence, student_weights
+from slam.calibration.evidence import Accumulator, Evidence, residual_scale, row_evidence
 from slam.calibration.model import RigModel
-from slam.calibration.posterior import residual_scale, solve
+from slam.calibration.posterior import residual_likelihoods, solve
 from slam.calibration.prior import Prior, factory_prior
 from tests.slam.calibration.drives import CAR, parameters, residual_fields
 
@@ -23,9 +22,9 @@ def test_the_posterior_is_that_of_the_whole_mixture():
     likelihood = np.exp(-0.5 * ((theta - 0.25) / 0.15) ** 2)
     p = likelihood * sum(np.exp(-0.5 * (theta / sigma) ** 2) / sigma for sigma in sigmas)
     p /= p.sum()
-    mean, found = p @ theta, solve(Prior(NONE, sigmas[:, None, None] ** 2), 0.0, evidence(0.25, 0.15))
+    mean, found = p @ theta, solve(Prior(NONE, sigmas[:, None, None] ** 2), evidence(0.25, 0.15))
     assert found.mean[0] == pytest.approx(mean, rel=1e-6)
-    assert found.inner[0, 0] == pytest.approx(p @ (theta - mean) ** 2, rel=1e-6)
+    assert found.covariance[0, 0] == pytest.approx(p @ (theta - mean) ** 2, rel=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.3, 1.0])
@@ -38,8 +37,9 @@ def test_how_large_the_residual_fields_are_is_seen_in_the_rows(scale):
         vertical = -model.vertical(points) @ theta - model.residual_vertical(points) @ fields
         found = row_evidence(model, points, vertical + 0.1 * rng.standard_normal(300), theta)[1]
         rows = found if rows is None else rows + found
-    assert residual_scale(factory_prior(model), rows) == pytest.approx(scale, rel=0.4)
-    assert residual_scale(factory_prior(model), rows.scaled(1e-9)) > 0.4  # where they say nothing
+    said, nothing = (residual_likelihoods(factory_prior(model), rows.scaled(factor)) for factor in (1.0, 1e-9))
+    assert residual_scale(said) == pytest.approx(scale, rel=0.4)
+    assert residual_scale(nothing) > 0.4  # where they say nothing
 
 
 @pytest.mark.parametrize("length", [1, 4, 10])
@@ -53,8 +53,8 @@ def test_errors_that_last_are_counted_as_such(length):
         for x in errors:
             sums.add(evidence(x, 1.0))
         for _ in range(5):
-            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6)), 0.0, sums.total())
-            sums.update_inflation(solution.mean, solution.inner)
+            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6)), sums.total())
+            sums.update_inflation(solution.mean, solution.covariance)
         z.append(solution.mean[0] / np.sqrt(solution.covariance[0, 0]))
     # Half a block and less is counted in full; the prior on the inflation holds a part back.
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.9
@@ -67,25 +67,30 @@ def test_a_prior_that_contradicts_all_blocks_is_no_scatter():
     for x in 5.0 + rng.standard_normal(400):
         sums.add(evidence(x, 1.0))
         sums.update_inflation(mean, np.full((1, 1), 0.01))
-        mean = solve(narrow, 0.0, sums.total()).mean
+        mean = solve(narrow, sums.total()).mean
     assert sums.inflation < 2.0
     assert mean[0] > 2.5  # of 5, by 400 measurements against a prior worth 100
 
 
-def test_what_an_error_of_the_whole_recording_leaves():
-    """Information (S⁻¹ + V)⁻¹, and the same mean."""
-    S = np.array([[4.0, 1.0], [1.0, 2.0]])
-    mean = np.array([0.3, -0.2])
-    left = Evidence(S, S @ mean, np.zeros((2, 1))).with_error(np.array([0.5, 2.0]))
-    np.testing.assert_allclose(np.linalg.inv(left.S), np.linalg.inv(S) + np.diag([0.5, 2.0]))
-    np.testing.assert_allclose(np.linalg.solve(left.S, left.e), mean)
-    nothing = Evidence(np.zeros((2, 2)), np.zeros(2), np.zeros((2, 1))).with_error(np.ones(2))
-    assert not nothing.S.any()
+def test_what_errors_of_parameters_and_fields_leave():
+    """Information (S⁻¹ + V + φ S⁻¹ C Cᵀ S⁻¹)⁻¹, and the same mean."""
+    S, C = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([[0.5, 0.1, 0.0], [0.2, 0.0, 0.4]])
+    mean, V, W = np.array([0.3, -0.2]), np.array([0.5, 2.0]), np.linalg.inv(S)
+    for fields in (0.0, 3.0):
+        left = Evidence(S, S @ mean, C).with_error(V, fields)
+        np.testing.assert_allclose(np.linalg.inv(left.S), W + np.diag(V) + fields * W @ C @ C.T @ W)
+        np.testing.assert_allclose(np.linalg.solve(left.S, left.e), mean)
+    nothing = Evidence(np.zeros((2, 2)), np.zeros(2), np.zeros((2, 1))).with_error(np.ones(2), 1.0)
+    assert not nothing.S.any() and not nothing.e.any()
 
 
-@pytest.mark.parametrize("dof", [1, 3])
-def test_good_residuals_weigh_the_inverse_of_their_variance_and_outliers_next_to_nothing(dof):
-    squared = 4.0 * chi2.ppf((np.arange(1000) + 0.5) / 1000, dof)  # of residuals with twice the configured noise
-    weights = student_weights(np.append(squared, 4e4), dof, 0.01)
-    assert weights[:1000].mean() == pytest.approx(0.25, rel=0.1)
-    assert weights[-1] < 1e-3
+def test_rows_weigh_the_inverse_of_their_variance_and_outliers_next_to_nothing():
+    model, rng = RigModel(CAR), np.random.default_rng(3)
+    points = model.focal * rng.uniform([-0.7, -0.2, 0.01], [0.7, 0.2, 0.05], (2000, 3))
+    vertical, theta = 0.2 * rng.standard_normal(2000), np.zeros(len(model.names))
+    A = model.vertical(points)
+    clean = row_evidence(model, points, vertical, theta)[0]
+    assert np.trace(clean.S) == pytest.approx(np.trace(A.T @ A) / 0.2**2, rel=0.1)
+    wrong = vertical + 40.0 * (np.arange(2000) == 0)
+    pull = row_evidence(model, points, wrong, theta)[0].e - clean.e
+    assert np.linalg.norm(pull) < 0.01 * np.linalg.norm(40.0 * A[0] / 0.2**2)

@@ -8,10 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 import slam
-from slam.calibration import RigModel
+from slam.calibration import RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
 from slam.commands.cli import app
 from slam.errors import SlamError
+from slam.run.calibrating import _judged
 from slam.run.repeat import load
 
 WORLD = "synthetic:aisle?frames=6&speed=16&turn_error=1"
@@ -46,9 +47,7 @@ def test_two_recordings_of_one_rig(made):
     assert tree["agreement"].startswith("The recordings agree")
     assert all(word in printed for word in ("apart", "roll", "no uncertainty"))
     assert tree["judgement"] in " ".join(printed.split())
-    assert (
-        tree["judgement"].startswith("By this the calibration is off by") and "a good calibration" in tree["judgement"]
-    )
+    assert tree["judgement"].startswith("By this the calibration is off by")
     model = RigModel(slam.open_sequence(WORLD).rig)
     factors = {"left_cx": (model.focal, "px"), "right_f": (100, "%"), "left_k1": (1000, "10⁻³"), "yaw": (1000, "mrad")}
     for row in [row for row in tree["parameters"] if row["name"] in factors]:
@@ -60,6 +59,18 @@ def test_two_recordings_of_one_rig(made):
         rig = slam.load_rig(folder / name)
         assert (rig.left, rig.right) == (expected.left, expected.right)
         np.testing.assert_allclose(rig.T_right_left, expected.T_right_left, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("off", "sigma", "word"),
+    [(0.01, 0.001, "good"), (0.2, 0.01, "worth correcting"), (0.2, 0.2, "uncertain"), (3.0, 0.01, "bad")],
+)
+def test_a_calibration_is_judged_by_the_noise_of_features_and_its_own_uncertainty(off, sigma, word):
+    model = RigModel(slam.open_sequence(WORLD).rig)
+    shift = np.array([float(name == "right_cx") for name in model.names]) / model.focal  # of all disparities by 1 px
+    posterior = RigPosterior(off * shift, sigma**2 * np.outer(shift, shift))
+    words = _judged(model, posterior, noise=0.4, matched=100.0)
+    assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
 
 
 def test_it_is_the_prior_of_a_run_and_of_its_repetition(made, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 import slam
 from experiments.simulated_recording import true_recording
-from slam.calibration.posterior import Solution
+from slam.calibration.posterior import RigPosterior
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError, SequenceError
@@ -76,7 +76,7 @@ def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkey
         if k in offsets:
             mean, tight = np.zeros(len(calibration.model.names)), 1e-9 * np.eye(len(calibration.model.names))
             mean[column] = offsets[k] / calibration.model.focal
-            calibration._solution = Solution(mean, tight, tight, 1.0)
+            calibration._own = RigPosterior(mean, tight)
         results.append(system.process_features(desk.observations(k)))
     revisions = [r.revision for r in results]
     assert [k for k, r in enumerate(revisions) if r is not None] == [8, 11]
