@@ -285,12 +285,14 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        self._solver.update(problem.factors, problem.values, problem.stamps, problem.removed)
+        stays = {key: float(s.number - 1) for key in problem.values.keys()}  # of all until the newest pose is solved for
+        self._solver.update(problem.factors, problem.values, stays, problem.removed)
         slots = self._solver.getISAM2Result().getNewFactorsIndices()
         for track, place in made:
             track.slot = slots[place]
         for _ in range(again):
             self._solver.update()
+        self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
         self._tracks.forget(s.number)
         values = self._solver.calculateEstimate()
         poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)])

@@ -51,8 +51,8 @@ class Steps(RectifiedMeasurement):
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
         own = 0.5 * (own + own.T)
-        tie = Tie(inverse(s.poses[-1]) @ T, own)
-        if s.inside and not rests and (first or before is None or (s.tie is not None and s.tie.times is not None)):
+        tie = Tie(inverse(s.poses[-1]) @ T, own, s.inside)
+        if s.inside and not rests and (first or before is None or (s.tie is not None and s.tie.direct)):
             tie = replace(tie, times=np.array([np.nan if first or before is None else -before, 0.0, dt]))
         return replace(
             s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
