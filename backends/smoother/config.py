@@ -19,8 +19,8 @@ class SmootherConfig:
             a lag, a factor ends before its first pose leaves.
         lag: number of poses that are smoothed; older ones are marginalised, so that neither time nor memory grows
             with the run. Null (in Python None) keeps all poses and revises the whole path.
-        landmarks: most landmarks that are variables of the graph: those that are measured for longer than a smart factor
-            spans, which keep what it says of them, and for as long as they are in the map.
+        landmarks: most landmarks that are variables of the graph: those that are measured for longer than a smart
+            factor spans keep what it says of them in this way, for as long as they are in the map.
         past: number of poses, at least, whose measurements are kept, to revise the path when measurements are mended.
 
     Raises:

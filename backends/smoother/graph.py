@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
@@ -74,11 +74,10 @@ class Tracks:
     Args:
         make: makes the factors.
         lag: number of poses that are smoothed; None for all.
-        plain: whether there are smart factors alone, but for what is known.
     """
 
-    def __init__(self, make: FactorMaker, lag: int | None, plain: bool = False) -> None:
-        self._make, self._lag, self._plain = make, lag, plain
+    def __init__(self, make: FactorMaker, lag: int | None) -> None:
+        self._make, self._lag = make, lag
         self._smart: dict[int, Track] = {}
         self._variables: dict[int, int] = {}  # numbers of the poses as long as which they stay
 
@@ -109,14 +108,15 @@ class Tracks:
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
             track = self._smart.get(serial)
-            if track is None or (track.begun != begun if begun != VARIABLE else track.poses[0] < first - 1):
+            goes_on = track is not None and (track.poses[0] >= first - 1 if begun == VARIABLE else track.begun == begun)
+            if track is None or not goes_on:
                 self._smart[serial] = track = Track(begun)
             track.poses.append(number)
             track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
             problem.grown[serial, track.begun] = track
-            if begun == VARIABLE and track.stereo and not self._plain:
+            if begun == VARIABLE and track.stereo:
                 self._turn(problem, s, serial, number)
 
     def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
@@ -137,8 +137,8 @@ class Tracks:
         problem.stamps[landmark_key(serial)] = float(number)
 
     def _turn(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
-        """A landmark of the map becomes a variable, and the measurements of its smart factor are its own."""
-        row = np.flatnonzero(s.landmarks.serial == serial)
+        """A landmark becomes a variable, if the state has it as one, with the measurements of its smart factor."""
+        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.begun == VARIABLE))
         if not len(row):
             return
         track = self._smart.pop(serial)
@@ -214,8 +214,8 @@ class Graph:
         self._make, self._lag = make, lag
         self.restart()
 
-    def restart(self, plain: bool = False) -> None:
-        """Leave what is in it: the next state is put in whole; see `rebuilt`."""
+    def restart(self) -> None:
+        """Leave what is in it: the next state is put in whole."""
         parameters = gtsam.ISAM2Params()
         parameters.relinearizeSkip = 1
         parameters.setRelinearizeThreshold(0.01)
@@ -223,7 +223,7 @@ class Graph:
         self._solver = gtsam.IncrementalFixedLagSmoother(
             _ENDLESS if self._lag is None else float(self._lag), parameters
         )
-        self._tracks = Tracks(self._make, self._lag, plain)
+        self._tracks = Tracks(self._make, self._lag)
         self._number, self._taken = -1, 0
         self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}
@@ -232,6 +232,8 @@ class Graph:
 
     def followed(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with one pose more than the last one; and why the graph was built anew, if it was.
+
+        After a failure there are no landmarks among its variables.
 
         Raises:
             SolverError: gtsam fails with the new graph as well.
@@ -244,17 +246,17 @@ class Graph:
             except FAILURES as error:
                 why, self.rebuilds = _line(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
-        return self.rebuilt(s, plain=bool(why)), why
+        if why:
+            s = replace(s, landmarks=s.landmarks.without_variables(s.number))
+        return self.rebuilt(s), why
 
-    def rebuilt(self, s: SmootherState, again: int = 0, plain: bool = False) -> Solved:
+    def rebuilt(self, s: SmootherState, again: int = 0) -> Solved:
         """The solution with all anew, from what the state keeps; `again` so many times linearised again.
-
-        Plain: no landmark is a variable, but those that are known.
 
         Raises:
             SolverError: gtsam fails.
         """
-        self.restart(plain)
+        self.restart()
         oldest = self.oldest(s)
         try:
             self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
@@ -285,8 +287,9 @@ class Graph:
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        stays = {key: float(s.number - 1) for key in problem.values.keys()}  # of all until the newest pose is solved for
-        self._solver.update(problem.factors, problem.values, stays, problem.removed)
+        # Nothing leaves before the newest pose is solved for: what leaves fixes where its neighbours are linearised.
+        now = dict.fromkeys(problem.values.keys(), float(s.number - 1))
+        self._solver.update(problem.factors, problem.values, now, problem.removed)
         slots = self._solver.getISAM2Result().getNewFactorsIndices()
         for track, place in made:
             track.slot = slots[place]
