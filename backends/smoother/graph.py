@@ -16,6 +16,9 @@ from slam.data import IdArray
 from slam.errors import SlamError
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 
+#: Times of variables, as gtsam's stubs have them.
+Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
+
 #: What gtsam throws when it cannot solve.
 FAILURES = (RuntimeError, ValueError, LookupError)
 
@@ -50,7 +53,7 @@ class GraphProblem:
     removed: list[int] = field(default_factory=list)  # slots of factors that others replace
     grown: dict[tuple[int, int], Track] = field(default_factory=dict)  # smart factors with new measurements
     # times of variables for the fixed lag: numbers of poses
-    stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = field(default_factory=dict)
+    stamps: Stamps = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +291,7 @@ class Graph:
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
         # Nothing leaves before the newest pose is solved for: what leaves fixes where its neighbours are linearised.
-        now = dict.fromkeys(problem.values.keys(), float(s.number - 1))
+        now: Stamps = dict.fromkeys(problem.values.keys(), float(s.number - 1))
         self._solver.update(problem.factors, problem.values, now, problem.removed)
         slots = self._solver.getISAM2Result().getNewFactorsIndices()
         for track, place in made:
