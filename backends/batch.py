@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from backends.smoother import SmootherBackend
-from backends.smoother.factors import landmark_key, pose_key, to_pose3, velocity_change
+from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
 from backends.smoother.graph import FAILURES, GraphProblem, Tracks, minimised
 from backends.smoother.state import SmootherState
 from slam.bounds import from_options, require_not_negative
@@ -25,7 +25,7 @@ from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
-from slam.window.motion import LONGEST, is_first, velocity_sigmas
+from slam.window.motion import LONGEST, is_first
 from slam.window.stereo import Field, RectifiedStereo
 
 _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
@@ -182,7 +182,7 @@ class _BatchSolution:
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))
-        for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), smoother.models):
+        for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), make):
             problem.factors.add(factor)
         places = _places(s, make.stereo, numbers)
         known = {serial: one for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
@@ -252,33 +252,18 @@ def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[i
     return {serial: place for serial, (d, place) in nearest.items() if count[serial] > 1 or d > _DISTINCT}
 
 
-def _motions(keys: list[int], dt: Array, models: EstimatorModels) -> Iterator[gtsam.NonlinearFactor]:
+def _motions(keys: list[int], dt: Array, make: FactorMaker) -> Iterator[gtsam.NonlinearFactor]:
     """What ties successive poses: their velocities differ by white noise; the first one has its own prior.
 
     Args:
         keys: variables of the poses (N,).
         dt: times between them (N − 1,) [s].
-        models: noise and priors.
+        make: makes the factors.
     """
     for i, interval in enumerate(dt.tolist()):
-        first = is_first(None if not i else float(dt[i - 1]), interval)
-        tied = keys[i : i + 2] if first else keys[i - 1 : i + 2]
-        earlier = interval if first else float(dt[i - 1])
-        noise = gtsam.noiseModel.Diagonal.Sigmas(velocity_sigmas(models, interval, first))
-        yield gtsam.CustomFactor(noise, tied, _velocity_change(tied, earlier, interval))
-
-
-def _velocity_change(keys: list[int], d0: float, d1: float) -> Callable[[gtsam.CustomFactor, gtsam.Values, Any], Any]:
-    """Residual (6,): the velocity [ω, v] between the last two poses, over d1 [s], less that between the first two."""
-
-    def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
-        r, J = velocity_change(np.array([values.atPose3(key).matrix() for key in keys]), np.array([d0, d1]))
-        if jacobians is not None:
-            for i, by_pose in enumerate(J):
-                jacobians[i] = by_pose
-        return r
-
-    return error
+        before = float(dt[i - 1]) if i else None
+        first = is_first(before, interval)
+        yield make.motion(keys[i if first else i - 1 : i + 2], np.array([before or np.nan, interval]))
 
 
 def _seen_at(keys: list[int], local: Array) -> Callable[[gtsam.CustomFactor, gtsam.Values, Any], Any]:

@@ -35,7 +35,8 @@ class SmootherBackend:
     (`slam.window.pose_only`). Frames from which the landmarks have moved enough in the image become poses of the factor
     graph: their measurements go into the smart factors, from which gtsam eliminates the landmarks, and the last poses
     are estimated together. Other frames hang at the last pose of the graph. A landmark stands where its last
-    measurements put it, given the poses; covariances are gtsam's marginals.
+    measurements put it, given the poses; some that are measured for longer than the lag are variables. Covariances are
+    gtsam's marginals.
 
     Args:
         rig: the cameras, rectified.

@@ -19,6 +19,8 @@ class SmootherConfig:
             a lag, a factor ends before its first pose leaves.
         lag: number of poses that are smoothed; older ones are marginalised, so that neither time nor memory grows
             with the run. Null (in Python None) keeps all poses and revises the whole path.
+        landmarks: most landmarks that are variables of the graph: those that are measured for longer than a smart
+            factor spans keep what it says of them in this way, for as long as they are in the map.
         past: number of poses, at least, whose measurements are kept, to revise the path when measurements are mended.
 
     Raises:
@@ -29,8 +31,10 @@ class SmootherConfig:
     overlap: float = 0.9
     track: int = 20
     lag: int | None = 16
+    landmarks: int = 20
     past: int = 50
 
     def __post_init__(self) -> None:
         ranges = {"motion": (0, 10), "overlap": (0, 1), "track": (2, 10**6), "lag": (2, 10**6), "past": (0, 10**6)}
+        ranges["landmarks"] = (0, 10**6)
         require_not_negative(self, ranges, "smoother")

@@ -92,22 +92,26 @@ class FactorMaker:
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         return gtsam.BetweenFactorPose3(pose_key(earlier), pose_key(later), to_pose3(relative), noise)
 
-    def motion(self, newest: int, poses: Array, dt: Array) -> gtsam.NonlinearFactor:
-        """The velocity to the newest pose is that before but for noise; linearised once, as its noise is large.
+    def motion(self, keys: Sequence[int], dt: Array) -> gtsam.NonlinearFactor:
+        """The velocity between the last two poses is that before but for noise.
+
+        gtsam linearises it where it linearises the rest: at other poses it would pull at the path as a whole, which
+        nothing else holds.
 
         Args:
-            newest: number of the newest pose.
-            poses: the last three (3, 4, 4), or two of which the first velocity is unknown (2, 4, 4).
-            dt: times between the last three (2,) [s].
+            keys: variables of three successive poses, or of two of which the first velocity is unknown.
+            dt: times between the last three (2,) [s]; the first does not count where there are two.
         """
-        first, values, added = len(poses) == 2, gtsam.Values(), newest + 1 - len(poses)
-        r, J = velocity_change(poses, dt)
-        rows: list[Any] = [row for i, by_pose in enumerate(J) for row in (pose_key(added + i), by_pose)]
-        noise = gtsam.noiseModel.Diagonal.Sigmas(velocity_sigmas(self._models, float(dt[1]), first))
-        for key, T in zip(rows[::2], poses):
-            values.insert(key, gtsam.Pose3(T))
-        rows += [-r, noise]
-        return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*rows), values)
+
+        def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
+            r, J = velocity_change(np.array([values.atPose3(key).matrix() for key in keys]), dt)
+            if jacobians is not None:
+                for i, by_pose in enumerate(J):
+                    jacobians[i] = by_pose
+            return r
+
+        sigmas = velocity_sigmas(self._models, float(dt[1]), len(keys) == 2)
+        return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), keys, error)
 
     def point(self, z: Sequence[float]) -> gtsam.StereoPoint2:
         """A measurement (uL, vL, uR); uR may be NaN."""

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
+from backends.smoother.landmarks import VARIABLE
 from backends.smoother.state import SmootherState
+from slam.data import IdArray
 from slam.errors import SlamError
-from slam.geometry.se3 import Array, adjoint, inverse, transform
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
+
+#: Times of variables, as gtsam's stubs have them.
+Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
 
 #: What gtsam throws when it cannot solve.
 FAILURES = (RuntimeError, ValueError, LookupError)
@@ -48,7 +53,7 @@ class GraphProblem:
     removed: list[int] = field(default_factory=list)  # slots of factors that others replace
     grown: dict[tuple[int, int], Track] = field(default_factory=dict)  # smart factors with new measurements
     # times of variables for the fixed lag: numbers of poses
-    stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = field(default_factory=dict)
+    stamps: Stamps = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +62,8 @@ class Solved:
 
     first: int  # number of the first one
     poses: Array  # (L, 4, 4)
+    serials: IdArray  # of landmarks that are variables (V,)
+    points: Array  # and where they are (V, 3)
     covariance: Array  # joint covariance (12, 12) of the last two poses; (6, 6) of a single one
 
 
@@ -65,13 +72,17 @@ class Tracks:
 
     A landmark is a smart factor that grows until the landmark goes on in a new one (`SmootherLandmarks.measured`):
     factors end before their first pose leaves the lag. A landmark of which more is known than what was measured is a
-    variable of its own.
+    variable of its own, and so are some that were measured for longer: those take over what is in their smart factor.
+
+    Args:
+        make: makes the factors.
+        lag: number of poses that are smoothed; None for all.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
         self._make, self._lag = make, lag
         self._smart: dict[int, Track] = {}
-        self._variables: dict[int, int] = {}  # numbers of the poses that measured them last
+        self._variables: dict[int, int] = {}  # numbers of the poses as long as which they stay
 
     def add_pose(self, problem: GraphProblem, s: SmootherState, number: int, first: int) -> None:
         """A pose, and its tie to the one before it, if it is not the first one."""
@@ -82,7 +93,8 @@ class Tracks:
             if tie.times is None or (not unknown and number - 2 < first):
                 factor = self._make.tie(number - 1, number, tie.relative, tie.covariance)
             else:
-                factor = self._make.motion(number, s.poses[row - (1 if unknown else 2) : row + 1], np.diff(tie.times))
+                keys = [pose_key(i) for i in range(number - (1 if unknown else 2), number + 1)]
+                factor = self._make.motion(keys, np.diff(tie.times))
             problem.factors.add(factor)
         problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
         problem.stamps[pose_key(number)] = float(number)
@@ -94,25 +106,60 @@ class Tracks:
         rows = (column[begin:].tolist() for column in (sight.serials, sight.begun, sight.z))
         for serial, begun, z in zip(*rows):
             point = make.point(z)
-            if known and self._is_variable(problem, s, serial, number, first):
-                self._variables[serial] = number
-                problem.stamps[landmark_key(serial)] = float(number)
+            if known and self._is_variable(problem, s, serial, begun, number, first):
+                self._stays(problem, serial, number)
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
             track = self._smart.get(serial)
-            if track is None or track.begun != begun:
+            goes_on = track is not None and (track.poses[0] >= first - 1 if begun == VARIABLE else track.begun == begun)
+            if track is None or not goes_on:
                 self._smart[serial] = track = Track(begun)
             track.poses.append(number)
             track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
-            problem.grown[serial, begun] = track
+            problem.grown[serial, track.begun] = track
+            if begun == VARIABLE and track.stereo:
+                self._turn(problem, s, serial, number)
 
-    def _is_variable(self, problem: GraphProblem, s: SmootherState, serial: int, number: int, first: int) -> bool:
+    def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
+        """Variables that the state keeps do not leave; their serial numbers."""
+        serials = s.landmarks.serial[s.landmarks.begun == VARIABLE].tolist()
+        kept = [serial for serial in serials if self._is_there(serial, s.number)]
+        for serial in kept:
+            self._stays(problem, serial, s.number)
+        return kept
+
+    def _is_there(self, serial: int, number: int) -> bool:
+        """Whether a variable has not left the lag before a pose."""
+        return serial in self._variables and (self._lag is None or self._variables[serial] >= number - 1 - self._lag)
+
+    def _stays(self, problem: GraphProblem, serial: int, number: int) -> None:
+        """A variable stays for as long as a pose."""
+        self._variables[serial] = number
+        problem.stamps[landmark_key(serial)] = float(number)
+
+    def _turn(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
+        """A landmark becomes a variable, if the state has it as one, with the measurements of its smart factor."""
+        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.begun == VARIABLE))
+        if not len(row):
+            return
+        track = self._smart.pop(serial)
+        del problem.grown[serial, track.begun]
+        if track.slot >= 0:
+            problem.removed.append(track.slot)
+        for pose, point in zip(track.poses, track.points):
+            problem.factors.add(self._make.explicit(point, pose, serial))
+        problem.values.insert(landmark_key(serial), s.landmarks.position[row[0]])
+        self._stays(problem, serial, number)
+
+    def _is_variable(
+        self, problem: GraphProblem, s: SmootherState, serial: int, begun: int, number: int, first: int
+    ) -> bool:
         """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
-        if serial in self._variables:
-            return self._lag is None or self._variables[serial] >= number - 1 - self._lag
         known = s.known.get(serial)
+        if serial in self._variables and (begun == VARIABLE or known is not None):
+            return self._is_there(serial, number)
         if known is None or 0 <= known.pose < first:
             return False
         self.add_known(problem, s, serial)
@@ -189,6 +236,8 @@ class Graph:
     def followed(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with one pose more than the last one; and why the graph was built anew, if it was.
 
+        After a failure there are no landmarks among its variables.
+
         Raises:
             SolverError: gtsam fails with the new graph as well.
         """
@@ -200,6 +249,8 @@ class Graph:
             except FAILURES as error:
                 why, self.rebuilds = _line(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
+        if why:
+            s = replace(s, landmarks=s.landmarks.without_variables(s.number))
         return self.rebuilt(s), why
 
     def rebuilt(self, s: SmootherState, again: int = 0) -> Solved:
@@ -237,18 +288,24 @@ class Graph:
             self._tracks.add_pose(problem, s, number, first)
             self._tracks.add_rows(problem, s, number, first)
             self._taken = len(s.sights[s.of(number)])
+        kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
-        self._solver.update(problem.factors, problem.values, problem.stamps, problem.removed)
+        # Nothing leaves before the newest pose is solved for: what leaves fixes where its neighbours are linearised.
+        now: Stamps = dict.fromkeys(problem.values.keys(), float(s.number - 1))
+        self._solver.update(problem.factors, problem.values, now, problem.removed)
         slots = self._solver.getISAM2Result().getNewFactorsIndices()
         for track, place in made:
             track.slot = slots[place]
         for _ in range(again):
             self._solver.update()
+        self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
         self._tracks.forget(s.number)
         values = self._solver.calculateEstimate()
         poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)])
         self._poses = dict(zip(range(first, s.number + 1), poses))
-        solved = Solved(first, poses, self._joint(list(range(max(first, s.number - 1), s.number + 1))))
+        points = np.array([values.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3)
+        joint = self._joint(list(range(max(first, s.number - 1), s.number + 1)))
+        solved = Solved(first, poses, np.array(kept, np.int64), points, joint)
         if not (np.isfinite(poses).all() and np.isfinite(solved.covariance).all()):
             raise ValueError("the solution is not finite")
         if (np.diag(solved.covariance) <= 0).any():
@@ -265,6 +322,15 @@ class Graph:
             return s.number, s.spread[-1]
         first = max(self.oldest(s), self.oldest(s) if first is None else first)
         return first, self._joint(list(range(first, s.number + 1)))
+
+    def landmark_covariance(self, s: SmootherState, serial: int, position: Array) -> Array | None:
+        """Covariance (3, 3) in the world of a landmark at a position (3,), if it is a variable of the state's graph."""
+        key = landmark_key(serial)
+        if self._number != s.number or self._kind != _kind(s) or not self._solver.getLinearizationPoint().exists(key):
+            return None
+        R = self._first[:3, :3]
+        J = R @ points_by_pose(transform(inverse(self._first), position[None]))[0]
+        return np.asarray(self._solver.getISAM2().marginalCovariance(key) + J @ self._base @ J.T)
 
     def _joint(self, numbers: list[int]) -> Array:
         isam, keys = self._solver.getISAM2(), [pose_key(i) for i in numbers]

@@ -8,12 +8,14 @@ from typing import Self
 import numpy as np
 
 from backends.smoother.landmark_kernels import carried_by, information_of
+from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array, points_by_pose
 from slam.table import LandmarkRows
 from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
+VARIABLE = -(10**9)  #: in place of the number of the pose with which a smart factor begins: a variable of the graph
 _GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
 _DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
 _BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
@@ -32,7 +34,9 @@ class SmootherLandmarks(LandmarkRows):
     world: BoolArray  # whether that does not depend on any pose (S,)
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
-    begun: IndexArray  # number of the pose from which its present smart factor counts (S,); it may begin later
+    begun: (
+        IndexArray  # number of the pose from which its present smart factor counts (S,); it may begin later; VARIABLE
+    )
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
     @classmethod
@@ -71,7 +75,8 @@ class SmootherLandmarks(LandmarkRows):
         last, begun = self.pose[rows].max(axis=1), self.begun.copy()
         half, full = max(track // 2, 1), begun[rows] <= pose - track
         anew = (last < 0) | (last < pose - half)
-        begun[rows] = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, begun[rows]))
+        smart = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, begun[rows]))
+        begun[rows] = np.where(begun[rows] == VARIABLE, VARIABLE, smart)
         old = np.zeros(len(self), bool)
         old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
@@ -82,6 +87,35 @@ class SmootherLandmarks(LandmarkRows):
         oldest = poses[rows].argmin(axis=1)
         zs[rows, oldest], poses[rows, oldest] = z, pose
         return replace(self, z=zs, pose=poses, away=away, begun=begun)
+
+    def with_variables(self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array) -> Self:
+        """With more landmarks as variables, of those that a pose T (4, 4) is about to measure (M, 3); at most so many.
+
+        These are landmarks whose smart factor is full: as variables they keep what it says of them, as its measurements
+        go over. They are in front of the camera by three of their sigmas, so that Gauss-Newton steps cannot put them
+        behind it. Variables that were not measured for longer than a factor spans make room, the oldest first.
+        """
+        last, variable = self.pose.max(axis=1), self.begun == VARIABLE
+        far = np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
+        sure = SIGMAS * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < far
+        full = ~variable[rows] & (self.begun[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
+        new = rows[full & sure & np.isfinite(z[:, 2])]
+        away = np.flatnonzero(variable & (last < pose - track))
+        away = away[np.argsort(last[away], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
+        begun = self.begun.copy()
+        begun[away] = 0
+        begun[np.sort(new)[: most - int(variable.sum()) + len(away)]] = VARIABLE
+        return replace(self, begun=begun)
+
+    def at(self, serials: IdArray, points: Array) -> Self:
+        """With some landmarks (V,), by serial number, at points (V, 3)."""
+        position = self.position.copy()
+        position[np.searchsorted(self.serial, serials)] = points
+        return replace(self, position=position)
+
+    def without_variables(self, pose: int) -> Self:
+        """With smart factors that begin at pose number `pose` in place of all variables."""
+        return replace(self, begun=np.where(self.begun == VARIABLE, pose, self.begun))
 
     def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Self:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""

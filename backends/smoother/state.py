@@ -42,6 +42,7 @@ class Tie:
 
     relative: Array  # the pose relative to the one before it in the graph (4, 4)
     covariance: Array  # of that (6, 6)
+    direct: bool  # whether the pose before it in the graph is the frame before it
     times: Array | None = None  # (3,)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.considered import by_pose_and_rig, landmarks_by_rig
 from backends.smoother.graph import Graph, Solved, SolverError
-from backends.smoother.landmarks import SmootherLandmarks, inverses
+from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
 from backends.smoother.state import Known, Sight, SmootherState, Tie
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
@@ -51,8 +51,8 @@ class Steps(RectifiedMeasurement):
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
         own = 0.5 * (own + own.T)
-        tie = Tie(inverse(s.poses[-1]) @ T, own)
-        if s.inside and not rests and (first or before is None or (s.tie is not None and s.tie.times is not None)):
+        tie = Tie(inverse(s.poses[-1]) @ T, own, s.inside)
+        if s.inside and not rests and (first or before is None or (s.tie is not None and s.tie.direct)):
             tie = replace(tie, times=np.array([np.nan if first or before is None else -before, 0.0, dt]))
         return replace(
             s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
@@ -136,6 +136,7 @@ class Steps(RectifiedMeasurement):
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
         marks.by_rig[seen] = landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
+        marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T)
         marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number))
         sight = Sight.of(marks, seen, z[used])
         if s.inside:
@@ -152,7 +153,8 @@ class Steps(RectifiedMeasurement):
         solved, why = graph.followed(after)
         after = self.settled(after, solved)
         drift = _drift(solved.covariance, after.poses[-2], after.poses[-1])
-        return replace(after, landmarks=after.landmarks.left_behind(seen, after.poses[-1], drift)), nis, why
+        marks = after.landmarks.without_variables(number) if why else after.landmarks
+        return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], drift)), nis, why
 
     def _is_chosen(self, s: SmootherState, T: Array, seen: IndexArray) -> bool:
         """Whether the newest frame, at T (4, 4), becomes a pose of the graph: see `SmootherConfig`."""
@@ -180,7 +182,9 @@ class Steps(RectifiedMeasurement):
             pair[:6, :6] = relative_covariance(newest_first, poses[-1], last[0])
         last[1] = poses[-1]
         spread = np.concatenate([s.spread[:-1], P[None, -6:, -6:]])
-        marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses)
+        marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses).at(
+            solved.serials, solved.points
+        )
         s = replace(s, poses=poses, last=last, pair=pair, spread=spread, landmarks=marks)
         return s if self.past is None or len(s.poses) < 1.5 * self.past else s.without_old(self.past)
 
@@ -231,8 +235,12 @@ class Steps(RectifiedMeasurement):
     def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks in the world."""
         first, joint = graph.joint_covariance(s)
-        poses = s.poses[s.of(first) :]
-        return s.landmarks.covariances(self.stereo, self.models.pixel_sigma, rows, first, poses, joint)
+        poses, marks = s.poses[s.of(first) :], s.landmarks
+        C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, first, poses, joint)
+        for i in np.flatnonzero(marks.begun[rows] == VARIABLE):
+            found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
+            C[i] = C[i] if found is None else found
+        return C
 
 
 def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> SmootherState:

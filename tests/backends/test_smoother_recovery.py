@@ -86,7 +86,8 @@ def test_one_failure_costs_nothing(break_solver, method, error):
     said = [r.reason for r in reports[1:] if r.reason]
     assert len(said) == 1 and said[0].startswith("smoother: built anew after gtsam: ") and "\n" not in said[0]
     off = se3.log(se3.inverse(untouched.trajectory().poses) @ backend.trajectory().poses)
-    assert np.abs(off).max() < 1e-3
+    deviations = np.sqrt(np.diag(untouched.estimate(landmarks=False).covariance))
+    assert np.abs(off / deviations).max() < 0.5  # all is linearised anew, where poses are known better
     near_the_truth(backend, data)
 
 
