@@ -69,14 +69,12 @@ class Covariance:
         """Of the state (12 + 3A, 12 + 3A)."""
         return np.block([[self.camera], [self.camera[:, CAMERA:].T, self.marks]])
 
-    def marginals(self) -> tuple[Array, Array]:
-        """Covariances (N, 3, 3) of all landmarks, and theirs (N, 3, 6) with the camera's [r, φ]."""
-        left, blocks = slice(POSE * self.poses, len(self.left) - self.rig), []
-        for P in (self.marks, self.left[left, left]):
-            blocks.append(np.einsum("iaib->iab", P.reshape(len(P) // 3, 3, len(P) // 3, 3)))
-        cross = np.concatenate([self.camera[:POSE, CAMERA:], self.cross[:POSE, left]], axis=1)
-        apart = np.zeros((len(self.known), 3, POSE))
-        return np.concatenate([*blocks, self.known]), np.concatenate([cross.T.reshape(-1, 3, POSE), apart])
+    def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
+        """Covariances (M, 3, 3) of some landmarks, and theirs (M, 3, 6) with the camera's [r, φ]."""
+        numbers, known = self._numbers(rows), rows >= self.correlated
+        blocks, cross = kernels.marginals(self.camera, self.marks, self.cross, self.left, numbers)
+        blocks[known] = self.known[rows[known] - self.correlated]
+        return blocks, cross
 
     def by_rig(self, rows: IndexArray) -> tuple[Array, Array]:
         """Derivatives of the camera's error (12, m), and of some landmarks (M, 3, m), by errors of the rig."""
@@ -99,11 +97,20 @@ class Covariance:
         """With the present pose among those that are kept, J (6, 6) times [r, φ]; and at most so many of them."""
         k = POSE * min(self.poses, most - 1)
         stay = np.concatenate([np.arange(k), np.arange(POSE * self.poses, len(self.left))])
-        own, left = self.camera[:POSE].T @ J.T, np.empty((POSE + len(stay), POSE + len(stay)))
-        left[:POSE, :POSE], left[:POSE, POSE:] = J @ own[:POSE], J @ self.cross[:POSE, stay]
-        left[POSE:, :POSE], left[POSE:, POSE:] = left[:POSE, POSE:].T, self.left[stay][:, stay]
-        cross = np.concatenate([own, self.cross[:, stay]], axis=1)
+        left = np.empty((POSE + len(stay), POSE + len(stay)))
+        left[:POSE, :POSE], left[:POSE, POSE:] = J @ self.pose @ J.T, J @ self.cross[:POSE, stay]
+        left[POSE:, :POSE], left[POSE:, POSE:] = left[:POSE, POSE:].T, self.left[stay[:, None], stay]
+        cross = np.concatenate([self.camera[:POSE].T @ J.T, self.cross[:, stay]], axis=1)
         return replace(self, cross=cross, left=left, poses=k // POSE + 1)
+
+    def joint_poses(self, J: Array, n: int) -> Array:
+        """Joint covariance (6n, 6n) of the last poses, the present one last, which is J (6, 6) times [r, φ]."""
+        k = POSE * (n - 1)
+        cross = self.cross[:POSE, :k].T @ J.T
+        P = np.block([[self.left[:k, :k], cross], [cross.T, J @ self.pose @ J.T]])
+        order = np.arange(POSE * n).reshape(n, POSE)
+        order[:-1] = order[-2::-1]
+        return np.asarray(P[order.reshape(-1)][:, order.reshape(-1)])
 
     def camera_moved(self, J: Array, noise: Array) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
@@ -123,7 +130,7 @@ class Covariance:
         marks[:n, :n], marks[n:, :n], marks[:n, n:] = self.marks, rows[:, CAMERA:], rows[:, CAMERA:].T
         own = rows[:, :POSE] @ by_pose.T
         own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
-        marks[n:, n:] = 0.5 * (own + own.T)
+        marks[n:, n:] = _positive(0.5 * (own + own.T), own.diagonal(), POSE)
         camera = np.concatenate([self.camera, rows[:, :CAMERA].T], axis=1)
         new = by_pose @ self.cross[:POSE]
         new[:, len(self.left) - self.rig :] += by_rig.reshape(len(rows), self.rig)
@@ -151,24 +158,52 @@ class Covariance:
         numbers[rows >= self.correlated] = -1
         return numbers.reshape(-1)
 
-    def corrected(self, lost: tuple[Array, Array, Array], J: Array, K: Array) -> Covariance:
-        """After an update, ``P − V Vᵀ``, in the coordinates of the corrected state.
+    def corrected(self, others: IndexArray, anew: Array, lost: tuple[Array, Array, Array], J: Array, K: Array) -> Covariance:
+        """After an update, in the coordinates of the corrected state: ``P − V Vᵀ`` with ``V = P Hᵀ L⁻ᵀ``.
 
-        `lost` is V = ``P Hᵀ L⁻ᵀ`` of the camera, of the landmarks, in Fortran's order, and of what has left. The
-        camera's error becomes J (12, 12) times what it was, and then to those of the landmarks K (A, 3, 6) times that
-        of the pose is added.
+        For a landmark of which all three pixels are measured this is written differently. Of its error y as seen from
+        the camera, in pixels, the part of S is ``P_yy + R``, so that
+
+            P_yy − P_yy S⁻¹ P_yy = R − R S⁻¹ R,    P_yx − P_yy S⁻¹ P_yx = R S⁻¹ P_yx:
+
+        as if the landmark had been put in anew where it is measured, independent of all else, with ``V = −R L⁻ᵀ``.
+        What a landmark's prior covariance has lost by rounding is so made good whenever it is measured.
+
+        Args:
+            others: landmarks (U,) of the state that stay in it as they are; they become the first ones of the state.
+            anew: covariances (F, 3, 3) of the measured ones' errors as seen from the camera, R in their coordinates.
+            lost: V of the camera, of the others and those anew, in Fortran's order, and of what has left.
+            J: the camera's error becomes J (12, 12) times what it was,
+            K: and then to those of the landmarks K (U + F, 3, 6) times that of the pose is added.
         """
         V_camera, V, V_left = lost
-        shift = np.asfortranarray(K.reshape(-1, POSE))
+        n, rows = 3 * len(others), 3 * others[:, None] + np.arange(3)
+        shift, here = np.asfortranarray(K.reshape(-1, POSE)), rows.reshape(-1)
+        camera, cross = np.zeros((CAMERA, len(V))), np.zeros((len(V), len(self.left)))
+        camera[:, :n], cross[:n] = self.camera[:, CAMERA + here], self.cross[CAMERA + here]
         own = J @ (self.camera[:, :CAMERA] - V_camera @ V_camera.T) @ J.T
-        own, rows = 0.5 * (own + own.T), J @ (self.camera[:, CAMERA:] - V_camera @ V.T)
-        marks = self.marks
-        if len(marks):
-            marks = dsyrk(-1.0, V, beta=1.0, c=marks.T, lower=1)  # a copy, of which the lower triangle counts
-            half = rows[:POSE].T + 0.5 * shift @ own[:POSE, :POSE]
+        own = _positive(0.5 * (own + own.T), self.camera.diagonal(), len(V.T))
+        with_marks = J @ (camera - V_camera @ V.T)
+        marks = np.zeros((0, 0))
+        if len(V):
+            before = kernels.with_independent(self.marks, others, anew)  # of which the upper triangle counts
+            variances = before.diagonal().copy()
+            marks = dsyrk(-1.0, V, beta=1.0, c=before.T, lower=1, overwrite_c=1)
+            half = with_marks[:POSE].T + 0.5 * shift @ own[:POSE, :POSE]
             marks = dsyr2k(1.0, shift, half, beta=1.0, c=marks, lower=1, overwrite_c=1).T
             kernels.mirror(marks)
-        camera = np.concatenate([own, rows + own[:, :POSE] @ shift.T], axis=1)
-        head, rest = J @ (self.cross[:CAMERA] - V_camera @ V_left.T), self.cross[CAMERA:] - V @ V_left.T
+            _positive(marks, variances, len(V.T))
+        with_marks += own[:, :POSE] @ shift.T
+        head, rest = J @ (self.cross[:CAMERA] - V_camera @ V_left.T), cross - V @ V_left.T
         cross = np.concatenate([head, rest + shift @ head[:POSE]])
-        return replace(self, camera=camera, marks=marks, cross=cross)
+        return replace(self, camera=np.concatenate([own, with_marks], axis=1), marks=marks, cross=cross)
+
+
+def _positive(P: Array, before: Array, terms: int) -> Array:
+    """P (N, N), a difference or sum of so many terms, with the variances that rounding may have taken from it.
+
+    By the variances (N,) of which it was made. Without them, a landmark that is hardly known in one direction may lose
+    its variance in another one.
+    """
+    P.reshape(-1)[:: len(P) + 1] += terms * np.finfo(float).eps * before
+    return P

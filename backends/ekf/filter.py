@@ -23,7 +23,7 @@ from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import definite, known_landmarks
+from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION
@@ -148,8 +148,9 @@ class EkfBackend:
         rows = s.landmarks.order if landmarks else s.landmarks.order[:0]
         marks = s.landmarks.select(rows)
         D = self._coordinates.jacobian(marks.anchors, marks.c)
-        blocks = D @ (s.covariance.marginals()[0][rows] if landmarks else np.zeros((0, 3, 3))) @ D.transpose(0, 2, 1)
-        return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, definite(blocks))
+        blocks = D @ s.covariance.marginals(rows)[0] @ D.transpose(0, 2, 1)
+        blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, blocks)
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
@@ -256,7 +257,8 @@ class EkfBackend:
     def _prediction(self, s: FilterState) -> Prediction:
         """Pose, and what is in the angle of view with its innovation covariance."""
         T, rows = s.pose, self._measure.visible(s.pose, s.landmarks.points)
-        marks, (blocks, cross) = s.landmarks.select(rows), (part[rows] for part in s.covariance.marginals())
+        rows = rows[s.landmarks.ids[rows] >= 0]
+        marks, (blocks, cross) = s.landmarks.select(rows), s.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         H = Jacobian(toward, marks.gauge @ s.camera.world(), rows)  # of where landmarks are as seen from the camera
         seen = H.own_covariances(s.covariance.pose, cross, blocks)

@@ -85,6 +85,58 @@ def conditional_distances(inverse, lost, y):
 
 
 @kernel
+def measured_columns(inverse, back, which, variance, out):
+    """``−R L⁻ᵀ`` of landmarks as measured anew, in their own coordinates, into `out` (F, 3, 3M).
+
+    L⁻¹ is `inverse` (3M, 3M), lower triangular; `which` (F,) of the measured landmarks these are, with derivatives
+    `back` (F, 3, 3) of their coordinates by the measurement.
+    """
+    for i in range(len(which)):
+        x = 3 * which[i]
+        for j in range(3):
+            a, b, c = -variance * back[i, j, 0], -variance * back[i, j, 1], -variance * back[i, j, 2]
+            out[i, j, :x] = 0.0
+            for k in range(x, len(inverse)):
+                out[i, j, k] = a * inverse[k, x] + b * inverse[k, x + 1] + c * inverse[k, x + 2]
+
+
+@kernel
+def with_independent(P, stay, blocks):
+    """The part of P of the landmarks `stay` (U,), and independent ones with blocks (F, 3, 3): its upper triangle."""
+    u, n = len(stay), 3 * (len(stay) + len(blocks))
+    out = np.zeros((n, n))
+    for i in range(u):
+        for j in range(3):
+            row, source = out[3 * i + j], P[3 * stay[i] + j]
+            for k in range(i, u):
+                x = 3 * stay[k]
+                row[3 * k], row[3 * k + 1], row[3 * k + 2] = source[x], source[x + 1], source[x + 2]
+    for i in range(len(blocks)):
+        x = 3 * (u + i)
+        for j in range(3):
+            for k in range(3):
+                out[x + j, x + k] = blocks[i, j, k]
+    return out
+
+
+@kernel
+def marginals(camera, marks, cross, left, numbers):
+    """Covariances (M, 3, 3) of landmarks by numbers as of `gather`, and theirs (M, 3, 6) with [r, φ]."""
+    size, n, m = camera.shape[0], camera.shape[1], len(numbers) // 3
+    blocks, with_pose = np.zeros((m, 3, 3)), np.zeros((m, 3, 6))
+    for i in range(m):
+        x = numbers[3 * i]
+        if x < 0:
+            continue
+        for j in range(3):
+            for k in range(3):
+                blocks[i, j, k] = marks[x - size + j, x - size + k] if x < n else left[x - n + j, x - n + k]
+            for k in range(6):
+                with_pose[i, j, k] = camera[k, x + j] if x < n else cross[k, x - n + j]
+    return blocks, with_pose
+
+
+@kernel
 def mirror(P):
     """Copy the upper triangle of P (n, n) to the lower, in place."""
     n = len(P)

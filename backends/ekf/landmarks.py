@@ -125,7 +125,7 @@ class FilterLandmarks(LandmarkRows):
         c[rows] = coordinates.moved(self.c[rows], change, _NEARER)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
-        return replace(self, c=c, points=points, gauge=gauge)
+        return replace(self, c=c, points=points, gauge=gauge, seen=self.seen.copy())
 
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:

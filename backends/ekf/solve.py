@@ -241,11 +241,27 @@ class System:
         W = self.inverse @ X
         return np.asarray(W - self.taken @ (self.taken.T @ W))
 
+    def lost(
+        self, P: Covariance, others: IndexArray, whole: IndexArray, back: Array, update: Update
+    ) -> tuple[Array, Array, Array]:
+        """V of `Covariance.corrected`, where `whole` (F,) of the measured landmarks are put in anew."""
+        (with_camera, with_marks), n, u = self.linear.HP, len(self.nu), 3 * len(others)
+        with_others = with_marks.reshape(n, P.count, 3).take(others, axis=1).reshape(n, u)
+        with_left = self.linear.H.times_rows(P.cross)
+        if P.rig:
+            field = np.where(self.linear.rows[:, :, None], update.field(update.z), 0.0)
+            with_left[:, -P.rig :] -= field.reshape(-1, P.rig)
+        V = self.whitened(np.concatenate([with_others, with_camera, with_left], axis=1))
+        marks = np.empty((u + 3 * len(whole), n), order="F")
+        marks[:u] = V[:u]
+        anew = np.empty((len(whole), 3, n))
+        kernels.measured_columns(self.inverse, back, whole, update.sigma**2, anew)
+        marks[u:] = anew.reshape(-1, n) - (anew.reshape(-1, n) @ self.taken) @ self.taken.T
+        return V[u : u + CAMERA], marks, V[u + CAMERA :]
+
     def whitened(self, HX: Array) -> Array:
-        """`whiten` of H X, transposed (N, 3M), in Fortran's order: P shrinks by ``V Vᵀ``, where V is this of H P."""
-        if not HX.size:
-            return np.zeros(HX.T.shape)
-        V = dtrmm(1.0, self.inverse.T, HX.T, side=1)
+        """`whiten` of H X, transposed (N, 3M), in Fortran's order."""
+        V = dtrmm(1.0, self.inverse.T, HX.T, side=1, overwrite_b=1)
         if self.taken.size:
             V = dgemm(-1.0, V @ self.taken, self.taken, beta=1.0, c=V, trans_b=1, overwrite_c=1)
         return np.asarray(V)
