@@ -7,8 +7,8 @@ The camera's last poses, as they were believed in their time, are kept in the sa
 What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
 
 Errors of the rig (`slam.interfaces.ConsideringBackend`) are such states, too: they are considered, but not estimated.
-Their columns of the cross-covariance hold the derivatives of the state by them, which the same gain moves: a landmark's
-measurement is off by ``H x − F δ``, with a field F. Their own covariance is not needed here.
+Their columns hold the derivatives of the state by them, which the same gain moves: a landmark's measurement is off by
+``H x − F δ``, with a field F. Their own covariance is not needed here.
 """
 
 from __future__ import annotations
@@ -28,60 +28,71 @@ POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of ``[camera (12), landmark 0 (3), ...]``, the state, and of what has left it."""
+    """Of ``[camera (12), last poses (6K), A landmarks of the state (3A), B that left it (3B), errors of the rig (m)]``.
 
-    camera: Array  # (12, 12 + 3A), of the camera with itself and all landmarks of the state: a motion changes no more
-    marks: Array  # (3A, 3A), of these landmarks
-    cross: Array  # (12 + 3A, 6K + 3B + m), with K poses, by right perturbations, B landmarks that left, m rig errors
-    left: Array  # (6K + 3B + m, 6K + 3B + m), of these
+    The state are the camera and its landmarks. The poses are perturbed on the right, the newest first.
+    """
+
+    head: Array  # (12 + 6K, 12 + 6K + 3A + 3B + m), of camera and last poses with everything: a motion changes no more
+    marks: Array  # (3A, 3A), of the state's landmarks
+    cross: Array  # (3A, 3B + m), of these with what has left
+    left: Array  # (3B, 3B + m), of landmarks that have left
     known: Array  # (C, 3, 3), of each landmark that is independent of all else
-    poses: int = 0  # K, the newest first
     rig: int = 0  # m
 
     @classmethod
     def of_camera(cls, P: Array) -> Covariance:
         """Of the camera alone (12, 12)."""
-        return cls(P, np.zeros((0, 0)), np.zeros((CAMERA, 0)), np.zeros((0, 0)), np.zeros((0, 3, 3)))
+        none = np.zeros((0, 0))
+        return cls(P, none, none, none, np.zeros((0, 3, 3)))
 
     def considering(self, by_rig: Array) -> Covariance:
-        """With errors of the rig, by derivatives (12, m) of the camera's error; nothing else has left the state yet."""
-        m = by_rig.shape[1]
-        cross = np.concatenate([by_rig, np.zeros((len(self.marks), m))])
-        return replace(self, cross=cross, left=np.zeros((m, m)), rig=m)
+        """With errors of the rig, by derivatives (12, m) of the camera's error, of which all else is made later."""
+        m, head = by_rig.shape[1], np.concatenate([self.head, by_rig], axis=1)
+        return replace(self, head=head, cross=np.zeros((0, m)), left=np.zeros((0, m)), rig=m)
 
     @property
     def count(self) -> int:
-        """Number of landmarks in the state: the first rows of the table of landmarks."""
+        """A: the first landmarks of the table."""
         return len(self.marks) // 3
 
     @property
     def correlated(self) -> int:
-        """Number of landmarks that are in it or have left it: those after them are known from elsewhere."""
-        return self.count + (len(self.left) - POSE * self.poses - self.rig) // 3
+        """A + B: the landmarks after these are known from elsewhere."""
+        return self.count + len(self.left) // 3
+
+    @property
+    def camera(self) -> Array:
+        """Of the camera (12, 12)."""
+        return self.head[:CAMERA, :CAMERA]
 
     @property
     def pose(self) -> Array:
-        """The block of [r, φ] (6, 6)."""
-        return self.camera[:POSE, :POSE]
+        """Of its [r, φ] (6, 6)."""
+        return self.head[:POSE, :POSE]
 
     @property
     def dense(self) -> Array:
         """Of the state (12 + 3A, 12 + 3A)."""
-        return np.block([[self.camera], [self.camera[:, CAMERA:].T, self.marks]])
+        h = len(self.head)
+        with_camera = self.head[:CAMERA, h : h + len(self.marks)]
+        return np.block([[self.camera, with_camera], [with_camera.T, self.marks]])
 
     def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
-        """Covariances (M, 3, 3) of some landmarks, and theirs (M, 3, 6) with the camera's [r, φ]."""
-        numbers, known = self._numbers(rows), rows >= self.correlated
-        blocks, cross = kernels.marginals(self.camera, self.marks, self.cross, self.left, numbers)
+        """Covariances (M, 3, 3) of landmarks, and theirs (M, 3, 6) with the camera's [r, φ]; by rows of the table."""
+        h, numbers, known = len(self.head), self._numbers(rows), rows >= self.correlated
+        blocks = np.zeros((len(rows), 3, 3))
+        kernels.blocks(self.marks, self.left, rows, blocks)
         blocks[known] = self.known[rows[known] - self.correlated]
-        return blocks, cross
+        with_pose = self.head[:POSE, h + numbers].T.reshape(len(rows), 3, POSE)
+        with_pose[known] = 0.0
+        return blocks, with_pose
 
     def by_rig(self, rows: IndexArray) -> tuple[Array, Array]:
         """Derivatives of the camera's error (12, m), and of some landmarks (M, 3, m), by errors of the rig."""
-        first, numbers = len(self.left) - self.rig, self._numbers(rows)
-        columns = len(self.cross) + np.arange(first, first + self.rig)
-        landmarks = kernels.gather(self.camera, self.marks, self.cross, self.left, numbers, columns)
-        return self.cross[:CAMERA, first:], landmarks.reshape(len(rows), 3, self.rig)
+        n = len(self.marks) + len(self.left)
+        landmarks = self._part(self._numbers(rows), np.arange(n, n + self.rig))
+        return self.head[:CAMERA, len(self.head) + n :], landmarks.reshape(len(rows), 3, self.rig)
 
     def displaced(self, rows: IndexArray, change: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error: the last of the rig's."""
@@ -93,72 +104,81 @@ class Covariance:
             table[numbers[here] - first, -1] -= change.reshape(-1)[here]
         return replace(self, cross=cross, left=left)
 
-    def with_pose(self, J: Array, most: int) -> Covariance:
-        """With the present pose among those that are kept, J (6, 6) times [r, φ]; and at most so many of them."""
-        k = POSE * min(self.poses, most - 1)
-        stay = np.concatenate([np.arange(k), np.arange(POSE * self.poses, len(self.left))])
-        left = np.empty((POSE + len(stay), POSE + len(stay)))
-        left[:POSE, :POSE], left[:POSE, POSE:] = J @ self.pose @ J.T, J @ self.cross[:POSE, stay]
-        left[POSE:, :POSE], left[POSE:, POSE:] = left[:POSE, POSE:].T, self.left[stay[:, None], stay]
-        cross = np.concatenate([self.camera[:POSE].T @ J.T, self.cross[:, stay]], axis=1)
-        return replace(self, cross=cross, left=left, poses=k // POSE + 1)
-
     def joint_poses(self, J: Array, n: int) -> Array:
-        """Joint covariance (6n, 6n) of the last poses, the present one last, which is J (6, 6) times [r, φ]."""
-        k = POSE * (n - 1)
-        cross = self.cross[:POSE, :k].T @ J.T
-        P = np.block([[self.left[:k, :k], cross], [cross.T, J @ self.pose @ J.T]])
-        order = np.arange(POSE * n).reshape(n, POSE)
-        order[:-1] = order[-2::-1]
-        return np.asarray(P[order.reshape(-1)][:, order.reshape(-1)])
+        """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
+        k = CAMERA + POSE * (n - 1)
+        with_past = J @ self.head[:POSE, CAMERA:k]
+        P = np.block([[J @ self.pose @ J.T, with_past], [with_past.T, self.head[CAMERA:k, CAMERA:k]]])
+        order = np.arange(POSE * n).reshape(n, POSE)[::-1].reshape(-1)
+        return np.asarray(P[order[:, None], order])
+
+    # --- the camera moves ---
+
+    def with_pose(self, J: Array, most: int) -> Covariance:
+        """With the present pose, J (6, 6) times [r, φ], the first of the last ones; at most so many are kept."""
+        k = min(len(self.head), CAMERA + POSE * (most - 1))
+        stay = np.concatenate([np.arange(k), np.arange(len(self.head), self.head.shape[1])])
+        head, new = self.head[:k, stay], J @ self.head[:POSE, stay]
+        own = np.concatenate([new[:, :CAMERA], J @ self.pose @ J.T, new[:, CAMERA:]], axis=1)
+        rows = np.concatenate([head[:, :CAMERA], new[:, :k].T, head[:, CAMERA:]], axis=1)
+        return replace(self, head=np.concatenate([rows[:CAMERA], own, rows[CAMERA:]]))
 
     def camera_moved(self, J: Array, noise: Array) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
-        camera, cross = J @ self.camera, self.cross.copy()
-        own = camera[:, :CAMERA] @ J.T + noise
-        camera[:, :CAMERA], cross[:CAMERA] = 0.5 * (own + own.T), J @ cross[:CAMERA]
-        return replace(self, camera=camera, cross=cross)
+        head = self.head.copy()
+        head[:CAMERA] = J @ head[:CAMERA]
+        own = head[:CAMERA, :CAMERA] @ J.T + noise
+        head[:CAMERA, :CAMERA] = 0.5 * (own + own.T)
+        head[CAMERA:, :CAMERA] = head[:CAMERA, CAMERA : len(head)].T
+        return replace(self, head=head)
+
+    # --- landmarks join and leave ---
 
     def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
 
         They are the last ones of the state. With the pose known, errors of the rig move them by `by_rig` (M, 3, m).
         """
-        by_pose, n, each = J.reshape(-1, POSE), len(self.marks), np.arange(len(J))
-        rows = by_pose @ self.camera[:POSE]
-        marks = np.empty((n + len(rows), n + len(rows)))
-        marks[:n, :n], marks[n:, :n], marks[:n, n:] = self.marks, rows[:, CAMERA:], rows[:, CAMERA:].T
+        by_pose, n, h = J.reshape(-1, POSE), len(self.marks), len(self.head)
+        rows, each = by_pose @ self.head[:POSE], np.arange(len(J))
         own = rows[:, :POSE] @ by_pose.T
         own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
+        marks, old = np.empty((n + len(rows), n + len(rows))), rows[:, h : h + n]
+        marks[:n, :n], marks[n:, :n], marks[:n, n:] = self.marks, old, old.T
         marks[n:, n:] = _positive(0.5 * (own + own.T), own.diagonal(), POSE)
-        camera = np.concatenate([self.camera, rows[:, :CAMERA].T], axis=1)
-        new = by_pose @ self.cross[:POSE]
-        new[:, len(self.left) - self.rig :] += by_rig.reshape(len(rows), self.rig)
-        cross = np.concatenate([self.cross, new])
-        return replace(self, camera=camera, marks=marks, cross=cross)
+        head = np.concatenate([self.head[:, : h + n], rows[:, :h].T, self.head[:, h + n :]], axis=1)
+        rows[:, len(self.head.T) - self.rig :] += by_rig.reshape(len(rows), self.rig)
+        return replace(self, head=head, marks=marks, cross=np.concatenate([self.cross, rows[:, h + n :]]))
 
     def rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
-        parts, first_known = (self.camera, self.marks, self.cross, self.left), self.correlated
-        begin, end, camera = CAMERA + len(self.marks), CAMERA + len(self.marks) + len(self.left), np.arange(CAMERA)
-        poses, rig = np.arange(begin, begin + POSE * self.poses), np.arange(end - self.rig, end)
-        state, outside = self._numbers(dense), np.concatenate([poses, self._numbers(left), rig])
-        marks, new = kernels.gather(*parts, state, state), np.flatnonzero(dense >= first_known)
+        h, n, first_known = len(self.head), len(self.marks) + len(self.left), self.correlated
+        state, away = self._numbers(dense), self._numbers(left)
+        rest = np.concatenate([away, np.arange(n, n + self.rig)])
+        columns = np.concatenate([np.arange(-h, 0), state, rest])
+        head = self.head[:, h + columns]
+        head[:, h : h + len(state)][:, state < 0] = 0.0
+        marks, new = self._part(state, state), np.flatnonzero(dense >= first_known)
         rows = 3 * new[:, None] + np.arange(3)
         marks[rows[:, :, None], rows[:, None, :]] = self.known[dense[new] - first_known]
-        state = np.concatenate([camera, state])
-        cross, own = kernels.gather(*parts, state, outside), kernels.gather(*parts, outside, outside)
-        rest = self.known[known - first_known]
-        return Covariance(kernels.gather(*parts, camera, state), marks, cross, own, rest, self.poses, self.rig)
+        return Covariance(
+            head, marks, self._part(state, rest), self._part(away, rest), self.known[known - first_known], self.rig
+        )
 
     def _numbers(self, rows: IndexArray) -> IndexArray:
-        """Of landmarks' coordinates (3M,) in ``[camera, landmarks, left]``; −1 for those that are known."""
-        numbers = CAMERA + 3 * rows[:, None] + np.arange(3)
-        numbers[rows >= self.count] += POSE * self.poses
+        """Of landmarks' coordinates (3M,) in ``[A, B, rig]``; −1 for those that are known."""
+        numbers = 3 * rows[:, None] + np.arange(3)
         numbers[rows >= self.correlated] = -1
         return numbers.reshape(-1)
 
-    def corrected(self, others: IndexArray, anew: Array, lost: tuple[Array, Array, Array], J: Array, K: Array) -> Covariance:
+    def _part(self, rows: IndexArray, columns: IndexArray) -> Array:
+        return np.asarray(kernels.gather(self.marks, self.cross, self.left, rows, columns))
+
+    # --- an update ---
+
+    def corrected(
+        self, others: IndexArray, anew: Array, V: tuple[Array, Array, Array], J: Array, K: Array
+    ) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − V Vᵀ`` with ``V = P Hᵀ L⁻ᵀ``.
 
         For a landmark of which all three pixels are measured this is written differently. Of its error y as seen from
@@ -167,36 +187,44 @@ class Covariance:
             P_yy − P_yy S⁻¹ P_yy = R − R S⁻¹ R,    P_yx − P_yy S⁻¹ P_yx = R S⁻¹ P_yx:
 
         as if the landmark had been put in anew where it is measured, independent of all else, with ``V = −R L⁻ᵀ``.
-        What a landmark's prior covariance has lost by rounding is so made good whenever it is measured.
+        What its prior covariance has lost by rounding is so made good whenever it is measured.
 
         Args:
             others: landmarks (U,) of the state that stay in it as they are; they become the first ones of the state.
             anew: covariances (F, 3, 3) of the measured ones' errors as seen from the camera, R in their coordinates.
-            lost: V of the camera, of the others and those anew, in Fortran's order, and of what has left.
+            V: of camera and last poses, of the others and those anew, in Fortran's order, and of what has left.
             J: the camera's error becomes J (12, 12) times what it was,
             K: and then to those of the landmarks K (U + F, 3, 6) times that of the pose is added.
         """
-        V_camera, V, V_left = lost
-        n, rows = 3 * len(others), 3 * others[:, None] + np.arange(3)
-        shift, here = np.asfortranarray(K.reshape(-1, POSE)), rows.reshape(-1)
-        camera, cross = np.zeros((CAMERA, len(V))), np.zeros((len(V), len(self.left)))
-        camera[:, :n], cross[:n] = self.camera[:, CAMERA + here], self.cross[CAMERA + here]
-        own = J @ (self.camera[:, :CAMERA] - V_camera @ V_camera.T) @ J.T
-        own = _positive(0.5 * (own + own.T), self.camera.diagonal(), len(V.T))
-        with_marks = J @ (camera - V_camera @ V.T)
+        V_head, V_marks, V_left = V
+        h, a, n = len(self.head), len(self.marks), len(V_marks)
+        here, shift = (3 * others[:, None] + np.arange(3)).reshape(-1), np.asfortranarray(K.reshape(-1, POSE))
+        head, cross = np.zeros((h, h + n + len(V_left))), np.zeros((n, len(V_left)))
+        head[:, :h], head[:, h : h + len(here)], head[:, h + n :] = (
+            self.head[:, :h], self.head[:, h + here], self.head[:, h + a :],
+        )  # fmt: skip
+        cross[: len(here)] = self.cross[here]
+        lost = np.concatenate([V_head, V_left]) @ V_marks.T
+        head[:, h : h + n] -= lost[:h]
+        cross -= lost[h:].T
+        for part, other in ((head[:CAMERA, :h], V_head), (head[:CAMERA, h + n :], V_left)):
+            part -= V_head[:CAMERA] @ other.T
+        head[:CAMERA] = J @ head[:CAMERA]
+        own = head[:CAMERA, :CAMERA] @ J.T
+        own = _positive(0.5 * (own + own.T), self.camera.diagonal(), len(V_marks.T))
+        head[:CAMERA, :CAMERA], head[CAMERA:, :CAMERA] = own, head[:CAMERA, CAMERA:h].T
         marks = np.zeros((0, 0))
-        if len(V):
-            before = kernels.with_independent(self.marks, others, anew)  # of which the upper triangle counts
-            variances = before.diagonal().copy()
-            marks = dsyrk(-1.0, V, beta=1.0, c=before.T, lower=1, overwrite_c=1)
-            half = with_marks[:POSE].T + 0.5 * shift @ own[:POSE, :POSE]
+        if n:
+            marks = kernels.with_independent(self.marks, others, anew)  # of which the upper triangle counts
+            variances = marks.diagonal().copy()
+            marks = dsyrk(-1.0, V_marks, beta=1.0, c=marks.T, lower=1, overwrite_c=1)
+            half = head[:POSE, h : h + n].T + 0.5 * shift @ own[:POSE, :POSE]
             marks = dsyr2k(1.0, shift, half, beta=1.0, c=marks, lower=1, overwrite_c=1).T
             kernels.mirror(marks)
-            _positive(marks, variances, len(V.T))
-        with_marks += own[:, :POSE] @ shift.T
-        head, rest = J @ (self.cross[:CAMERA] - V_camera @ V_left.T), cross - V @ V_left.T
-        cross = np.concatenate([head, rest + shift @ head[:POSE]])
-        return replace(self, camera=np.concatenate([own, with_marks], axis=1), marks=marks, cross=cross)
+            _positive(marks, variances, len(V_marks.T))
+        cross += shift @ head[:POSE, h + n :]
+        head[:, h : h + n] += head[:, :POSE] @ shift.T
+        return replace(self, head=head, marks=marks, cross=cross)
 
 
 def _positive(P: Array, before: Array, terms: int) -> Array:

@@ -239,7 +239,7 @@ class EkfBackend:
 
     def _advanced(self, camera: Camera, dt: float) -> Motion:
         """The camera after a step by the motion model."""
-        return camera.advanced(self.models, self.state.covariance.camera[:, :CAMERA], dt)
+        return camera.advanced(self.models, self.state.covariance.camera, dt)
 
     def _predicted(self, stamp: float, moved: Callable[[Camera, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""

@@ -11,29 +11,30 @@ _BLOCK = 64  # cost: rows and columns that are copied at a time
 
 
 @kernel
-def times(by_pose, own, marks, camera, P, with_camera, with_marks):
+def times(by_pose, own, marks, head, P, with_camera, with_marks):
     """``H`` times the covariance of camera and landmarks, into `with_camera` (3M, 12) and `with_marks` (3M, 3A).
 
     The landmarks `marks` (M,) are measured, with derivatives (M, 3, 6) by [r, φ] and (M, 3, 3) by their own
-    coordinates; the covariance has the camera's rows (12, 12 + 3A) and P (3A, 3A).
+    coordinates; the covariance has the camera's rows `head`, in which the landmarks' columns follow those of the last
+    poses, and P (3A, 3A).
     """
-    size, n = len(camera), len(P)
-    p, q, r = camera[0][size:], camera[1][size:], camera[2][size:]
-    s, t, u = camera[3][size:], camera[4][size:], camera[5][size:]
+    size, h, n = with_camera.shape[1], len(head), len(P)
+    p, q, r = head[0][h : h + n], head[1][h : h + n], head[2][h : h + n]
+    s, t, u = head[3][h : h + n], head[4][h : h + n], head[5][h : h + n]
     for i in range(len(own)):
         x = 3 * marks[i]
         for j in range(3):
             out, row = with_marks[3 * i + j], with_camera[3 * i + j]
             a, b, c = own[i, j, 0], own[i, j, 1], own[i, j, 2]
             for k in range(size):
-                row[k] = a * camera[k, size + x] + b * camera[k, size + x + 1] + c * camera[k, size + x + 2]
+                row[k] = a * head[k, h + x] + b * head[k, h + x + 1] + c * head[k, h + x + 2]
             for k in range(n):
                 out[k] = a * P[x, k] + b * P[x + 1, k] + c * P[x + 2, k]
             a, b, c = by_pose[i, j, 0], by_pose[i, j, 1], by_pose[i, j, 2]
             d, e, f = by_pose[i, j, 3], by_pose[i, j, 4], by_pose[i, j, 5]
             for k in range(size):
-                row[k] += a * camera[0, k] + b * camera[1, k] + c * camera[2, k]
-                row[k] += d * camera[3, k] + e * camera[4, k] + f * camera[5, k]
+                row[k] += a * head[0, k] + b * head[1, k] + c * head[2, k]
+                row[k] += d * head[3, k] + e * head[4, k] + f * head[5, k]
             for k in range(n):
                 out[k] += a * p[k] + b * q[k] + c * r[k] + d * s[k] + e * t[k] + f * u[k]
 
@@ -86,18 +87,20 @@ def conditional_distances(inverse, lost, y):
 
 @kernel
 def measured_columns(inverse, back, which, variance, out):
-    """``−R L⁻ᵀ`` of landmarks as measured anew, in their own coordinates, into `out` (F, 3, 3M).
+    """``−R L⁻ᵀ``, transposed, of landmarks put in anew, in their own coordinates, into `out` (3M, 3F).
 
     L⁻¹ is `inverse` (3M, 3M), lower triangular; `which` (F,) of the measured landmarks these are, with derivatives
     `back` (F, 3, 3) of their coordinates by the measurement.
     """
-    for i in range(len(which)):
-        x = 3 * which[i]
-        for j in range(3):
-            a, b, c = -variance * back[i, j, 0], -variance * back[i, j, 1], -variance * back[i, j, 2]
-            out[i, j, :x] = 0.0
-            for k in range(x, len(inverse)):
-                out[i, j, k] = a * inverse[k, x] + b * inverse[k, x + 1] + c * inverse[k, x + 2]
+    for row in range(len(inverse)):
+        for i in range(len(which)):
+            x = 3 * which[i]
+            for j in range(3):
+                value = 0.0
+                if x <= row:
+                    value += back[i, j, 0] * inverse[row, x] + back[i, j, 1] * inverse[row, x + 1]
+                    value += back[i, j, 2] * inverse[row, x + 2]
+                out[row, 3 * i + j] = -variance * value
 
 
 @kernel
@@ -120,20 +123,15 @@ def with_independent(P, stay, blocks):
 
 
 @kernel
-def marginals(camera, marks, cross, left, numbers):
-    """Covariances (M, 3, 3) of landmarks by numbers as of `gather`, and theirs (M, 3, 6) with [r, φ]."""
-    size, n, m = camera.shape[0], camera.shape[1], len(numbers) // 3
-    blocks, with_pose = np.zeros((m, 3, 3)), np.zeros((m, 3, 6))
-    for i in range(m):
-        x = numbers[3 * i]
-        if x < 0:
-            continue
-        for j in range(3):
-            for k in range(3):
-                blocks[i, j, k] = marks[x - size + j, x - size + k] if x < n else left[x - n + j, x - n + k]
-            for k in range(6):
-                with_pose[i, j, k] = camera[k, x + j] if x < n else cross[k, x - n + j]
-    return blocks, with_pose
+def blocks(marks, left, rows, out):
+    """Covariances of landmarks into `out` (M, 3, 3), by rows of the table; those that are only known are left out."""
+    n = len(marks)
+    for i in range(len(rows)):
+        x = 3 * rows[i]
+        if x < n + len(left):
+            for j in range(3):
+                for k in range(3):
+                    out[i, j, k] = marks[x + j, x + k] if x < n else left[x - n + j, x - n + k]
 
 
 @kernel
@@ -148,24 +146,20 @@ def mirror(P):
 
 
 @kernel
-def gather(camera, marks, cross, left, rows, columns):
-    """Part (R, C) of the whole covariance by numbers of its rows and columns: camera, landmarks, what has left.
+def gather(marks, cross, left, rows, columns):
+    """Part (R, C) of the landmarks' covariance by numbers of rows and columns in ``[state, left, rig]``.
 
     A number −1 stands for what is independent of all else.
     """
-    size, n, out = camera.shape[0], camera.shape[1], np.empty((len(rows), len(columns)))
+    n, out = len(marks), np.empty((len(rows), len(columns)))
     for i in range(len(rows)):
         r = rows[i]
         for j in range(len(columns)):
             c = columns[j]
             if r < 0 or c < 0:
                 out[i, j] = 0.0
-            elif r >= n:
-                out[i, j] = cross[c, r - n] if c < n else left[r - n, c - n]
-            elif c >= n:
-                out[i, j] = cross[r, c - n]
-            elif r >= size and c >= size:
-                out[i, j] = marks[r - size, c - size]
+            elif r < n:
+                out[i, j] = marks[r, c] if c < n else cross[r, c - n]
             else:
-                out[i, j] = camera[r, c] if r < size else camera[c, r]
+                out[i, j] = cross[c, r - n] if c < n else left[r - n, c - n]
     return out

@@ -79,13 +79,16 @@ class Jacobian:
     def times(self, P: Covariance) -> tuple[Array, Array]:
         """``H P``: with the camera (3M, 12), and with the landmarks of the state (3M, 3A)."""
         with_camera, with_marks = (np.empty((3 * len(self.own), n)) for n in (CAMERA, len(P.marks)))
-        kernels.times(self.by_pose, self.own, self.marks, P.camera, P.marks, with_camera, with_marks)
+        kernels.times(self.by_pose, self.own, self.marks, P.head, P.marks, with_camera, with_marks)
         return with_camera, with_marks
 
-    def times_rows(self, X: Array) -> Array:
-        """``H X`` (3M, N) for X (n, N)."""
-        landmarks = X[CAMERA:].reshape(len(X) // 3 - CAMERA // 3, 3, X.shape[1])[self.marks]
-        return np.asarray(self.own @ landmarks + self.by_pose @ X[:POSE]).reshape(3 * len(self.own), X.shape[1])
+    def times_rest(self, P: Covariance) -> Array:
+        """``H P``: with the last poses, and with what has left the state."""
+        h, numbers = len(P.head), (3 * self.marks[:, None] + np.arange(3)).reshape(-1)
+        with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h + len(P.marks) :]], axis=1)
+        with_marks = np.concatenate([P.head[CAMERA:, h + numbers].T, P.cross[numbers]], axis=1)
+        n = len(with_pose.T)
+        return np.asarray(self.own @ with_marks.reshape(-1, 3, n) + self.by_pose @ with_pose).reshape(-1, n)
 
     def covariance(self, with_camera: Array, with_marks: Array, variance: float) -> Array:
         """``H (H P)ᵀ + variance 1`` (3M, 3M), by the parts of H P: its lower triangle, and zero."""
@@ -247,17 +250,18 @@ class System:
         """V of `Covariance.corrected`, where `whole` (F,) of the measured landmarks are put in anew."""
         (with_camera, with_marks), n, u = self.linear.HP, len(self.nu), 3 * len(others)
         with_others = with_marks.reshape(n, P.count, 3).take(others, axis=1).reshape(n, u)
-        with_left = self.linear.H.times_rows(P.cross)
+        rest = self.linear.H.times_rest(P)
         if P.rig:
             field = np.where(self.linear.rows[:, :, None], update.field(update.z), 0.0)
-            with_left[:, -P.rig :] -= field.reshape(-1, P.rig)
-        V = self.whitened(np.concatenate([with_others, with_camera, with_left], axis=1))
-        marks = np.empty((u + 3 * len(whole), n), order="F")
-        marks[:u] = V[:u]
-        anew = np.empty((len(whole), 3, n))
-        kernels.measured_columns(self.inverse, back, whole, update.sigma**2, anew)
-        marks[u:] = anew.reshape(-1, n) - (anew.reshape(-1, n) @ self.taken) @ self.taken.T
-        return V[u : u + CAMERA], marks, V[u + CAMERA :]
+            rest[:, -P.rig :] -= field.reshape(n, P.rig)
+        V = self.whitened(np.concatenate([with_others, with_camera, rest], axis=1))
+        marks = np.empty((n, u + 3 * len(whole)))
+        marks[:, :u] = V[:u].T
+        kernels.measured_columns(self.inverse, back, whole, update.sigma**2, marks[:, u:])
+        if self.taken.size:
+            marks[:, u:] -= self.taken @ (self.taken.T @ marks[:, u:])
+        h = u + len(P.head)
+        return V[u:h], marks.T, V[h:]
 
     def whitened(self, HX: Array) -> Array:
         """`whiten` of H X, transposed (N, 3M), in Fortran's order."""
