@@ -176,54 +176,34 @@ class Covariance:
 
     # --- an update ---
 
-    def corrected(
-        self, others: IndexArray, anew: Array, V: tuple[Array, Array, Array], J: Array, K: Array
-    ) -> Covariance:
-        """After an update, in the coordinates of the corrected state: ``P − V Vᵀ`` with ``V = P Hᵀ L⁻ᵀ``.
-
-        For a landmark of which all three pixels are measured this is written differently. Of its error y as seen from
-        the camera, in pixels, the part of S is ``P_yy + R``, so that
-
-            P_yy − P_yy S⁻¹ P_yy = R − R S⁻¹ R,    P_yx − P_yy S⁻¹ P_yx = R S⁻¹ P_yx:
-
-        as if the landmark had been put in anew where it is measured, independent of all else, with ``V = −R L⁻ᵀ``.
-        What its prior covariance has lost by rounding is so made good whenever it is measured.
+    def corrected(self, V: tuple[Array, Array, Array], J: Array, K: Array) -> Covariance:
+        """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ = P − V Vᵀ`` (paper A, Eq. 11).
 
         Args:
-            others: landmarks (U,) of the state that stay in it as they are; they become the first ones of the state.
-            anew: covariances (F, 3, 3) of the measured ones' errors as seen from the camera, R in their coordinates.
-            V: of camera and last poses, of the others and those anew, in Fortran's order, and of what has left.
+            V: ``P Hᵀ L⁻ᵀ`` of camera and last poses, of the state's landmarks, in Fortran's order, of what has left.
             J: the camera's error becomes J (12, 12) times what it was,
-            K: and then to those of the landmarks K (U + F, 3, 6) times that of the pose is added.
+            K: and then to those of the landmarks K (A, 3, 6) times that of the pose is added.
         """
         V_head, V_marks, V_left = V
-        h, a, n = len(self.head), len(self.marks), len(V_marks)
-        here, shift = (3 * others[:, None] + np.arange(3)).reshape(-1), np.asfortranarray(K.reshape(-1, POSE))
-        head, cross = np.zeros((h, h + n + len(V_left))), np.zeros((n, len(V_left)))
-        head[:, :h], head[:, h : h + len(here)], head[:, h + n :] = (
-            self.head[:, :h], self.head[:, h + here], self.head[:, h + a :],
-        )  # fmt: skip
-        cross[: len(here)] = self.cross[here]
+        h, n, terms = len(self.head), len(self.head) + len(self.marks), len(V_marks.T)
+        head, shift = self.head.copy(), np.asfortranarray(K.reshape(-1, POSE))
         lost = np.concatenate([V_head, V_left]) @ V_marks.T
-        head[:, h : h + n] -= lost[:h]
-        cross -= lost[h:].T
-        for part, other in ((head[:CAMERA, :h], V_head), (head[:CAMERA, h + n :], V_left)):
-            part -= V_head[:CAMERA] @ other.T
+        head[:, h:n] -= lost[:h]
+        head[:CAMERA, :h] -= V_head[:CAMERA] @ V_head.T
+        head[:CAMERA, n:] -= V_head[:CAMERA] @ V_left.T
         head[:CAMERA] = J @ head[:CAMERA]
         own = head[:CAMERA, :CAMERA] @ J.T
-        own = _positive(0.5 * (own + own.T), self.camera.diagonal(), len(V_marks.T))
+        own = _positive(0.5 * (own + own.T), self.camera.diagonal(), terms)
         head[:CAMERA, :CAMERA], head[CAMERA:, :CAMERA] = own, head[:CAMERA, CAMERA:h].T
-        marks = np.zeros((0, 0))
-        if n:
-            marks = kernels.with_independent(self.marks, others, anew)  # of which the upper triangle counts
-            variances = marks.diagonal().copy()
-            marks = dsyrk(-1.0, V_marks, beta=1.0, c=marks.T, lower=1, overwrite_c=1)
-            half = head[:POSE, h : h + n].T + 0.5 * shift @ own[:POSE, :POSE]
+        marks = self.marks
+        if len(marks):
+            marks = dsyrk(-1.0, V_marks, beta=1.0, c=marks.T, lower=1)  # a copy, of which the lower triangle counts
+            half = head[:POSE, h:n].T + 0.5 * shift @ own[:POSE, :POSE]
             marks = dsyr2k(1.0, shift, half, beta=1.0, c=marks, lower=1, overwrite_c=1).T
             kernels.mirror(marks)
-            _positive(marks, variances, len(V_marks.T))
-        cross += shift @ head[:POSE, h + n :]
-        head[:, h : h + n] += head[:, :POSE] @ shift.T
+            _positive(marks, self.marks.diagonal(), terms)
+        cross = self.cross - lost[h:].T + shift @ head[:POSE, n:]
+        head[:, h:n] += head[:, :POSE] @ shift.T
         return replace(self, head=head, marks=marks, cross=cross)
 
 

@@ -86,43 +86,6 @@ def conditional_distances(inverse, lost, y):
 
 
 @kernel
-def measured_columns(inverse, back, which, variance, out):
-    """``−R L⁻ᵀ``, transposed, of landmarks put in anew, in their own coordinates, into `out` (3M, 3F).
-
-    L⁻¹ is `inverse` (3M, 3M), lower triangular; `which` (F,) of the measured landmarks these are, with derivatives
-    `back` (F, 3, 3) of their coordinates by the measurement.
-    """
-    for row in range(len(inverse)):
-        for i in range(len(which)):
-            x = 3 * which[i]
-            for j in range(3):
-                value = 0.0
-                if x <= row:
-                    value += back[i, j, 0] * inverse[row, x] + back[i, j, 1] * inverse[row, x + 1]
-                    value += back[i, j, 2] * inverse[row, x + 2]
-                out[row, 3 * i + j] = -variance * value
-
-
-@kernel
-def with_independent(P, stay, blocks):
-    """The part of P of the landmarks `stay` (U,), and independent ones with blocks (F, 3, 3): its upper triangle."""
-    u, n = len(stay), 3 * (len(stay) + len(blocks))
-    out = np.zeros((n, n))
-    for i in range(u):
-        for j in range(3):
-            row, source = out[3 * i + j], P[3 * stay[i] + j]
-            for k in range(i, u):
-                x = 3 * stay[k]
-                row[3 * k], row[3 * k + 1], row[3 * k + 2] = source[x], source[x + 1], source[x + 2]
-    for i in range(len(blocks)):
-        x = 3 * (u + i)
-        for j in range(3):
-            for k in range(3):
-                out[x + j, x + k] = blocks[i, j, k]
-    return out
-
-
-@kernel
 def blocks(marks, left, rows, out):
     """Covariances of landmarks into `out` (M, 3, 3), by rows of the table; those that are only known are left out."""
     n = len(marks)

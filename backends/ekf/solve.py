@@ -88,7 +88,9 @@ class Jacobian:
         with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h + len(P.marks) :]], axis=1)
         with_marks = np.concatenate([P.head[CAMERA:, h + numbers].T, P.cross[numbers]], axis=1)
         n = len(with_pose.T)
-        return np.asarray(self.own @ with_marks.reshape(-1, 3, n) + self.by_pose @ with_pose).reshape(-1, n)
+        shape = len(self.own), 3, n
+        HP = self.own @ with_marks.reshape(shape) + self.by_pose @ with_pose
+        return np.asarray(HP).reshape(3 * len(self.own), n)
 
     def covariance(self, with_camera: Array, with_marks: Array, variance: float) -> Array:
         """``H (H P)ᵀ + variance 1`` (3M, 3M), by the parts of H P: its lower triangle, and zero."""
@@ -244,28 +246,19 @@ class System:
         W = self.inverse @ X
         return np.asarray(W - self.taken @ (self.taken.T @ W))
 
-    def lost(
-        self, P: Covariance, others: IndexArray, whole: IndexArray, back: Array, update: Update
-    ) -> tuple[Array, Array, Array]:
-        """V of `Covariance.corrected`, where `whole` (F,) of the measured landmarks are put in anew."""
-        (with_camera, with_marks), n, u = self.linear.HP, len(self.nu), 3 * len(others)
-        with_others = with_marks.reshape(n, P.count, 3).take(others, axis=1).reshape(n, u)
+    def lost(self, update: Update) -> tuple[Array, Array, Array]:
+        """``P Hᵀ L⁻ᵀ``, see `Covariance.corrected`."""
+        P, (with_camera, with_marks) = update.covariance, self.linear.HP
         rest = self.linear.H.times_rest(P)
         if P.rig:
             field = np.where(self.linear.rows[:, :, None], update.field(update.z), 0.0)
-            rest[:, -P.rig :] -= field.reshape(n, P.rig)
-        V = self.whitened(np.concatenate([with_others, with_camera, rest], axis=1))
-        marks = np.empty((n, u + 3 * len(whole)))
-        marks[:, :u] = V[:u].T
-        kernels.measured_columns(self.inverse, back, whole, update.sigma**2, marks[:, u:])
-        if self.taken.size:
-            marks[:, u:] -= self.taken @ (self.taken.T @ marks[:, u:])
-        h = u + len(P.head)
-        return V[u:h], marks.T, V[h:]
+            rest[:, -P.rig :] -= field.reshape(-1, P.rig)
+        narrow = self.whitened(np.concatenate([with_camera, rest], axis=1))
+        return narrow[: len(P.head)], self.whitened(with_marks), narrow[len(P.head) :]
 
     def whitened(self, HX: Array) -> Array:
         """`whiten` of H X, transposed (N, 3M), in Fortran's order."""
-        V = dtrmm(1.0, self.inverse.T, HX.T, side=1, overwrite_b=1)
+        V = dtrmm(1.0, self.inverse.T, HX.T, side=1)
         if self.taken.size:
             V = dgemm(-1.0, V @ self.taken, self.taken, beta=1.0, c=V, trans_b=1, overwrite_c=1)
         return np.asarray(V)

@@ -112,10 +112,12 @@ class FilterState:
         return self._rearranged(np.concatenate([dense, back]), np.setdiff1d(left, back), np.setdiff1d(known, back))
 
     def relieved(self) -> FilterState:
-        """Where the state is too large, without those not measured for longest, which are its first ones."""
-        dense, left, known = self._parts()
-        old = dense[self.landmarks.seen[dense] < self.frame]
-        leave = old[: max(len(dense) - _LEAST, 0)]
+        """Where the state is too large, without those not measured for longest."""
+        if self.covariance.count <= _MOST:
+            return self
+        (dense, left, known), seen = self._parts(), self.landmarks.seen
+        old = dense[np.argsort(seen[dense], kind="stable")]
+        leave = np.sort(old[seen[old] < self.frame][: max(len(dense) - _LEAST, 0)])
         if len(dense) <= _MOST or not len(leave):
             return self
         return self._rearranged(np.setdiff1d(dense, leave), np.concatenate([left, leave]), known)
@@ -146,7 +148,7 @@ class FilterState:
         Raises:
             UnsolvableError: the new state is not finite.
         """
-        update, system, before, P = found.update, found.system, self.landmarks, self.covariance
+        update, before, P = found.update, self.landmarks, found.update.covariance
         camera = found.at.camera_after(found.change)
         marks = before.moved(update.coordinates, slice(P.count), found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
@@ -154,18 +156,8 @@ class FilterState:
         marks.seen[update.marks[found.used]] = self.frame
         J = self.camera.transport(camera)
         K = (marks.gauge - before.gauge)[: P.count] @ camera.world() * camera.transports
-        H, whole = system.linear.H, np.flatnonzero(system.rows.all(axis=1))
-        K[update.marks[whole]] += H.lever[whole] @ np.linalg.inv(J[:POSE, :POSE])
-        alive = before.ids[: P.count] >= 0
-        alive[update.marks[whole]] = False
-        others, back = np.flatnonzero(alive), np.linalg.inv(H.own[whole])
-        order = np.concatenate([others, update.marks[whole]])
-        rest = np.arange(P.count, len(before))
-        anew = update.sigma**2 * back @ back.transpose(0, 2, 1)
-        lost = system.lost(P, others, whole, back, update)
-        covariance = P.corrected(others, anew, lost, J, K[order])
+        covariance = P.corrected(found.system.lost(update), J, K)
         settled = camera.settled()
         if settled.camera is not camera:
             covariance = covariance.camera_moved(settled.J, settled.noise)
-        marks = marks.select(np.concatenate([order, rest]))
         return replace(self, camera=settled.camera, landmarks=marks, covariance=covariance).relieved()
