@@ -90,9 +90,8 @@ class Covariance:
 
     def by_rig(self, rows: IndexArray) -> tuple[Array, Array]:
         """Derivatives of the camera's error (12, m), and of some landmarks (M, 3, m), by errors of the rig."""
-        n = len(self.marks) + len(self.left)
-        landmarks = self._part(self._numbers(rows), np.arange(n, n + self.rig))
-        return self.head[:CAMERA, len(self.head) + n :], landmarks.reshape(len(rows), 3, self.rig)
+        landmarks = self._part(rows, rows[:0], self.rig)
+        return self.head[:CAMERA, len(self.head.T) - self.rig :], landmarks.reshape(len(rows), 3, self.rig)
 
     def displaced(self, rows: IndexArray, change: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error: the last of the rig's."""
@@ -152,18 +151,14 @@ class Covariance:
 
     def rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
-        h, n, first_known = len(self.head), len(self.marks) + len(self.left), self.correlated
-        state, away = self._numbers(dense), self._numbers(left)
-        rest = np.concatenate([away, np.arange(n, n + self.rig)])
-        columns = np.concatenate([np.arange(-h, 0), state, rest])
-        head = self.head[:, h + columns]
-        head[:, h : h + len(state)][:, state < 0] = 0.0
-        marks, new = self._part(state, state), np.flatnonzero(dense >= first_known)
-        rows = 3 * new[:, None] + np.arange(3)
+        h, first_known, new = len(self.head), self.correlated, np.flatnonzero(dense >= self.correlated)
+        columns = np.concatenate([np.arange(h), h + self._numbers(dense), h + self._numbers(left)])
+        head = np.concatenate([self.head[:, columns], self.head[:, len(self.head.T) - self.rig :]], axis=1)
+        marks, rows = self._part(dense, dense, 0), 3 * new[:, None] + np.arange(3)
+        head[:, h + rows.reshape(-1)] = 0.0
         marks[rows[:, :, None], rows[:, None, :]] = self.known[dense[new] - first_known]
-        return Covariance(
-            head, marks, self._part(state, rest), self._part(away, rest), self.known[known - first_known], self.rig
-        )
+        cross, own = self._part(dense, left, self.rig), self._part(left, left, self.rig)
+        return Covariance(head, marks, cross, own, self.known[known - first_known], self.rig)
 
     def _numbers(self, rows: IndexArray) -> IndexArray:
         """Of landmarks' coordinates (3M,) in ``[A, B, rig]``; −1 for those that are known."""
@@ -171,8 +166,9 @@ class Covariance:
         numbers[rows >= self.correlated] = -1
         return numbers.reshape(-1)
 
-    def _part(self, rows: IndexArray, columns: IndexArray) -> Array:
-        return np.asarray(kernels.gather(self.marks, self.cross, self.left, rows, columns))
+    def _part(self, rows: IndexArray, columns: IndexArray, rig: int) -> Array:
+        """Of landmarks' coordinates with others', and with so many errors of the rig."""
+        return np.asarray(kernels.gather(self.marks, self.cross, self.left, rows, columns, rig))
 
     # --- an update ---
 

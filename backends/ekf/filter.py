@@ -257,7 +257,6 @@ class EkfBackend:
     def _prediction(self, s: FilterState) -> Prediction:
         """Pose, and what is in the angle of view with its innovation covariance."""
         T, rows = s.pose, self._measure.visible(s.pose, s.landmarks.points)
-        rows = rows[s.landmarks.ids[rows] >= 0]
         marks, (blocks, cross) = s.landmarks.select(rows), s.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         H = Jacobian(toward, marks.gauge @ s.camera.world(), rows)  # of where landmarks are as seen from the camera

@@ -109,20 +109,30 @@ def mirror(P):
 
 
 @kernel
-def gather(marks, cross, left, rows, columns):
-    """Part (R, C) of the landmarks' covariance by numbers of rows and columns in ``[state, left, rig]``.
+def gather(marks, cross, left, rows, columns, m):
+    """Part (3R, 3C + m) of the landmarks' covariance, by rows of their table, and their columns of m errors of the rig.
 
-    A number −1 stands for what is independent of all else.
+    What is only known is independent of all else.
     """
-    n, out = len(marks), np.empty((len(rows), len(columns)))
+    n, both = len(marks) // 3, (len(marks) + len(left)) // 3
+    out, rig = np.zeros((3 * len(rows), 3 * len(columns) + m)), cross.shape[1] - m
     for i in range(len(rows)):
         r = rows[i]
-        for j in range(len(columns)):
-            c = columns[j]
-            if r < 0 or c < 0:
-                out[i, j] = 0.0
-            elif r < n:
-                out[i, j] = marks[r, c] if c < n else cross[r, c - n]
-            else:
-                out[i, j] = cross[c, r - n] if c < n else left[r - n, c - n]
+        if r >= both:
+            continue
+        for a in range(3):
+            target, x = out[3 * i + a], 3 * r + a
+            for j in range(len(columns)):
+                c, y = columns[j], 3 * j
+                if c >= both:
+                    continue
+                if c < n and r >= n:
+                    for k in range(3):
+                        target[y + k] = cross[3 * c + k, x - 3 * n]
+                    continue
+                source, z = (marks[x], 3 * c) if c < n else (cross[x], 3 * (c - n)) if r < n else (left[x - 3 * n], 3 * (c - n))
+                for k in range(3):
+                    target[y + k] = source[z + k]
+            for k in range(m):
+                target[3 * len(columns) + k] = cross[x, rig + k] if r < n else left[x - 3 * n, rig + k]
     return out

@@ -80,8 +80,6 @@ class FilterState:
         """
         if not len(ids):
             return self
-        if (self.landmarks.ids < 0).any():
-            return self._rearranged(*self._parts()).placed(coordinates, ids, h, covariances, by_rig)
         R, anchors = self.pose[:3, :3], np.repeat(self.pose[None, :3], len(h), axis=0)
         new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T, self.frame)
         D = coordinates.inverse_jacobian(anchors, new.c) @ R
@@ -98,34 +96,31 @@ class FilterState:
         return replace(self, landmarks=self.landmarks.joined(new), covariance=covariance)
 
     def removed(self, ids: IdArray) -> FilterState:
-        """Without some landmarks (M,): their rows go when next the covariance is written anew."""
-        left = self.landmarks.ids.copy()
-        left[self.landmarks.rows_of(ids)] = -1
-        return replace(self, landmarks=replace(self.landmarks, ids=left))
+        """Without some landmarks (M,)."""
+        gone = self.landmarks.rows_of(ids)
+        return self._rearranged(*(np.setdiff1d(part, gone) for part in self._parts())) if len(gone) else self
 
     def with_all_of(self, ids: IdArray) -> FilterState:
         """With some landmarks (M,), which may have left it or be known from elsewhere, in the state."""
         rows, (dense, left, known) = self.landmarks.rows_of(ids), self._parts()
-        back = np.sort(rows[rows >= self.covariance.count])
+        back = np.sort(rows[rows >= len(dense)])
         if not len(back):
             return self
         return self._rearranged(np.concatenate([dense, back]), np.setdiff1d(left, back), np.setdiff1d(known, back))
 
     def relieved(self) -> FilterState:
         """Where the state is too large, without those not measured for longest."""
-        if self.covariance.count <= _MOST:
-            return self
         (dense, left, known), seen = self._parts(), self.landmarks.seen
-        old = dense[np.argsort(seen[dense], kind="stable")]
-        leave = np.sort(old[seen[old] < self.frame][: max(len(dense) - _LEAST, 0)])
+        old = np.flatnonzero(seen[dense] < self.frame)
+        leave = np.sort(old[np.argsort(seen[old], kind="stable")][: max(len(dense) - _LEAST, 0)])
         if len(dense) <= _MOST or not len(leave):
             return self
         return self._rearranged(np.setdiff1d(dense, leave), np.concatenate([left, leave]), known)
 
     def _parts(self) -> tuple[IndexArray, IndexArray, IndexArray]:
-        """Rows of the landmarks that are in the map: in the state, left, known from elsewhere."""
-        rows, a, b = np.flatnonzero(self.landmarks.ids >= 0), self.covariance.count, self.covariance.correlated
-        return rows[rows < a], rows[(rows >= a) & (rows < b)], rows[rows >= b]
+        """Rows of the landmarks that are in the state, have left it, or are known from elsewhere."""
+        rows, a, b = np.arange(len(self.landmarks)), self.covariance.count, self.covariance.correlated
+        return rows[:a], rows[a:b], rows[b:]
 
     def _rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> FilterState:
         """With the landmarks of these rows of the table in each part."""
