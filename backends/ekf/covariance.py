@@ -144,7 +144,7 @@ class Covariance:
         own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
         marks, old = np.empty((n + len(rows), n + len(rows))), rows[:, h : h + n]
         marks[:n, :n], marks[n:, :n], marks[:n, n:] = self.marks, old, old.T
-        marks[n:, n:] = _positive(0.5 * (own + own.T), own.diagonal(), POSE)
+        marks[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
         head = np.concatenate([self.head[:, : h + n], rows[:, :h].T, self.head[:, h + n :]], axis=1)
         rows[:, len(self.head.T) - self.rig :] += by_rig.reshape(len(rows), self.rig)
         return replace(self, head=head, marks=marks, cross=np.concatenate([self.cross, rows[:, h + n :]]))
@@ -189,7 +189,7 @@ class Covariance:
         head[:CAMERA, n:] -= V_head[:CAMERA] @ V_left.T
         head[:CAMERA] = J @ head[:CAMERA]
         own = head[:CAMERA, :CAMERA] @ J.T
-        own = _positive(0.5 * (own + own.T), self.camera.diagonal(), terms)
+        own = positive(0.5 * (own + own.T), self.camera.diagonal(), terms)
         head[:CAMERA, :CAMERA], head[CAMERA:, :CAMERA] = own, head[:CAMERA, CAMERA:h].T
         marks = self.marks
         if len(marks):
@@ -197,17 +197,19 @@ class Covariance:
             half = head[:POSE, h:n].T + 0.5 * shift @ own[:POSE, :POSE]
             marks = dsyr2k(1.0, shift, half, beta=1.0, c=marks, lower=1, overwrite_c=1).T
             kernels.mirror(marks)
-            _positive(marks, self.marks.diagonal(), terms)
+            transported = np.einsum("ij,jk,ik->i", shift, own[:POSE, :POSE], shift)
+            positive(marks, self.marks.diagonal() + transported, terms)
         cross = self.cross - lost[h:].T + shift @ head[:POSE, n:]
         head[:, h:n] += head[:, :POSE] @ shift.T
         return replace(self, head=head, marks=marks, cross=cross)
 
 
-def _positive(P: Array, before: Array, terms: int) -> Array:
-    """P (N, N), a difference or sum of so many terms, with the variances that rounding may have taken from it.
+def positive(P: Array, summands: Array, terms: int) -> Array:
+    """P (..., N, N), a sum or difference of so many terms, with what rounding may have taken from its variances.
 
-    By the variances (N,) of which it was made. Without them, a landmark that is hardly known in one direction may lose
-    its variance in another one.
+    The summands (..., N) are the variances of which these were made. Large ones may cancel: without this, a landmark
+    that is hardly known in one direction loses its variance in another one.
     """
-    P.reshape(-1)[:: len(P) + 1] += terms * np.finfo(float).eps * before
+    each = np.arange(P.shape[-1])
+    P[..., each, each] += terms * np.finfo(float).eps * summands
     return P

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from backends.ekf.config import EkfConfig
-from backends.ekf.covariance import CAMERA, POSE
+from backends.ekf.covariance import CAMERA, POSE, positive
 from backends.ekf.landmarks import COORDINATES, Coordinates, FilterLandmarks, distant_anchors
 from backends.ekf.motion import Camera, EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
@@ -148,8 +148,10 @@ class EkfBackend:
         rows = s.landmarks.order if landmarks else s.landmarks.order[:0]
         marks = s.landmarks.select(rows)
         D = self._coordinates.jacobian(marks.anchors, marks.c)
-        blocks = D @ s.covariance.marginals(rows)[0] @ D.transpose(0, 2, 1)
-        blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        own = s.covariance.marginals(rows)[0]
+        blocks = D @ own @ D.transpose(0, 2, 1)
+        summands = (D * D @ np.einsum("nii->ni", own)[:, :, None])[:, :, 0]
+        blocks = positive(0.5 * (blocks + blocks.transpose(0, 2, 1)), summands, 9)
         return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, blocks)
 
     def positions(self, ids: IdArray) -> Array:

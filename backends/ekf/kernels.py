@@ -115,24 +115,23 @@ def gather(marks, cross, left, rows, columns, m):
     What is only known is independent of all else.
     """
     n, both = len(marks) // 3, (len(marks) + len(left)) // 3
-    out, rig = np.zeros((3 * len(rows), 3 * len(columns) + m)), cross.shape[1] - m
-    for i in range(len(rows)):
-        r = rows[i]
+    out, end, rig = np.zeros((3 * len(rows), 3 * len(columns) + m)), 3 * len(columns), cross.shape[1] - m
+    for i in range(3 * len(rows)):
+        r, x = rows[i // 3], 3 * rows[i // 3] + i % 3
         if r >= both:
             continue
-        for a in range(3):
-            target, x = out[3 * i + a], 3 * r + a
-            for j in range(len(columns)):
-                c, y = columns[j], 3 * j
-                if c >= both:
-                    continue
-                if c < n and r >= n:
-                    for k in range(3):
-                        target[y + k] = cross[3 * c + k, x - 3 * n]
-                    continue
-                source, z = (marks[x], 3 * c) if c < n else (cross[x], 3 * (c - n)) if r < n else (left[x - 3 * n], 3 * (c - n))
-                for k in range(3):
-                    target[y + k] = source[z + k]
-            for k in range(m):
-                target[3 * len(columns) + k] = cross[x, rig + k] if r < n else left[x - 3 * n, rig + k]
+        beyond = cross[x] if r < n else left[x - 3 * n]
+        for j in range(len(columns)):
+            c, y = columns[j], 3 * j
+            if c < n and r < n:
+                z = 3 * c
+                out[i, y], out[i, y + 1], out[i, y + 2] = marks[x, z], marks[x, z + 1], marks[x, z + 2]
+            elif c < n:
+                z = x - 3 * n
+                out[i, y], out[i, y + 1], out[i, y + 2] = cross[3 * c, z], cross[3 * c + 1, z], cross[3 * c + 2, z]
+            elif c < both:
+                z = 3 * (c - n)
+                out[i, y], out[i, y + 1], out[i, y + 2] = beyond[z], beyond[z + 1], beyond[z + 2]
+        for k in range(m):
+            out[i, end + k] = beyond[rig + k]
     return out

@@ -20,6 +20,7 @@ from slam.table import LandmarkRows
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
+_ASIDE = 1e3  # guard: largest |x/z|, |y/z|; 89.9 degrees from the axis of the camera that saw it first
 _STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
 
@@ -59,9 +60,11 @@ class InverseDepth:
     def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:
         """Coordinates of points after a change of c (M, 3); of an inverse depth at least this share is left.
 
-        The measurements of a far point may want its inverse depth negative: then it goes away, step by step.
+        The measurements of a far point may want its inverse depth negative: then it goes away, step by step. A point
+        that would go beside the camera that saw it first is NaN: no linear step has a meaning so far away.
         """
         out = c + change
+        out[np.abs(out[:, :2]).max(axis=1, initial=0.0) > _ASIDE] = np.nan
         out[:, 2] = np.maximum(out[:, 2], np.maximum(least * c[:, 2], _FARTHEST))
         return np.asarray(out)
 
