@@ -188,8 +188,8 @@ class Covariance:
         head[:CAMERA, :h] -= V_head[:CAMERA] @ V_head.T
         head[:CAMERA, n:] -= V_head[:CAMERA] @ V_left.T
         head[:CAMERA] = J @ head[:CAMERA]
-        own = head[:CAMERA, :CAMERA] @ J.T
-        own = positive(0.5 * (own + own.T), self.camera.diagonal(), terms)
+        moved = head[:CAMERA, :CAMERA] @ J.T
+        own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), terms)
         head[:CAMERA, :CAMERA], head[CAMERA:, :CAMERA] = own, head[:CAMERA, CAMERA:h].T
         marks = self.marks
         if len(marks):

@@ -145,14 +145,14 @@ class EkfBackend:
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         s = self._started("estimate")
-        rows = s.landmarks.order if landmarks else s.landmarks.order[:0]
-        marks = s.landmarks.select(rows)
+        T, P, rows = s.pose.copy(), s.pose_covariance(), s.landmarks.order
+        if not landmarks:
+            return Estimate(s.stamp, T, P, rows[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        marks, own = s.landmarks.select(rows), s.covariance.marginals(rows)[0]
         D = self._coordinates.jacobian(marks.anchors, marks.c)
-        own = s.covariance.marginals(rows)[0]
-        blocks = D @ own @ D.transpose(0, 2, 1)
-        summands = (D * D @ np.einsum("nii->ni", own)[:, :, None])[:, :, 0]
-        blocks = positive(0.5 * (blocks + blocks.transpose(0, 2, 1)), summands, 9)
-        return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, blocks)
+        C, summands = D @ own @ D.transpose(0, 2, 1), (D * D @ np.einsum("nii->ni", own)[:, :, None])[:, :, 0]
+        blocks = positive(0.5 * (C + C.transpose(0, 2, 1)), summands, 9)
+        return Estimate(s.stamp, T, P, marks.ids, marks.points, blocks)
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
@@ -294,7 +294,7 @@ class EkfBackend:
             after = s.corrected(found)
         except UnsolvableError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self._form.name}: {error}")
-        used, w = found.used, found.system.w
+        used, w = found.used, found.whitened.w
         dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
         return after, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], float(w @ w), dof)
 

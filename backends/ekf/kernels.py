@@ -115,10 +115,11 @@ def gather(marks, cross, left, rows, columns, m):
     What is only known is independent of all else.
     """
     n, both = len(marks) // 3, (len(marks) + len(left)) // 3
-    out, end, rig = np.zeros((3 * len(rows), 3 * len(columns) + m)), 3 * len(columns), cross.shape[1] - m
+    out, end, rig = np.empty((3 * len(rows), 3 * len(columns) + m)), 3 * len(columns), cross.shape[1] - m
     for i in range(3 * len(rows)):
         r, x = rows[i // 3], 3 * rows[i // 3] + i % 3
         if r >= both:
+            out[i] = 0.0
             continue
         beyond = cross[x] if r < n else left[x - 3 * n]
         for j in range(len(columns)):
@@ -132,6 +133,8 @@ def gather(marks, cross, left, rows, columns, m):
             elif c < both:
                 z = 3 * (c - n)
                 out[i, y], out[i, y + 1], out[i, y + 2] = beyond[z], beyond[z + 1], beyond[z + 2]
+            else:
+                out[i, y], out[i, y + 1], out[i, y + 2] = 0.0, 0.0, 0.0
         for k in range(m):
             out[i, end + k] = beyond[rig + k]
     return out

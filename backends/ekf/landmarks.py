@@ -60,11 +60,11 @@ class InverseDepth:
     def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:
         """Coordinates of points after a change of c (M, 3); of an inverse depth at least this share is left.
 
-        The measurements of a far point may want its inverse depth negative: then it goes away, step by step. A point
-        that would go beside the camera that saw it first is NaN: no linear step has a meaning so far away.
+        The measurements of a far point may want its inverse depth negative: then it goes away, step by step. Nor does
+        a step, which has no meaning so far from where it is linear, put it beside the camera that saw it first.
         """
-        out = c + change
-        out[np.abs(out[:, :2]).max(axis=1, initial=0.0) > _ASIDE] = np.nan
+        out, aside = c + change, np.maximum(np.abs(c[:, :2]), _ASIDE)
+        out[:, :2] = np.clip(out[:, :2], -aside, aside)
         out[:, 2] = np.maximum(out[:, 2], np.maximum(least * c[:, 2], _FARTHEST))
         return np.asarray(out)
 

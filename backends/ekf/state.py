@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.ekf.covariance import CAMERA, POSE, Covariance
+from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from backends.ekf.motion import Camera, Motion
 from backends.ekf.solve import Posterior, UnsolvableError
@@ -97,8 +97,11 @@ class FilterState:
 
     def removed(self, ids: IdArray) -> FilterState:
         """Without some landmarks (M,)."""
-        gone = self.landmarks.rows_of(ids)
-        return self._rearranged(*(np.setdiff1d(part, gone) for part in self._parts())) if len(gone) else self
+        if not len(ids):
+            return self
+        stay = np.ones(len(self.landmarks), bool)
+        stay[self.landmarks.rows_of(ids)] = False
+        return self._rearranged(*(part[stay[part]] for part in self._parts()))
 
     def with_all_of(self, ids: IdArray) -> FilterState:
         """With some landmarks (M,), which may have left it or be known from elsewhere, in the state."""
@@ -151,7 +154,7 @@ class FilterState:
         marks.seen[update.marks[found.used]] = self.frame
         J = self.camera.transport(camera)
         K = (marks.gauge - before.gauge)[: P.count] @ camera.world() * camera.transports
-        covariance = P.corrected(found.system.lost(update), J, K)
+        covariance = P.corrected(found.whitened.lost(update), J, K)
         settled = camera.settled()
         if settled.camera is not camera:
             covariance = covariance.camera_moved(settled.J, settled.noise)

@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 from backends.ekf.angles import attitude, body_rate_derivative, pose_jacobian, reanchor
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, gauge_jacobian
+from backends.ekf.measurement import Jacobian, Measurement
 from backends.ekf.motion import EulerCamera
-from backends.ekf.solve import Jacobian, Linear, Measurement, System, UnsolvableError, Update, gate, solve
+from backends.ekf.solve import Innovation, UnsolvableError, Update, Whitened, gate, solve
 from backends.ekf.state import FilterState
 from slam.geometry import se3
 from slam.geometry.euler import angles, body_rate_matrix
@@ -159,7 +160,9 @@ def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
 def whole(covariance: Covariance) -> np.ndarray:
     """All of it as one matrix."""
     c, h = covariance, len(covariance.head)
-    P = np.block([[c.head[:, :h], c.head[:, h:]], [c.head[:, h:].T, np.block([[c.marks, c.cross], [c.cross.T, c.left]])]])
+    P = np.block(
+        [[c.head[:, :h], c.head[:, h:]], [c.head[:, h:].T, np.block([[c.marks, c.cross], [c.cross.T, c.left]])]]
+    )
     n = len(P)
     P = np.pad(P, (0, 3 * len(covariance.known)))
     for i, block in enumerate(covariance.known):
@@ -300,7 +303,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     assert np.abs(difference).max() < 1e-5  # what the differences leave in H
     found = np.concatenate([after.camera.x, after.landmarks.c.reshape(-1)])
     np.testing.assert_allclose(found, x + K @ nu, rtol=1e-6, atol=1e-6)
-    assert solution.system.w @ solution.system.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
+    assert solution.whitened.w @ solution.whitened.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
 
 
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
@@ -370,7 +373,7 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch)
     cost = lambda x: residuals(s, update, deviation * x)  # noqa: E731
     best = least_squares(cost, np.zeros(48), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(corrected(s, update), deviation * best.x, atol=1e-5)
-    w = solution.system.w
+    w = solution.whitened.w
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
 
@@ -385,19 +388,19 @@ def test_what_is_taken_out_was_never_there():
     """A landmark's distance from what the others predict is the fall of the NIS when it is left out."""
     s, update = far_off(1)
 
-    def system(update: Update) -> System:
-        linear = gate(replace(update, gate_probability=1 - 1e-15)).linear
-        return System.of(linear, np.zeros_like(linear.rows))
+    def whitened(update: Update) -> Whitened:
+        innovation = gate(replace(update, gate_probability=1 - 1e-15)).innovation
+        return Whitened.of(innovation, np.zeros_like(innovation.rows))
 
-    every, P = system(update), s.covariance.dense
+    every, P = whitened(update), s.covariance.dense
     for gone in ([0], [5], [11], [3, 4, 8]):
         mask = np.isin(np.arange(12), gone)
         without = every.without(mask)
         if len(gone) == 1:
             fall = every.w @ every.w - without.w @ without.w
             assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
-        fresh = system(replace(update, z=np.where(mask[:, None], np.nan, update.z)))
-        HP = [np.concatenate(one.linear.HP, axis=1) for one in (without, fresh)]
+        fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)))
+        HP = [np.concatenate(one.innovation.HP, axis=1) for one in (without, fresh)]
         np.testing.assert_allclose(without.y @ HP[0], fresh.y @ HP[1], rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
         V, W = without.whitened(HP[0]), fresh.whitened(HP[1])
@@ -413,7 +416,7 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     update = update_of(s, np.full((12, 3), 100.0), coordinates, 5, 0.9)
     for T in (None, s.pose @ se3.exp(np.array([0.05, -0.1, 0.02, 0.5, -0.2, 0.3]))):
         at = update.at(T, 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c)
-        H = np.concatenate(Linear.of(update, np.ones((12, 3), bool), at).H.times(covariance_of(np.eye(48))), axis=1)
+        H = np.concatenate(Innovation.of(update, np.ones((12, 3), bool), at).H.times(covariance_of(np.eye(48))), axis=1)
         U = np.zeros((48, 6))
         U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
         U[12:] = s.landmarks.gauge.reshape(-1, 6)

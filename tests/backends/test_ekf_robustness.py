@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import backends
 from backends.ekf import EkfBackend
 from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, models_for
+from slam.testing.hostile import play
 from tests.backends.ekf_runs import (
     FORWARD,
     MODELS,
@@ -154,6 +156,12 @@ def test_a_pair_that_is_not_in_step_moves_nothing(make):
         step(backend, 0.1 * k, seen, known)
         off = se3.log(se3.inverse(T) @ backend.trajectory().poses[-1])
         assert np.linalg.norm(off[:5]) < 0.3 and abs(off[5]) < 0.7 * T[2, 3] + 0.1
+
+
+@pytest.mark.parametrize("name, seed", [("ekf", 207), ("iekf", 212), ("ekf", 14), ("ekf", 315), ("iekf", 318)])
+def test_no_landmark_loses_its_variance(name, seed):
+    """Calls with gaps of years and landmarks of little parallax: large numbers cancel, or a step has no meaning."""
+    play(partial(backends.create, name), seed)
 
 
 # --- robustness ---
