@@ -80,11 +80,13 @@ class Covariance:
 
     def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
         """Covariances (M, 3, 3) of landmarks, and theirs (M, 3, 6) with the camera's [r, φ]; by rows of the table."""
-        h, numbers, known = len(self.head), self._numbers(rows), rows >= self.correlated
-        blocks = np.zeros((len(rows), 3, 3))
-        kernels.blocks(self.marks, self.left, rows, blocks)
-        blocks[known] = self.known[rows[known] - self.correlated]
-        with_pose = self.head[:POSE, h + numbers].T.reshape(len(rows), 3, POSE)
+        a, b, h = self.count, self.correlated, len(self.head)
+        blocks, state, left, known = np.empty((len(rows), 3, 3)), rows < a, (rows >= a) & (rows < b), rows >= b
+        for part, P, first in ((state, self.marks, 0), (left, self.left, a)):
+            each = 3 * (rows[part, None] - first) + np.arange(3)
+            blocks[part] = P[each[:, :, None], each[:, None, :]]
+        blocks[known] = self.known[rows[known] - b]
+        with_pose = self.head[:POSE, h + self._numbers(rows)].T.reshape(len(rows), 3, POSE)
         with_pose[known] = 0.0
         return blocks, with_pose
 

@@ -86,18 +86,6 @@ def conditional_distances(inverse, lost, y):
 
 
 @kernel
-def blocks(marks, left, rows, out):
-    """Covariances of landmarks into `out` (M, 3, 3), by rows of the table; those that are only known are left out."""
-    n = len(marks)
-    for i in range(len(rows)):
-        x = 3 * rows[i]
-        if x < n + len(left):
-            for j in range(3):
-                for k in range(3):
-                    out[i, j, k] = marks[x + j, x + k] if x < n else left[x - n + j, x - n + k]
-
-
-@kernel
 def mirror(P):
     """Copy the upper triangle of P (n, n) to the lower, in place."""
     n = len(P)
