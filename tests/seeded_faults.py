@@ -45,7 +45,7 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "cross = self.cross - lost[h:].T + shift", "cross = self.cross + shift",
+        "cross = self.cross - lost[h:].T + shift @ head[:POSE, n:]", "cross = self.cross + shift @ head[:POSE, n:]",
         "tests/backends/test_ekf_parts.py tests/backends/test_rest.py tests/backends/test_ekf.py",
     ),
     Fault(

@@ -174,17 +174,17 @@ class Covariance:
 
     # --- an update ---
 
-    def corrected(self, V: tuple[Array, Array, Array], J: Array, K: Array) -> Covariance:
+    def corrected(self, V: tuple[Array, Array, Array], J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ = P − V Vᵀ`` (paper A, Eq. 11).
 
         Args:
             V: ``P Hᵀ L⁻ᵀ`` of camera and last poses, of the state's landmarks, in Fortran's order, of what has left.
             J: the camera's error becomes J (12, 12) times what it was,
-            K: and then to those of the landmarks K (A, 3, 6) times that of the pose is added.
+            shift: and then to those of the landmarks this (A, 3, 6) times that of the pose is added.
         """
         V_head, V_marks, V_left = V
         h, n, terms = len(self.head), len(self.head) + len(self.marks), len(V_marks.T)
-        head, shift = self.head.copy(), np.asfortranarray(K.reshape(-1, POSE))
+        head, shift = self.head.copy(), np.asfortranarray(shift.reshape(-1, POSE))
         lost = np.concatenate([V_head, V_left]) @ V_marks.T
         head[:, h:n] -= lost[:h]
         head[:CAMERA, :h] -= V_head[:CAMERA] @ V_head.T

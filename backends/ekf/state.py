@@ -153,8 +153,8 @@ class FilterState:
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.marks[found.used]] = self.frame
         J = self.camera.transport(camera)
-        K = (marks.gauge - before.gauge)[: P.count] @ camera.world() * camera.transports
-        covariance = P.corrected(found.whitened.lost(update), J, K)
+        shift = (marks.gauge - before.gauge)[: P.count] @ camera.world() * camera.transports
+        covariance = P.corrected(found.whitened.lost(update), J, shift)
         settled = camera.settled()
         if settled.camera is not camera:
             covariance = covariance.camera_moved(settled.J, settled.noise)
