@@ -199,8 +199,7 @@ class Covariance:
             half = head[:POSE, h:n].T + 0.5 * shift @ own[:POSE, :POSE]
             marks = dsyr2k(1.0, shift, half, beta=1.0, c=marks, lower=1, overwrite_c=1).T
             kernels.mirror(marks)
-            transported = np.einsum("ij,jk,ik->i", shift, own[:POSE, :POSE], shift)
-            positive(marks, self.marks.diagonal() + transported, terms)
+            positive(marks, self.marks.diagonal() + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1), terms)
         cross = self.cross - lost[h:].T + shift @ head[:POSE, n:]
         head[:, h:n] += head[:, :POSE] @ shift.T
         return replace(self, head=head, marks=marks, cross=cross)

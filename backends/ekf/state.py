@@ -113,10 +113,12 @@ class FilterState:
 
     def relieved(self) -> FilterState:
         """Where the state is too large, without those not measured for longest."""
+        if self.covariance.count <= _MOST:
+            return self
         (dense, left, known), seen = self._parts(), self.landmarks.seen
         old = np.flatnonzero(seen[dense] < self.frame)
         leave = np.sort(old[np.argsort(seen[old], kind="stable")][: max(len(dense) - _LEAST, 0)])
-        if len(dense) <= _MOST or not len(leave):
+        if not len(leave):
             return self
         return self._rearranged(np.setdiff1d(dense, leave), np.concatenate([left, leave]), known)
 
