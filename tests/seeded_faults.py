@@ -45,13 +45,12 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "head, rest = J @ (self.cross[:CAMERA] - V_camera @ V_left.T), self.cross[CAMERA:] - V @ V_left.T",
-        "head, rest = J @ self.cross[:CAMERA], self.cross[CAMERA:]",
+        "cross = self.cross - lost[h:].T + shift @ head[:POSE, n:]", "cross = self.cross + shift @ head[:POSE, n:]",
         "tests/backends/test_ekf_parts.py tests/backends/test_rest.py tests/backends/test_ekf.py",
     ),
     Fault(
         "no process noise", "backends/ekf/covariance.py",
-        "own = camera[:, :CAMERA] @ J.T + noise", "own = camera[:, :CAMERA] @ J.T",
+        "own = head[:CAMERA, :CAMERA] @ J.T + noise", "own = head[:CAMERA, :CAMERA] @ J.T",
         "tests/backends/test_ekf.py tests/backends/test_ekf_parts.py",
     ),
     Fault(

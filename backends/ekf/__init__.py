@@ -1,4 +1,15 @@
-"""The papers' filter: an extended Kalman filter over camera and landmarks. See `backends.ekf.filter`."""
+"""The papers' filter: an extended Kalman filter over camera and landmarks. See `backends.ekf.filter`.
+
+In the papers' order:
+
+- `motion`: the camera's state and its transition (paper B, section 2), in the angles of `angles`.
+- `landmarks`: a landmark's three numbers, and the table of all.
+- `measurement`: ``z = h(x)`` and H (A, Eqs. 5-10; B, Eqs. 1-5).
+- `solve`: innovation, gate, and the update of the mean (A, Eq. 11); `recovery`: what else is tried where it fails.
+- `covariance`: ``A P Aᵀ + W Q Wᵀ`` (B, section 2), landmarks that join (A, Eq. 10), ``P − K S Kᵀ`` (A, Eq. 11).
+- `state`: camera, landmarks and covariance, and the steps from one such state to the next.
+- `filter`: the back end.
+"""
 
 from backends.ekf.config import EkfConfig
 from backends.ekf.filter import EkfBackend

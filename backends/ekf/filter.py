@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from backends.ekf.config import EkfConfig
-from backends.ekf.covariance import CAMERA, POSE
+from backends.ekf.covariance import CAMERA, POSE, positive
 from backends.ekf.landmarks import COORDINATES, Coordinates, FilterLandmarks, distant_anchors
 from backends.ekf.motion import Camera, EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
@@ -23,7 +23,7 @@ from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import definite, known_landmarks
+from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION
@@ -145,11 +145,14 @@ class EkfBackend:
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         s = self._started("estimate")
-        rows = s.landmarks.order if landmarks else s.landmarks.order[:0]
-        marks = s.landmarks.select(rows)
+        T, P, rows = s.pose.copy(), s.pose_covariance(), s.landmarks.order
+        if not landmarks:
+            return Estimate(s.stamp, T, P, rows[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        marks, own = s.landmarks.select(rows), s.covariance.marginals(rows)[0]
         D = self._coordinates.jacobian(marks.anchors, marks.c)
-        blocks = D @ (s.covariance.marginals()[0][rows] if landmarks else np.zeros((0, 3, 3))) @ D.transpose(0, 2, 1)
-        return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, definite(blocks))
+        C, summands = D @ own @ D.transpose(0, 2, 1), (D * D @ np.einsum("nii->ni", own)[:, :, None])[:, :, 0]
+        blocks = positive(0.5 * (C + C.transpose(0, 2, 1)), summands, 9)
+        return Estimate(s.stamp, T, P, marks.ids, marks.points, blocks)
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
@@ -238,7 +241,7 @@ class EkfBackend:
 
     def _advanced(self, camera: Camera, dt: float) -> Motion:
         """The camera after a step by the motion model."""
-        return camera.advanced(self.models, self.state.covariance.camera[:, :CAMERA], dt)
+        return camera.advanced(self.models, self.state.covariance.camera, dt)
 
     def _predicted(self, stamp: float, moved: Callable[[Camera, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""
@@ -256,7 +259,7 @@ class EkfBackend:
     def _prediction(self, s: FilterState) -> Prediction:
         """Pose, and what is in the angle of view with its innovation covariance."""
         T, rows = s.pose, self._measure.visible(s.pose, s.landmarks.points)
-        marks, (blocks, cross) = s.landmarks.select(rows), (part[rows] for part in s.covariance.marginals())
+        marks, (blocks, cross) = s.landmarks.select(rows), s.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         H = Jacobian(toward, marks.gauge @ s.camera.world(), rows)  # of where landmarks are as seen from the camera
         seen = H.own_covariances(s.covariance.pose, cross, blocks)
@@ -291,7 +294,7 @@ class EkfBackend:
             after = s.corrected(found)
         except UnsolvableError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self._form.name}: {error}")
-        used, w = found.used, found.system.w
+        used, w = found.used, found.whitened.w
         dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
         return after, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], float(w @ w), dof)
 

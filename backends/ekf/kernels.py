@@ -11,29 +11,30 @@ _BLOCK = 64  # cost: rows and columns that are copied at a time
 
 
 @kernel
-def times(by_pose, own, marks, camera, P, with_camera, with_marks):
+def times(by_pose, own, marks, head, P, with_camera, with_marks):
     """``H`` times the covariance of camera and landmarks, into `with_camera` (3M, 12) and `with_marks` (3M, 3A).
 
     The landmarks `marks` (M,) are measured, with derivatives (M, 3, 6) by [r, φ] and (M, 3, 3) by their own
-    coordinates; the covariance has the camera's rows (12, 12 + 3A) and P (3A, 3A).
+    coordinates; the covariance has the camera's rows `head`, in which the landmarks' columns follow those of the last
+    poses, and P (3A, 3A).
     """
-    size, n = len(camera), len(P)
-    p, q, r = camera[0][size:], camera[1][size:], camera[2][size:]
-    s, t, u = camera[3][size:], camera[4][size:], camera[5][size:]
+    size, h, n = with_camera.shape[1], len(head), len(P)
+    p, q, r = head[0][h : h + n], head[1][h : h + n], head[2][h : h + n]
+    s, t, u = head[3][h : h + n], head[4][h : h + n], head[5][h : h + n]
     for i in range(len(own)):
         x = 3 * marks[i]
         for j in range(3):
             out, row = with_marks[3 * i + j], with_camera[3 * i + j]
             a, b, c = own[i, j, 0], own[i, j, 1], own[i, j, 2]
             for k in range(size):
-                row[k] = a * camera[k, size + x] + b * camera[k, size + x + 1] + c * camera[k, size + x + 2]
+                row[k] = a * head[k, h + x] + b * head[k, h + x + 1] + c * head[k, h + x + 2]
             for k in range(n):
                 out[k] = a * P[x, k] + b * P[x + 1, k] + c * P[x + 2, k]
             a, b, c = by_pose[i, j, 0], by_pose[i, j, 1], by_pose[i, j, 2]
             d, e, f = by_pose[i, j, 3], by_pose[i, j, 4], by_pose[i, j, 5]
             for k in range(size):
-                row[k] += a * camera[0, k] + b * camera[1, k] + c * camera[2, k]
-                row[k] += d * camera[3, k] + e * camera[4, k] + f * camera[5, k]
+                row[k] += a * head[0, k] + b * head[1, k] + c * head[2, k]
+                row[k] += d * head[3, k] + e * head[4, k] + f * head[5, k]
             for k in range(n):
                 out[k] += a * p[k] + b * q[k] + c * r[k] + d * s[k] + e * t[k] + f * u[k]
 
@@ -96,24 +97,32 @@ def mirror(P):
 
 
 @kernel
-def gather(camera, marks, cross, left, rows, columns):
-    """Part (R, C) of the whole covariance by numbers of its rows and columns: camera, landmarks, what has left.
+def gather(marks, cross, left, rows, columns, m):
+    """Part (3R, 3C + m) of the landmarks' covariance, by rows of their table, and their columns of m errors of the rig.
 
-    A number −1 stands for what is independent of all else.
+    What is only known is independent of all else.
     """
-    size, n, out = camera.shape[0], camera.shape[1], np.empty((len(rows), len(columns)))
-    for i in range(len(rows)):
-        r = rows[i]
+    n, both = len(marks) // 3, (len(marks) + len(left)) // 3
+    out, end, rig = np.empty((3 * len(rows), 3 * len(columns) + m)), 3 * len(columns), cross.shape[1] - m
+    for i in range(3 * len(rows)):
+        r, x = rows[i // 3], 3 * rows[i // 3] + i % 3
+        if r >= both:
+            out[i] = 0.0
+            continue
+        beyond = cross[x] if r < n else left[x - 3 * n]
         for j in range(len(columns)):
-            c = columns[j]
-            if r < 0 or c < 0:
-                out[i, j] = 0.0
-            elif r >= n:
-                out[i, j] = cross[c, r - n] if c < n else left[r - n, c - n]
-            elif c >= n:
-                out[i, j] = cross[r, c - n]
-            elif r >= size and c >= size:
-                out[i, j] = marks[r - size, c - size]
+            c, y = columns[j], 3 * j
+            if c < n and r < n:
+                z = 3 * c
+                out[i, y], out[i, y + 1], out[i, y + 2] = marks[x, z], marks[x, z + 1], marks[x, z + 2]
+            elif c < n:
+                z = x - 3 * n
+                out[i, y], out[i, y + 1], out[i, y + 2] = cross[3 * c, z], cross[3 * c + 1, z], cross[3 * c + 2, z]
+            elif c < both:
+                z = 3 * (c - n)
+                out[i, y], out[i, y + 1], out[i, y + 2] = beyond[z], beyond[z + 1], beyond[z + 2]
             else:
-                out[i, j] = camera[r, c] if r < size else camera[c, r]
+                out[i, y], out[i, y + 1], out[i, y + 2] = 0.0, 0.0, 0.0
+        for k in range(m):
+            out[i, end + k] = beyond[rig + k]
     return out

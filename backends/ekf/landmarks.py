@@ -20,6 +20,7 @@ from slam.table import LandmarkRows
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
+_ASIDE = 1e3  # guard: largest |x/z|, |y/z|; 89.9 degrees from the axis of the camera that saw it first
 _STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
 
@@ -59,9 +60,11 @@ class InverseDepth:
     def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:
         """Coordinates of points after a change of c (M, 3); of an inverse depth at least this share is left.
 
-        The measurements of a far point may want its inverse depth negative: then it goes away, step by step.
+        The measurements of a far point may want its inverse depth negative: then it goes away, step by step. Nor does
+        a step, which has no meaning so far from where it is linear, put it beside the camera that saw it first.
         """
-        out = c + change
+        out, aside = c + change, np.maximum(np.abs(c[:, :2]), _ASIDE)
+        out[:, :2] = np.clip(out[:, :2], -aside, aside)
         out[:, 2] = np.maximum(out[:, 2], np.maximum(least * c[:, 2], _FARTHEST))
         return np.asarray(out)
 
@@ -125,7 +128,7 @@ class FilterLandmarks(LandmarkRows):
         c[rows] = coordinates.moved(self.c[rows], change, _NEARER)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
-        return replace(self, c=c, points=points, gauge=gauge)
+        return replace(self, c=c, points=points, gauge=gauge, seen=self.seen.copy())
 
 
 def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: Array) -> Array:

@@ -3,8 +3,6 @@
 In the papers' order: the innovation ν and its covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain
 ``K = P Hᵀ S⁻¹``, the corrected state ``x + K ν`` and covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is
 ``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for the pose and measured landmarks alone.
-
-A component that is not measured (or gated) keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ from scipy.linalg.lapack import dpotrf, dtrtri
 from backends.ekf import kernels
 from backends.ekf.covariance import CAMERA, POSE, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
+from backends.ekf.measurement import Jacobian, Measurement
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
@@ -39,73 +38,6 @@ _SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
 
 class UnsolvableError(ArithmeticError):
     """The update has no usable solution; the message says why. It never leaves the back end."""
-
-
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """(uL, vL, uR) of landmarks, by the camera's pose and their coordinates (paper A, Eqs. 5-10; B, Eqs. 1-5)."""
-
-    stereo: RectifiedStereo
-    coordinates: Coordinates
-    anchors: Array  # of the landmarks (M, 3, 4)
-
-    def at(self, T: Array, c: Array) -> tuple[Array, Array]:
-        """Predicted (M, 3) [px] at a pose T (4, 4) and coordinates c (M, 3), NaN behind a camera.
-
-        And derivatives (M, 3, 3) by the coordinates. A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
-        """
-        z, J = self.stereo.project((self.coordinates.points(self.anchors, c) - T[:3, 3]) @ T[:3, :3])
-        return z, J @ (T[:3, :3].T @ self.coordinates.jacobian(self.anchors, c))
-
-
-@dataclass(frozen=True, eq=False)
-class Jacobian:
-    """H (3M, n) of the measurements by the state's error, as products with it.
-
-    A landmark's measurement depends on where it is as seen from the camera alone. An error x of the camera's pose moves
-    it there by ``−lever x`` in its own coordinates, so that ``H = own [−lever, 1]`` has columns for the pose and
-    the landmark: a displacement of both together is no row's business, wherever H is taken.
-    """
-
-    own: Array  # derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
-    lever: Array  # (M, 3, 6)
-    marks: IndexArray  # which landmarks of the state these are (M,)
-
-    @cached_property
-    def by_pose(self) -> Array:
-        """Derivatives (M, 3, 6) by the pose's error."""
-        return np.asarray(-self.own @ self.lever)
-
-    def times(self, P: Covariance) -> tuple[Array, Array]:
-        """``H P``: with the camera (3M, 12), and with the landmarks of the state (3M, 3A)."""
-        with_camera, with_marks = (np.empty((3 * len(self.own), n)) for n in (CAMERA, len(P.marks)))
-        kernels.times(self.by_pose, self.own, self.marks, P.camera, P.marks, with_camera, with_marks)
-        return with_camera, with_marks
-
-    def times_rows(self, X: Array) -> Array:
-        """``H X`` (3M, N) for X (n, N)."""
-        landmarks = X[CAMERA:].reshape(len(X) // 3 - CAMERA // 3, 3, X.shape[1])[self.marks]
-        return np.asarray(self.own @ landmarks + self.by_pose @ X[:POSE]).reshape(3 * len(self.own), X.shape[1])
-
-    def covariance(self, with_camera: Array, with_marks: Array, variance: float) -> Array:
-        """``H (H P)ᵀ + variance 1`` (3M, 3M), by the parts of H P: its lower triangle, and zero."""
-        S = np.zeros((len(with_camera), len(with_camera)))
-        kernels.innovation_covariance(self.by_pose, self.own, self.marks, with_camera, with_marks, variance, S)
-        return S
-
-    def own_covariances(self, pose: Array, cross: Array, blocks: Array) -> Array:
-        """Covariances (M, 3, 3) [px²] of each landmark's innovation by itself, without the measurement's noise.
-
-        By those of the pose's error (6, 6), of the landmarks' own coordinates with it (M, 3, 6), and of these.
-        """
-        A, B = self.by_pose, self.own
-        S = (A @ pose + 2 * (B @ cross)) @ A.transpose(0, 2, 1)
-        return np.asarray(0.5 * (S + S.transpose(0, 2, 1)) + B @ blocks @ B.transpose(0, 2, 1))
-
-    def transposed_times(self, y: Array) -> Array:
-        """``Hᵀ y`` (6 + 3M,) of [pose, measured landmarks], for y (3M,); it is zero elsewhere."""
-        m = len(self.own)
-        return np.concatenate([y @ self.by_pose.reshape(3 * m, 6), (y.reshape(m, 1, 3) @ self.own).reshape(3 * m)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +72,7 @@ class Update:
         """What is predicted."""
         return Measurement(self.stereo, self.coordinates, self.landmarks.anchors)
 
-    def at(self, T: Array | None, change: Array | None = None, from_prior: float = 0.0) -> Iterate:
+    def at(self, T: Array | None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
         """Linearised at a pose (4, 4), or the prior's own, and a change (M, 3) of the landmarks' coordinates."""
         camera, J, mean, c = self.camera, np.eye(CAMERA), np.zeros(CAMERA), self.landmarks.c
         if T is not None:
@@ -150,11 +82,11 @@ class Update:
         change = np.zeros_like(c) if change is None else change
         z, own = self.measurement.at(camera.pose, self.coordinates.moved(c, change))
         lever = self.landmarks.gauge @ (camera.world() @ J[:POSE, :POSE])
-        return Iterate(camera, J, mean, change, z, own, lever, from_prior)
+        return Linearisation(camera, J, mean, change, z, own, lever, from_prior)
 
 
 @dataclass(frozen=True, eq=False)
-class Iterate:
+class Linearisation:
     """Where measurements are linearised."""
 
     camera: Any
@@ -178,8 +110,8 @@ class Iterate:
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
-    """A linear update, not factorised yet."""
+class Innovation:
+    """ν and its covariance S, linearised somewhere (paper A, Eq. 11)."""
 
     rows: BoolArray  # mask of its rows (M, 3)
     H: Jacobian
@@ -188,7 +120,7 @@ class Linear:
     S: Array  # its covariance, lower triangle (3M, 3M)
 
     @classmethod
-    def of(cls, update: Update, rows: BoolArray, at: Iterate) -> Linear:
+    def of(cls, update: Update, rows: BoolArray, at: Linearisation) -> Innovation:
         """Linearised at an iterate."""
         H = Jacobian(at.own if rows.all() else np.where(rows[:, :, None], at.own, 0.0), at.lever, update.marks)
         nu = np.where(rows, update.z - at.z, 0.0).reshape(-1)
@@ -198,27 +130,27 @@ class Linear:
 
 
 @dataclass(frozen=True, eq=False)
-class System:
-    """A linear update in whitened innovations: ``w = L⁻¹ ν`` has covariance 1.
+class Whitened:
+    """The innovation whitened by ``S = L Lᵀ``: ``w = L⁻¹ ν`` has covariance 1.
 
     To take out measurements is to project w on what is orthogonal to the columns of L⁻¹ that belong to them: that gives
     what a factorisation without them would.
     """
 
-    linear: Linear
+    innovation: Innovation
     rows: BoolArray  # mask of its rows (M, 3)
     nu: Array  # (3M,)
     inverse: Array  # L⁻¹ (3M, 3M), lower triangular
     taken: Array  # orthonormal directions (3M, K) of what has been taken out
 
     @classmethod
-    def of(cls, linear: Linear, gone: BoolArray) -> System:
+    def of(cls, innovation: Innovation, gone: BoolArray) -> Whitened:
         """Without some rows (mask (M, 3)).
 
         Raises:
             UnsolvableError: S is not positive definite.
         """
-        nu, S, out = linear.nu, linear.S, np.flatnonzero(gone)
+        nu, S, out = innovation.nu, innovation.S, np.flatnonzero(gone)
         if len(out):
             nu, S = nu.copy(), S.copy()
             nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
@@ -227,9 +159,9 @@ class System:
             raise UnsolvableError("the innovation covariance is not positive definite")
         inverse = _inverse(upper).T
         inverse[out, out] = 0.0
-        return cls(linear, linear.rows & ~gone, nu, inverse, np.zeros((len(nu), 0)))
+        return cls(innovation, innovation.rows & ~gone, nu, inverse, np.zeros((len(nu), 0)))
 
-    def without(self, gone: BoolArray) -> System:
+    def without(self, gone: BoolArray) -> Whitened:
         """Without some more landmarks (mask (M,))."""
         columns = self.inverse[:, np.flatnonzero(gone[:, None] & self.rows)]
         more = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))[0]
@@ -241,10 +173,18 @@ class System:
         W = self.inverse @ X
         return np.asarray(W - self.taken @ (self.taken.T @ W))
 
+    def lost(self, update: Update) -> tuple[Array, Array, Array]:
+        """``P Hᵀ L⁻ᵀ``, see `Covariance.corrected`."""
+        P, (with_camera, with_marks) = update.covariance, self.innovation.HP
+        rest = self.innovation.H.times_rest(P)
+        if P.rig:
+            field = np.where(self.innovation.rows[:, :, None], update.field(update.z), 0.0)
+            rest[:, -P.rig :] -= field.reshape(-1, P.rig)
+        narrow = self.whitened(np.concatenate([with_camera, rest], axis=1))
+        return narrow[: len(P.head)], self.whitened(with_marks), narrow[len(P.head) :]
+
     def whitened(self, HX: Array) -> Array:
-        """`whiten` of H X, transposed (N, 3M), in Fortran's order: P shrinks by ``V Vᵀ``, where V is this of H P."""
-        if not HX.size:
-            return np.zeros(HX.T.shape)
+        """`whiten` of H X, transposed (N, 3M), in Fortran's order."""
         V = dtrmm(1.0, self.inverse.T, HX.T, side=1)
         if self.taken.size:
             V = dgemm(-1.0, V @ self.taken, self.taken, beta=1.0, c=V, trans_b=1, overwrite_c=1)
@@ -263,7 +203,7 @@ class System:
     @cached_property
     def by_pose(self) -> Array:
         """The whitened innovation's covariance (3M, 6) with the pose."""
-        return self.whiten(self.linear.HP[0][:, :POSE])
+        return self.whiten(self.innovation.HP[0][:, :POSE])
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -284,9 +224,9 @@ class Posterior:
 
     update: Update
     used: BoolArray  # which landmarks (M,) it is made of
-    at: Iterate  # the last linearisation
-    change: Array  # of the state (n,), see `Iterate.camera_after`
-    system: System  # the last linear update, from which the covariance follows
+    at: Linearisation  # the last linearisation
+    change: Array  # of the state (n,), see `Linearisation.camera_after`
+    whitened: Whitened  # the last innovation, from which the covariance follows
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,8 +236,8 @@ class Gated:
     used: BoolArray  # (M,)
     limits: Array  # of the gate (M,)
     distances: Array  # squared, of the innovations (M,); NaN where none is predicted
-    start: Iterate  # where they were linearised
-    linear: Linear
+    start: Linearisation  # where they were linearised
+    innovation: Innovation
 
 
 def gate(update: Update, at_guess: bool = False) -> Gated:
@@ -311,13 +251,13 @@ def gate(update: Update, at_guess: bool = False) -> Gated:
     if not (np.isfinite(start.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
         raise UnsolvableError("the predicted state is not finite")
     visible = np.asarray(np.isfinite(start.z).all(axis=1))
-    linear = Linear.of(update, measured & visible[:, None], start)
+    innovation = Innovation.of(update, measured & visible[:, None], start)
     limits = chi_square_limits(measured.sum(axis=1), update.gate_probability)
-    own = kernels.own_distances(linear.nu, linear.S)
+    own = kernels.own_distances(innovation.nu, innovation.S)
     if not np.isfinite(own).all():
         raise UnsolvableError("the predicted innovations are not finite or not positive definite")
     distances = np.where(visible, own, np.nan)
-    return Gated(np.asarray(distances <= limits), limits, distances, start, linear)
+    return Gated(np.asarray(distances <= limits), limits, distances, start, innovation)
 
 
 def solve(update: Update, gated: Gated) -> Posterior | None:
@@ -331,44 +271,44 @@ def solve(update: Update, gated: Gated) -> Posterior | None:
     """
     if not gated.used.any():
         return None
-    used, first = gated.used, System.of(gated.linear, gated.linear.rows & ~gated.used[:, None])
+    used, first = gated.used, Whitened.of(gated.innovation, gated.innovation.rows & ~gated.used[:, None])
     while used.any():
-        at, change, system = _iterate(update, gated.start, first)
-        excess = system.distances() / gated.limits
+        at, change, whitened = _iterate(update, gated.start, first)
+        excess = whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            left = update.covariance.pose - system.by_pose.T @ system.by_pose
+            left = update.covariance.pose - whitened.by_pose.T @ whitened.by_pose
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
-            return Posterior(update, used, at, change, system)
+            return Posterior(update, used, at, change, whitened)
         used = used & (excess <= max(1.0, 0.5 * worst))
         first = first.without(~used)
     return None
 
 
-def _iterate(update: Update, now: Iterate, system: System) -> tuple[Iterate, Array, System]:
-    """The change of the state (n,), from where, by an update whose first linearisation is `system`, and the last.
+def _iterate(update: Update, now: Linearisation, whitened: Whitened) -> tuple[Linearisation, Array, Whitened]:
+    """The change of the state (n,), from where, by an update whose first linearisation is `whitened`, and the last.
 
     Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
     is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
     """
-    rows, reached = system.rows, None
+    rows, reached = whitened.rows, None
     for iteration in range(1, update.iterations + 1):
-        s, HP = system.linear.H.transposed_times(system.y), system.linear.HP
-        change = np.concatenate([now.mean + system.y @ HP[0], system.y @ HP[1]])
+        s, HP = whitened.innovation.H.transposed_times(whitened.y), whitened.innovation.HP
+        change = np.concatenate([now.mean + whitened.y @ HP[0], whitened.y @ HP[1]])
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
-        if update.iterations == 1 or _linear(update, system, now, change):
-            return now, change, system
+        if update.iterations == 1 or _linear(update, whitened, now, change):
+            return now, change, whitened
         following, step = _descend(update, rows, now, s, change)
         if iteration == 1 and update.guess is not None:
             following = min(following, _at_guess(update), key=lambda iterate: iterate.cost(update, rows))
         if following is now:
             break
-        reached = now, step, system
+        reached = now, step, whitened
         if iteration < update.iterations:
             now = following
-            system = System.of(Linear.of(update, rows, now), np.zeros_like(rows))
+            whitened = Whitened.of(Innovation.of(update, rows, now), np.zeros_like(rows))
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
@@ -386,21 +326,21 @@ def _inverse(U: Array) -> Array:
     return out
 
 
-def _linear(update: Update, system: System, now: Iterate, change: Array) -> bool:
+def _linear(update: Update, whitened: Whitened, now: Linearisation, change: Array) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
     moved = change[update.numbers[POSE:]].reshape(-1, 3)
     T, c = now.camera_after(change).pose, update.coordinates.moved(update.landmarks.c, moved)
-    z, _ = update.measurement.at(T, c)
+    z, _ = update.measurement.seen(T, c)
     seen = moved - now.lever @ change[:POSE] - now.change
-    errors = np.where(system.rows, z - now.z - (now.own @ seen[:, :, None])[:, :, 0], 0.0)
+    errors = np.where(whitened.rows, z - now.z - (now.own @ seen[:, :, None])[:, :, 0], 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = system.whiten(errors.reshape(-1)) @ system.by_pose
-    variances = update.covariance.pose.diagonal() - (system.by_pose**2).sum(axis=0)
+    shift = whitened.whiten(errors.reshape(-1)) @ whitened.by_pose
+    variances = update.covariance.pose.diagonal() - (whitened.by_pose**2).sum(axis=0)
     return bool((shift**2 <= _POSE_SHARE**2 * variances).all())
 
 
-def _at_guess(update: Update) -> Iterate:
+def _at_guess(update: Update) -> Linearisation:
     """The guess, with the landmarks where they are believed: its distance from the prior is that of the pose alone."""
     there, distance = update.at(update.guess), math.inf
     with suppress(np.linalg.LinAlgError):  # a pose that is known exactly cannot be moved
@@ -409,7 +349,9 @@ def _at_guess(update: Update) -> Iterate:
     return replace(there, from_prior=distance)
 
 
-def _descend(update: Update, rows: BoolArray, now: Iterate, s: Array, change: Array) -> tuple[Iterate, Array]:
+def _descend(
+    update: Update, rows: BoolArray, now: Linearisation, s: Array, change: Array
+) -> tuple[Linearisation, Array]:
     """The longest of the steps 1, 1/2, 1/4, ... towards ``change = mean + P s`` that does not raise the cost, else now.
 
     Where it ends, and the step (n,). The next linearisation is at the pose reached: the camera turns, and the landmarks

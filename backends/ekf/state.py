@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.ekf.covariance import CAMERA, POSE, Covariance
+from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from backends.ekf.motion import Camera, Motion
 from backends.ekf.solve import Posterior, UnsolvableError
@@ -63,10 +63,8 @@ class FilterState:
 
     def recent_poses(self, n: int) -> RecentPoses:
         """The last poses, as they were believed in their time, with their joint covariance; at most n."""
-        covariance = self.covariance.with_pose(self.camera.by_error(), RECENT + 1)
         path = [(self.stamp, self.pose), *self.recent][:n][::-1]
-        P = covariance.left[: POSE * len(path), : POSE * len(path)].reshape(len(path), POSE, len(path), POSE)
-        joint = P[::-1, :, ::-1].reshape(POSE * len(path), POSE * len(path))
+        joint = self.covariance.joint_poses(self.camera.by_error(), len(path))
         stamps, poses = np.array([stamp for stamp, _ in path]), np.array([T for _, T in path])
         return RecentPoses(stamps, poses, 0.5 * (joint + joint.T))
 
@@ -89,8 +87,7 @@ class FilterState:
         by_rig = np.zeros((len(h), 3, self.covariance.rig)) if by_rig is None else D @ by_rig
         covariance = self.covariance.appended(new.gauge @ self.camera.world(), noise, by_rig)
         landmarks = self.landmarks.with_rows(self.covariance.count, new)
-        placed = replace(self, measured=True, landmarks=landmarks, covariance=covariance)
-        return placed._relieved(np.zeros(0, np.intp), np.flatnonzero(landmarks.seen == self.frame))
+        return replace(self, measured=True, landmarks=landmarks, covariance=covariance).relieved()
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
@@ -100,34 +97,35 @@ class FilterState:
 
     def removed(self, ids: IdArray) -> FilterState:
         """Without some landmarks (M,)."""
-        gone = self.landmarks.rows_of(ids)
-        if not len(gone):
+        if not len(ids):
             return self
         stay = np.ones(len(self.landmarks), bool)
-        stay[gone] = False
-        rows, a, b = np.arange(len(stay)), self.covariance.count, self.covariance.correlated
-        return self._rearranged(*(part[stay[part]] for part in (rows[:a], rows[a:b], rows[b:])))
+        stay[self.landmarks.rows_of(ids)] = False
+        return self._rearranged(*(part[stay[part]] for part in self._parts()))
 
     def with_all_of(self, ids: IdArray) -> FilterState:
         """With some landmarks (M,), which may have left it or be known from elsewhere, in the state."""
-        rows = self.landmarks.rows_of(ids)
-        back = np.sort(rows[rows >= self.covariance.count])
-        return self._relieved(back, rows) if len(back) else self
-
-    def _relieved(self, back: IndexArray, kept: IndexArray) -> FilterState:
-        """With rows `back` in the state; where it is too large, those not measured for longest leave it.
-
-        Those of the rows `kept` stay in any case.
-        """
-        a, b, n = self.covariance.count, self.covariance.correlated, len(self.landmarks)
-        others = np.setdiff1d(np.arange(a), kept)
-        too_many = max(a + len(back) - _LEAST, 0) if a + len(back) > _MOST else 0
-        leave = np.sort(others[np.argsort(self.landmarks.seen[others], kind="stable")][:too_many])
-        if not len(back) and not len(leave):
+        rows, (dense, left, known) = self.landmarks.rows_of(ids), self._parts()
+        back = np.sort(rows[rows >= len(dense)])
+        if not len(back):
             return self
-        left = np.concatenate([np.setdiff1d(np.arange(a, b), back), leave])
-        dense = np.concatenate([np.setdiff1d(np.arange(a), leave), back])
-        return self._rearranged(dense, left, np.setdiff1d(np.arange(b, n), back))
+        return self._rearranged(np.concatenate([dense, back]), np.setdiff1d(left, back), np.setdiff1d(known, back))
+
+    def relieved(self) -> FilterState:
+        """Where the state is too large, without those not measured for longest."""
+        if self.covariance.count <= _MOST:
+            return self
+        (dense, left, known), seen = self._parts(), self.landmarks.seen
+        old = np.flatnonzero(seen[dense] < self.frame)
+        leave = np.sort(old[np.argsort(seen[old], kind="stable")][: max(len(dense) - _LEAST, 0)])
+        if not len(leave):
+            return self
+        return self._rearranged(np.setdiff1d(dense, leave), np.concatenate([left, leave]), known)
+
+    def _parts(self) -> tuple[IndexArray, IndexArray, IndexArray]:
+        """Rows of the landmarks that are in the state, have left it, or are known from elsewhere."""
+        rows, a, b = np.arange(len(self.landmarks)), self.covariance.count, self.covariance.correlated
+        return rows[:a], rows[a:b], rows[b:]
 
     def _rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> FilterState:
         """With the landmarks of these rows of the table in each part."""
@@ -150,22 +148,16 @@ class FilterState:
         Raises:
             UnsolvableError: the new state is not finite.
         """
-        update, before, count = found.update, self.landmarks, self.covariance.count
+        update, before, P = found.update, self.landmarks, found.update.covariance
         camera = found.at.camera_after(found.change)
-        marks = before.moved(update.coordinates, slice(count), found.change[CAMERA:].reshape(-1, 3))
+        marks = before.moved(update.coordinates, slice(P.count), found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
-        seen = marks.seen.copy()
-        seen[update.marks[found.used]] = self.frame
-        J, system, P = self.camera.transport(camera), found.system, update.covariance
-        K = (marks.gauge - before.gauge)[:count] @ camera.world() * camera.transports
-        with_camera, with_marks, with_left = *system.linear.HP, system.linear.H.times_rows(P.cross)
-        if P.rig:
-            field = np.where(system.linear.rows[:, :, None], update.field(update.z), 0.0)
-            with_left[:, -P.rig :] -= field.reshape(-1, P.rig)
-        narrow = system.whitened(np.concatenate([with_camera, with_left], axis=1))
-        covariance = P.corrected((narrow[:CAMERA], system.whitened(with_marks), narrow[CAMERA:]), J, K)
+        marks.seen[update.marks[found.used]] = self.frame
+        J = self.camera.transport(camera)
+        shift = (marks.gauge - before.gauge)[: P.count] @ camera.world() * camera.transports
+        covariance = P.corrected(found.whitened.lost(update), J, shift)
         settled = camera.settled()
         if settled.camera is not camera:
             covariance = covariance.camera_moved(settled.J, settled.noise)
-        return replace(self, camera=settled.camera, landmarks=replace(marks, seen=seen), covariance=covariance)
+        return replace(self, camera=settled.camera, landmarks=marks, covariance=covariance).relieved()

@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 from backends.ekf.angles import attitude, body_rate_derivative, pose_jacobian, reanchor
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, gauge_jacobian
+from backends.ekf.measurement import Jacobian, Measurement
 from backends.ekf.motion import EulerCamera
-from backends.ekf.solve import Jacobian, Linear, Measurement, System, UnsolvableError, Update, gate, solve
+from backends.ekf.solve import Innovation, UnsolvableError, Update, Whitened, gate, solve
 from backends.ekf.state import FilterState
 from slam.geometry import se3
 from slam.geometry.euler import angles, body_rate_matrix
@@ -86,7 +87,7 @@ def model(rig, coordinates=None, anchors=None) -> Measurement:
 
 def covariance_of(P: np.ndarray) -> Covariance:
     """Of a camera and landmarks with a joint covariance."""
-    none = np.zeros((len(P), 0)), np.zeros((0, 0)), np.zeros((0, 3, 3))
+    none = np.zeros((len(P) - CAMERA, 0)), np.zeros((0, 0)), np.zeros((0, 3, 3))
     return Covariance(P[:CAMERA].copy(), P[CAMERA:, CAMERA:].copy(), *none)
 
 
@@ -101,7 +102,7 @@ def test_measurement_jacobians(phi):
     np.testing.assert_allclose(z, measured.stereo.project(h)[0], atol=1e-9)
     lever = gauge_jacobian(Euclidean(), np.zeros((5, 3, 4)), points, points) @ camera.world()
     J = Jacobian(own, lever, np.arange(5))
-    H = J.times_rows(np.eye(27))
+    H = np.concatenate(J.times(covariance_of(np.eye(27))), axis=1)
     for i in range(len(H)):
         np.testing.assert_allclose(J.transposed_times(np.eye(len(H))[i]), np.delete(H[i], np.s_[6:12]), atol=1e-9)
 
@@ -158,7 +159,10 @@ def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
 
 def whole(covariance: Covariance) -> np.ndarray:
     """All of it as one matrix."""
-    P = np.block([[covariance.dense, covariance.cross], [covariance.cross.T, covariance.left]])
+    c, h = covariance, len(covariance.head)
+    P = np.block(
+        [[c.head[:, :h], c.head[:, h:]], [c.head[:, h:].T, np.block([[c.marks, c.cross], [c.cross.T, c.left]])]]
+    )
     n = len(P)
     P = np.pad(P, (0, 3 * len(covariance.known)))
     for i, block in enumerate(covariance.known):
@@ -173,7 +177,7 @@ def numbers(rows) -> np.ndarray:
 def test_landmarks_move_between_the_parts():
     covariance, P = grown(np.random.default_rng(4))
     assert_equal_to_rounding(whole(covariance), P)
-    blocks, cross = covariance.marginals()
+    blocks, cross = covariance.marginals(np.arange(14))
     for i in range(14):
         rows = slice(12 + 3 * i, 15 + 3 * i)
         assert_equal_to_rounding(blocks[i], P[rows, rows])
@@ -184,19 +188,21 @@ def test_landmarks_move_between_the_parts():
 
 
 def test_the_last_poses_are_kept():
-    """Of three poses the last two, before the landmarks that have left; these come back from behind them."""
+    """Of three poses the last two, behind the camera; landmarks that had left come back."""
     covariance, P = grown(np.random.default_rng(6))
     M, poses = np.eye(len(P)), [np.random.default_rng(k).standard_normal((6, 6)) for k in range(3)]
     for J in poses:
         covariance = covariance.with_pose(J, 2)
     kept = np.zeros((12, len(P)))
     kept[:6, :6], kept[6:, :6] = poses[2], poses[1]
-    M = np.concatenate([M[:33], kept, M[33:]])
+    M = np.concatenate([M[:12], kept, M[12:]])
     assert_equal_to_rounding(whole(covariance), M @ P @ M.T)
     g = numbers([0, 1, 2, 3, 4, 5, 6, 8, 12])
     back = covariance.rearranged(np.array([0, 1, 2, 3, 4, 5, 6, 8, 12]), np.array([7, 10]), np.array([11]))
     assert_equal_to_rounding(back.dense, P[np.ix_(g, g)])
-    assert_equal_to_rounding(back.cross[:, :12], P[g][:, :6] @ np.concatenate([poses[2], poses[1]]).T)
+    found = np.delete(back.head[12:24, : 24 + 27], np.s_[12:24], axis=1)
+    assert_equal_to_rounding(found, np.concatenate([poses[2], poses[1]]) @ P[:6, g])
+    assert_equal_to_rounding(back.joint_poses(np.eye(6), 3)[-6:, -6:], P[:6, :6])
 
 
 def test_the_camera_moves():
@@ -209,20 +215,24 @@ def test_the_camera_moves():
 
 
 def test_a_correction_and_its_transport():
-    """Landmarks that have left keep their own covariance; all else changes as written."""
+    """Landmarks that have left and last poses keep their own covariance; all else changes as written."""
     rng = np.random.default_rng(10)
     covariance, P = grown(rng)
-    n, W = len(covariance.dense), 0.1 * rng.standard_normal((len(P) - 9, 5))
-    lost = W[:CAMERA], np.asfortranarray(W[CAMERA:n]), W[n:]
-    J, K = rng.standard_normal((CAMERA, CAMERA)), rng.standard_normal((7, 3, 6))
+    past = rng.standard_normal((6, 6))
+    M = np.insert(np.eye(len(P)), [12] * 6, np.pad(past, ((0, 0), (0, len(P) - 6))), axis=0)
+    covariance, P = covariance.with_pose(past, 2), M @ P @ M.T
+    n, m, kept = 12 + 6 + 21, 12 + 6 + 33, np.r_[12:18, 39:51]
+    V = 0.1 * rng.standard_normal((m, 5))
+    J, K = np.eye(CAMERA), rng.standard_normal((7, 3, 6))
+    J[:3, 3:6] = rng.standard_normal((3, 3))
     expected = P.copy()
-    expected[: len(W), : len(W)] -= W @ W.T
-    expected[n:, n:] = P[n:, n:]
-    M = np.eye(len(P))
-    M[:CAMERA, :CAMERA] = J
-    M[CAMERA:n] += np.pad(K.reshape(-1, 6) @ J[:6], ((0, 0), (0, len(P) - CAMERA)))
-    found = covariance.corrected(lost, J, K)
-    assert_equal_to_rounding(whole(found), M @ expected @ M.T)
+    expected[:m, :m] -= V @ V.T
+    expected[np.ix_(kept, kept)] = P[np.ix_(kept, kept)]
+    T = np.eye(len(P))
+    T[:CAMERA, :CAMERA] = J
+    T[18:n, :CAMERA] = K.reshape(-1, 6) @ J[:6]
+    found = covariance.corrected((V[:18], np.asfortranarray(V[18:n]), V[n:]), J, K)
+    assert_equal_to_rounding(whole(found), T @ expected @ T.T)
 
 
 # --- the filter's steps against the printed formulas ---
@@ -293,7 +303,7 @@ def test_the_update_is_the_joseph_form(coordinates):
     assert np.abs(difference).max() < 1e-5  # what the differences leave in H
     found = np.concatenate([after.camera.x, after.landmarks.c.reshape(-1)])
     np.testing.assert_allclose(found, x + K @ nu, rtol=1e-6, atol=1e-6)
-    assert solution.system.w @ solution.system.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
+    assert solution.whitened.w @ solution.whitened.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
 
 
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
@@ -363,7 +373,7 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch)
     cost = lambda x: residuals(s, update, deviation * x)  # noqa: E731
     best = least_squares(cost, np.zeros(48), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(corrected(s, update), deviation * best.x, atol=1e-5)
-    w = solution.system.w
+    w = solution.whitened.w
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
 
@@ -378,19 +388,19 @@ def test_what_is_taken_out_was_never_there():
     """A landmark's distance from what the others predict is the fall of the NIS when it is left out."""
     s, update = far_off(1)
 
-    def system(update: Update) -> System:
-        linear = gate(replace(update, gate_probability=1 - 1e-15)).linear
-        return System.of(linear, np.zeros_like(linear.rows))
+    def whitened(update: Update) -> Whitened:
+        innovation = gate(replace(update, gate_probability=1 - 1e-15)).innovation
+        return Whitened.of(innovation, np.zeros_like(innovation.rows))
 
-    every, P = system(update), s.covariance.dense
+    every, P = whitened(update), s.covariance.dense
     for gone in ([0], [5], [11], [3, 4, 8]):
         mask = np.isin(np.arange(12), gone)
         without = every.without(mask)
         if len(gone) == 1:
             fall = every.w @ every.w - without.w @ without.w
             assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
-        fresh = system(replace(update, z=np.where(mask[:, None], np.nan, update.z)))
-        HP = [np.concatenate(one.linear.HP, axis=1) for one in (without, fresh)]
+        fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)))
+        HP = [np.concatenate(one.innovation.HP, axis=1) for one in (without, fresh)]
         np.testing.assert_allclose(without.y @ HP[0], fresh.y @ HP[1], rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
         V, W = without.whitened(HP[0]), fresh.whitened(HP[1])
@@ -406,7 +416,7 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     update = update_of(s, np.full((12, 3), 100.0), coordinates, 5, 0.9)
     for T in (None, s.pose @ se3.exp(np.array([0.05, -0.1, 0.02, 0.5, -0.2, 0.3]))):
         at = update.at(T, 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c)
-        H = Linear.of(update, np.ones((12, 3), bool), at).H.times_rows(np.eye(48))
+        H = np.concatenate(Innovation.of(update, np.ones((12, 3), bool), at).H.times(covariance_of(np.eye(48))), axis=1)
         U = np.zeros((48, 6))
         U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
         U[12:] = s.landmarks.gauge.reshape(-1, 6)
