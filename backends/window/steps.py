@@ -14,7 +14,7 @@ from backends.window.state import WindowLandmarks, WindowState, between
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, points_by_pose
-from slam.window import chart_kernels, kernels, motion, pose_only
+from slam.window import chart_kernels, motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS
 from slam.window.problem import Places, RelativePrior, Rows, Window
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
@@ -186,9 +186,7 @@ class Steps(RectifiedMeasurement):
         for close, least in ((CLOSE, _TESTED), (_CLOSER, 0.0)):
             solution = solve(w, close)
             w, covariances = solution.window, solution.point_covariances(len(w.poses) - 1)
-            distances = kernels.left_out_distances(
-                self.stereo.intrinsics, w.poses[-1], w.points[at], z, covariances[0][at], self.models.pixel_sigma, least
-            )
+            distances = solution.left_out_distances(-1, at, z, covariances[0][at], self.models.pixel_sigma, least)
             if np.isfinite(distances).all():
                 break
         return solution, covariances, distances

@@ -219,19 +219,33 @@ class Solution:
         )
         return X[3 * len(w.members) :], points
 
-    def point_covariances(self, pose: int, points: IndexArray | None = None) -> tuple[Array, Array]:
-        """Covariances (N, 3, 3) of points in the coordinates of a pose, and in the world; zero for known ones.
+    def point_covariances(self, pose: int) -> tuple[Array, Array]:
+        """Covariances (N, 3, 3) of the points in the coordinates of a pose, and in the world; zero for known ones."""
+        e = self.equations
+        w = e.window
+        return covariance_kernels.point_relations(
+            w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,
+            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members),
+        )  # fmt: skip
+
+    def left_out_distances(
+        self, pose: int, points: IndexArray, z: Array, local: Array, sigma: float, least: float = 0.0
+    ) -> Array:
+        """Squared distance (M,) of rows of one pose from what all others predict for them, χ² of 3 numbers or of 2.
 
         Args:
             pose: which.
-            points: these alone (N,); None for all.
+            points: which the rows are of (M,).
+            z: the rows' measurements (M, 3), uR NaN where missing.
+            local: covariances of these points in the pose's coordinates (M, 3, 3), see `point_covariances`.
+            sigma: noise of the rows [px].
+            least: share of its noise that a row's residual must have to be tested; ∞ where it has less.
         """
-        w, e = self.window, self.equations
-        chosen = np.arange(len(w.points)) if points is None else points
-        return covariance_kernels.point_relations(
-            w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,
-            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members), chosen,
-        )  # fmt: skip
+        w, then = self.window, self.equations.window
+        return np.asarray(kernels.left_out_distances(
+            w.stereo.intrinsics, w.poses[pose], w.points[points], z, local, sigma, least, then.poses[pose],
+            then.points[points],
+        ))  # fmt: skip
 
 
 def solve(window: Window, close: float = CLOSE) -> Solution:

@@ -85,6 +85,38 @@ def test_covariances_are_those_of_dense_least_squares():
         np.testing.assert_allclose(local[m], J @ P @ J.T, rtol=1e-3, atol=1e-3 * np.trace(J @ P @ J.T))
 
 
+def test_distances_of_rows_are_those_of_leaving_each_out():
+    w = solve(window()).window
+    found, newest = solve(w), np.flatnonzero(w.rows.pose == POSES - 1)
+    local, _ = found.point_covariances(-1)
+    distances = found.left_out_distances(-1, w.rows.point[newest], w.rows.z[newest], local[w.rows.point[newest]], SIGMA)
+    for row, distance in list(zip(newest, distances))[:6]:
+        rest = solve(replace(w, rows=w.rows.select(np.arange(len(w.rows)) != row)))
+        m, T = w.rows.point[row], rest.window.poses[-1]
+        z, J = STEREO.project(se3.transform(se3.inverse(T), rest.window.points[m : m + 1]))
+        measured = np.isfinite(w.rows.z[row])
+        nu, J = (w.rows.z[row] - z[0])[measured], J[0][measured]
+        S = SIGMA**2 * np.eye(len(nu)) + J @ rest.point_covariances(-1)[0][m] @ J.T
+        assert distance == pytest.approx(nu @ np.linalg.solve(S, nu), rel=0.05)
+
+
+def test_distances_are_finite_however_far_the_last_step_went():
+    """Covariances and derivatives are of one linearisation; of two, a residual's variance may be negative."""
+    rng = np.random.default_rng(0)
+    path, points = truth()
+    far = points * rng.uniform(1, 8, (POINTS, 1))
+    z = np.concatenate([STEREO.project(se3.transform(se3.inverse(T), far))[0] for T in path])
+    z += SIGMA * rng.standard_normal(z.shape)
+    z[:, 2] = np.where(rng.random(len(z)) < 0.5, np.nan, z[:, 2])
+    rows = Rows(np.repeat(np.arange(POSES), POINTS), np.tile(np.arange(POINTS), POSES), z, np.full(len(z), 1 / SIGMA))
+    start = far * rng.uniform(0.7, 1.4, (POINTS, 1))
+    found = solver.solve(Window(STEREO, path, start, rows, prior=RelativePrior.of_pose(path[0], START)), 10.0)
+    local, _ = found.point_covariances(-1)
+    newest = rows.pose == POSES - 1
+    points, z = rows.point[newest], rows.z[newest]
+    assert np.isfinite(found.left_out_distances(-1, points, z, local[points], SIGMA)).all()
+
+
 def test_nees_of_poses_is_in_its_band():
     squares = []
     for seed in range(40):
