@@ -185,11 +185,13 @@ class Solution:
         window: poses and points as found.
         equations: linearised next to the solution.
         cost: at the solution.
+        converged: False where the steps ran out, or none of them lessened the cost.
     """
 
     window: Window
     equations: NormalEquations
     cost: float
+    converged: bool = True
 
     @cached_property
     def inverse_factor(self) -> Array:
@@ -266,14 +268,14 @@ def solve(window: Window, close: float = CLOSE) -> Solution:
             return Solution(now.after(x), now, now.cost - rest)
         following = _descended(now, x)
         if following is None:
-            return Solution(now.window, now, now.cost)
+            return Solution(now.window, now, now.cost, False)
         x, rest = following.step(now.factor)
         if not np.isfinite(rest):
             raise np.linalg.LinAlgError("a window's step is not finite")
         if rest < close:  # so near the end the last factor serves once more
             return Solution(following.after(x), now, following.cost - rest)
         now = linearised(following.window)
-    return Solution(now.window, now, now.cost)
+    return Solution(now.window, now, now.cost, False)
 
 
 def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:

@@ -238,6 +238,12 @@ def test_the_prior_does_not_mind_where_all_stands():
     assert cost(moved) == pytest.approx(cost(here), abs=1e-6)
 
 
+def test_a_solution_says_whether_it_was_reached(monkeypatch):
+    assert solver.solve(window(off=0.3)).converged
+    monkeypatch.setattr(solver, "_STEPS", 1)
+    assert not solver.solve(window(off=0.3)).converged
+
+
 def test_what_nothing_determines_is_refused():
     w = window(prior=RelativePrior.none())
     with pytest.raises(np.linalg.LinAlgError):
