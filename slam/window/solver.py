@@ -236,6 +236,8 @@ class Solution:
     ) -> Array:
         """Squared distance (M,) of rows of one pose from what all others predict for them, χ² of 3 numbers or of 2.
 
+        It is zero for the only row of a point of which nothing else is known.
+
         Args:
             pose: which.
             points: which the rows are of (M,).
@@ -244,11 +246,15 @@ class Solution:
             sigma: noise of the rows [px].
             least: share of its noise that a row's residual must have to be tested; ∞ where it has less.
         """
-        w, then = self.window, self.equations.window
-        return np.asarray(kernels.left_out_distances(
+        w, then, first = self.window, self.equations.window, self.window.by_point[0]
+        distances = kernels.left_out_distances(
             w.stereo.intrinsics, w.poses[pose], w.points[points], z, local, sigma, least, then.poses[pose],
             then.points[points],
-        ))  # fmt: skip
+        )  # fmt: skip
+        alone = (first[points + 1] - first[points] == 1) & (w.place[points] == kernels.ELIMINATED)
+        if w.information is not None:
+            alone &= w.information[points, 0, 0] == 0
+        return np.where(alone, 0.0, distances)
 
 
 def solve(window: Window, close: float = CLOSE) -> Solution:

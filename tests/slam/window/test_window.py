@@ -100,6 +100,19 @@ def test_distances_of_rows_are_those_of_leaving_each_out():
         assert distance == pytest.approx(nu @ np.linalg.solve(S, nu), rel=0.05)
 
 
+def test_the_only_row_of_a_point_is_at_no_distance():
+    """Whatever was measured, the point explains it: there is nothing to test, at any share of noise."""
+    w = window()
+    w = replace(w, rows=w.rows.select((w.rows.point != 3) | (w.rows.pose == POSES - 1)))
+    found, z = solver.solve(w), w.rows.z[(w.rows.point == 3)]
+    local, _ = found.point_covariances(-1)
+    assert found.left_out_distances(-1, np.array([3]), z, local[3:4], SIGMA, 0.01) == 0
+    known = replace(w, mean=w.points, information=np.tile(np.eye(3), (POINTS, 1, 1)))
+    found = solver.solve(known)
+    local, _ = found.point_covariances(-1)
+    assert found.left_out_distances(-1, np.array([3]), z, local[3:4], SIGMA) > 0
+
+
 def test_distances_are_finite_however_far_the_last_step_went():
     """Covariances and derivatives are of one linearisation; of two, a residual's variance may be negative."""
     rng = np.random.default_rng(0)
