@@ -93,7 +93,9 @@ def marginalised(
     at = slice(3 * D, 3 * D + 6)
     V = information @ A
     information[:, at], information[at], information[at, at] = V, V.T, A.T @ V
-    vector[at], by_rig[at] = A.T @ vector, A.T @ by_rig  # apart, so that errors of the rig do not change η's digits
+    # apart, so that errors of the rig do not change η's digits
+    vector[at] = A.T @ vector
+    by_rig[at] = A.T @ by_rig
     prior = RelativePrior(
         members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vector, by_rig
     )
