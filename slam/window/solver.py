@@ -15,11 +15,10 @@ from slam.window.problem import Window
 
 _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
-#: numerics: Decrease of the cost by a step with the last factor below which that step is the last. It is the square of
-#: the step in standard deviations, over all unknowns together; what the step leaves moves a drive by 0.02 of them.
-CLOSE = 0.1
+#: numerics: Decrease of the cost by a step with the last factor below which that step is the last; it leaves far less.
+CLOSE = 1e-2
 #: numerics: The same for a step with a factor of its own, in units of `close`; it leaves the square of that.
-_NEAR = 5.0
+_NEAR = 50.0
 
 
 @dataclass(frozen=True, eq=False)
