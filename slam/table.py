@@ -23,7 +23,7 @@ class Table:
         return [getattr(self, name) for name in self.__dataclass_fields__]
 
     def __len__(self) -> int:
-        return len(self.columns[0])
+        return len(getattr(self, next(iter(self.__dataclass_fields__))))
 
     def select(self, rows: Any) -> Self:
         """Some of the rows: a mask, indices, or a slice."""

@@ -90,7 +90,7 @@ FAULTS = (
     ),
     Fault(
         "the prior's information vector is not moved with its reference", "slam/window/marginal.py",
-        "vectors[at] = A.T @ vectors", "vectors[at] = 0.0",
+        "vector[at] = A.T @ vector", "vector[at] = 0.0",
         "tests/slam/window tests/backends/test_window.py",
     ),
     Fault(

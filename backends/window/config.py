@@ -24,7 +24,7 @@ class WindowConfig:
     poses: int = 8
     reference: int = 10
     lag: int = 50
-    landmarks: int = 150
+    landmarks: int = 100
 
     def __post_init__(self) -> None:
         ranges = {"poses": (3, 10**3), "reference": (1, 10**6), "lag": (0, 10**5), "landmarks": (0, 10**5)}

@@ -14,7 +14,7 @@ from backends.window.state import WindowLandmarks, WindowState, between
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, points_by_pose
-from slam.window import chart_kernels, kernels, motion, pose_only
+from slam.window import chart_kernels, motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS
 from slam.window.problem import Places, RelativePrior, Rows, Window
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
@@ -167,7 +167,7 @@ class Steps(RectifiedMeasurement):
         rows = s.rows.joined(self._rows(s, points[used], z[used]))
         w, active = problem(replace(s, rows=rows), self.stereo, self.models)
         for again in range(_SOLVED_AGAIN + 1):
-            solution, distances = self._tested(w, np.searchsorted(active, points[used]), z[used])
+            solution, known, distances = self._tested(w, np.searchsorted(active, points[used]), z[used])
             bad = distances > limits[used]
             if not bad.any() or again == _SOLVED_AGAIN:
                 break
@@ -177,22 +177,19 @@ class Steps(RectifiedMeasurement):
             if not used.any():
                 raise np.linalg.LinAlgError("no observation agrees with the others")
         s = replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used])))
-        relations = *solution.point_covariances(len(s.frames) - 1), solution.by_rig(self.field(solution.window.rows.z))
+        relations = *known, solution.by_rig(self.field(solution.window.rows.z))
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
         return _after(s, solution, active, relations, points[used]), used, nis
 
-    def _tested(self, w: Window, at: IndexArray, z: Array) -> tuple[Solution, Array]:
-        """The solution, and how far points `at` (M,) are from their measurements z (M, 3) in the newest pose."""
+    def _tested(self, w: Window, at: IndexArray, z: Array) -> tuple[Solution, tuple[Array, Array], Array]:
+        """The solution, covariances of its points, and how far those `at` (M,) are from their measurements z (M, 3)."""
         for close, least in ((CLOSE, _TESTED), (_CLOSER, 0.0)):
             solution = solve(w, close)
-            w = solution.window
-            distances = kernels.left_out_distances(
-                self.stereo.intrinsics, w.poses[-1], w.points[at], z,
-                solution.point_covariances(len(w.poses) - 1, at)[0], self.models.pixel_sigma, least,
-            )  # fmt: skip
+            w, covariances = solution.window, solution.point_covariances(len(w.poses) - 1)
+            distances = solution.left_out_distances(-1, at, z, covariances[0][at], self.models.pixel_sigma, least)
             if np.isfinite(distances).all():
                 break
-        return solution, distances
+        return solution, covariances, distances
 
 
 def _lost(s: WindowState) -> bool:

@@ -37,21 +37,6 @@ def solve_factorised(M, n, v):
 
 
 @helper
-def invert(M, out):
-    """Inverse (3, 3) of any matrix (3, 3) by its cofactors; returns the determinant."""
-    for j in range(3):
-        a, b = (j + 1) % 3, (j + 2) % 3
-        for i in range(3):
-            c, d = (i + 1) % 3, (i + 2) % 3
-            out[i, j] = M[a, c] * M[b, d] - M[a, d] * M[b, c]
-    determinant = M[0, 0] * out[0, 0] + M[0, 1] * out[1, 0] + M[0, 2] * out[2, 0]
-    for i in range(3):
-        for j in range(3):
-            out[i, j] /= determinant
-    return determinant
-
-
-@helper
 def invert_symmetric(M, ridge, out):
     """Inverse (3, 3) of a symmetric matrix (3, 3) with `ridge` added to its diagonal, by ``L D Lᵀ``."""
     d0 = M[0, 0] + ridge

@@ -32,7 +32,7 @@ from slam.objects.points import (
     shape_of,
     with_shape,
 )
-from slam.window import chart_kernels, kernels, pose_only
+from slam.window import chart_kernels, pose_only
 from slam.window.agreement import INFLATION
 from slam.window.problem import Places, Rows
 from slam.window.solver import Solution, linearised, solve
@@ -222,11 +222,7 @@ class BodyEstimator:
             tried = replace(b, rows=b.rows.joined(self._rows(len(b) - 1, rows[used], z[used])))
             solution = solve(window(tried, self.stereo, motion))
             local, _ = solution.point_covariances(len(b) - 1)
-            w = solution.window
-            distances = kernels.left_out_distances(
-                self.stereo.intrinsics, w.poses[-1], w.points[rows[used]], z[used],
-                local[rows[used]], self.sigma, 0.0,
-            )  # fmt: skip
+            distances = solution.left_out_distances(-1, rows[used], z[used], local[rows[used]], self.sigma)
             excess = distances / limits[used]
             bad = excess > max(1.0, 0.5 * float(excess.max()))  # the worst draw the pose, and others seem bad
             if not bad.any() or again == _SOLVED_AGAIN:

@@ -15,20 +15,19 @@ from slam.window.kernels import ELIMINATED, KNOWN
 
 
 @kernel
-def point_relations(T, points, place, E, pose, cross, first, order, column, inverse, X, P_poses, newest, prior, chosen):
-    """Covariances of the points `chosen` (C,) in the coordinates of a pose T (4, 4), and in the world (C, 3, 3) each.
+def point_relations(T, points, place, E, pose, cross, first, order, column, inverse, X, P_poses, newest, prior):
+    """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each.
 
     T's unknowns begin at `newest`, −1 where it is fixed; `X` (n, n) is ``L⁻¹`` of the normal equations' Cholesky
     factor, `P_poses` (6 F, 6 F) the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse`
     is by `eliminate`.
     """
     n, size, at = len(X), len(P_poses), newest - prior
-    camera, world = np.zeros((len(chosen), 3, 3)), np.zeros((len(chosen), 3, 3))
+    camera, world = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 3))
     own, by = np.empty((3, 3)), np.zeros((3, 6))
     A, AP = np.zeros((3, size)), np.zeros((3, size))
     q, D, G, tmp = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 3))
-    for c in range(len(chosen)):
-        p = chosen[c]
+    for p in range(len(points)):
         d = place[p]
         if d >= 0:
             for i in range(3):
@@ -68,13 +67,13 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
                     own[i, j] = total
         else:
             continue
-        turn(E[p], own, world[c])
+        turn(E[p], own, world[p])
         # q = Rᵀ (p − t): δq = Rᵀ E d + hat(q) ω − v
         transform_back(T, points[p], q)
         for i in range(3):
             for j in range(3):
                 D[i, j] = T[0, i] * E[p, 0, j] + T[1, i] * E[p, 1, j] + T[2, i] * E[p, 2, j]
-        turn(D, own, camera[c])
+        turn(D, own, camera[p])
         if newest < 0:
             continue
         G[0, 1], G[0, 2], G[1, 2] = -q[2], q[1], -q[0]
@@ -90,7 +89,7 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
                         tmp[i, j] += 0.5 * G[i, a] * P_poses[at + a, at + k] * G[j, k]
         for i in range(3):
             for j in range(3):
-                camera[c, i, j] += tmp[i, j] + tmp[j, i]
+                camera[p, i, j] += tmp[i, j] + tmp[j, i]
     return camera, world
 
 

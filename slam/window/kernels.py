@@ -296,18 +296,21 @@ def step(poses, column, points, place, E, pose, cross, first, order, inverse, gr
 
 
 @kernel
-def left_out_distances(camera, T, points, z, covariances, sigma, least):
+def left_out_distances(camera, T, points, z, covariances, sigma, least, T_then, points_then):
     """Squared distance (M,) of each row from what all others predict for it, at the solution, with 3 or 2 numbers.
 
     With r the residual, ``rᵀ (σ² 1 − J C Jᵀ)⁻¹ r``, C the point's covariance (3, 3) in the newest camera T, in which
-    the row itself takes part. ∞ where the point is not in front of the camera, or where a residual has less than the
-    share `least` of the row's noise.
+    the row itself takes part, and J as linearised for C, at `T_then` and `points_then`: elsewhere the difference need
+    not be positive. ∞ where the point is not in front of the camera, or where a residual has less than the share
+    `least` of the row's noise.
     """
     out, q, r, D = np.empty(len(points)), np.empty(3), np.empty(3), np.empty((3, 3))
-    S, inverse = np.empty((3, 3)), np.empty((3, 3))
+    S, inverse, r_then = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for m in range(len(points)):
         transform_back(T, points[m], q)
-        if not residual(camera, q, z[m], r, D):
+        front = residual(camera, q, z[m], r, D)
+        transform_back(T_then, points_then[m], q)
+        if not (residual(camera, q, z[m], r_then, D) and front):
             out[m] = np.inf
             continue
         if np.isnan(r[2]):

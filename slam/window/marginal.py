@@ -68,14 +68,14 @@ def marginalised(
         e.H, e.b, np.flatnonzero(gone), np.flatnonzero(~gone)
     )
     B = e.by_rig(np.zeros((len(w.rows), 3, 0)) if field is None else field)[0]
-    vectors = np.column_stack([vector, B[~gone] - gain.T @ B[gone]])  # of η, and of its derivatives
+    by_rig = B[~gone] - gain.T @ B[gone]
     if not (np.isfinite(mean).all() and np.isfinite(e.cost)):
         raise np.linalg.LinAlgError("what leaves a window cannot be marginalised")
     E = e.E[w.members]
     conditional = Conditional(mean, gain, E[points], E[~points])
 
     members, poses = w.members[~points], np.delete(w.poses, pose, axis=0)
-    D, n = len(members), len(information)
+    D = len(members)
     if reference:
         basis, _ = chart_kernels.relative_charts(poses[0], w.points[members])
     else:
@@ -85,23 +85,25 @@ def marginalised(
         raise np.linalg.LinAlgError("a point of the prior is behind its chart")
     if reference:  # coordinates from another pose
         back = np.linalg.inv(change)
-        rows = (np.swapaxes(back, 1, 2) @ information[: 3 * D].reshape(D, 3, n)).reshape(3 * D, n)
-        information = np.concatenate([rows, information[3 * D :]])
-        columns = (
-            (information[:, : 3 * D].reshape(n, D, 3).transpose(1, 0, 2) @ back).transpose(1, 0, 2).reshape(n, 3 * D)
-        )
-        information = np.concatenate([columns, information[:, 3 * D :]], axis=1)
-        turned = np.swapaxes(back, 1, 2) @ vectors[: 3 * D].reshape(D, 3, vectors.shape[1])
-        vectors = np.concatenate([turned.reshape(3 * D, vectors.shape[1]), vectors[3 * D :]])
+        information = _of_charts(back, _of_charts(back, information).T)
+        vector, by_rig = _of_charts(back, vector), _of_charts(back, by_rig)
     # x = δ − A δ₀ of all but the reference
     relative = inverse(poses[0]) @ poses
     A = np.concatenate([-by.reshape(3 * D, 6), np.eye(6), adjoint(inverse(relative[1:])).reshape(-1, 6)])
     at = slice(3 * D, 3 * D + 6)
     V = information @ A
     information[:, at], information[at], information[at, at] = V, V.T, A.T @ V
-    vectors[at] = A.T @ vectors
+    # apart, so that errors of the rig do not change η's digits
+    vector[at] = A.T @ vector
+    by_rig[at] = A.T @ by_rig
     prior = RelativePrior(
-        members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vectors[:, 0].copy(),
-        vectors[:, 1:].copy(),
-    )  # fmt: skip
+        members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vector, by_rig
+    )
     return prior, conditional, e.cost
+
+
+def _of_charts(back: Array, v: Array) -> Array:
+    """Gradients v (n, …) by coordinates of other charts, with which the first ones change by `back` (D, 3, 3)."""
+    D = len(back)
+    points = np.swapaxes(back, 1, 2) @ v[: 3 * D].reshape(D, 3, v[:1].size)
+    return np.concatenate([points.reshape(3 * D, *v.shape[1:]), v[3 * D :]])

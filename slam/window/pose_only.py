@@ -49,26 +49,6 @@ def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
     return T, used
 
 
-def least_squares(problem: PoseProblem, start: Array) -> tuple[Array, Array]:
-    """Pose (4, 4) by all measurements that are in front of the camera, and its covariance (6, 6).
-
-    Raises:
-        numpy.linalg.LinAlgError: nothing determines it.
-    """
-    whitener = _whiteners(problem.noise, problem.z)
-    T = _gauss_newton(problem, whitener, start, np.ones(len(problem.z), bool))
-    G = whitened_residuals(problem, T)[1].reshape(-1, 6)
-    if not np.isfinite(T).all():
-        raise np.linalg.LinAlgError("nothing determines the pose")
-    return T, np.linalg.inv(problem.information + G.T @ G)
-
-
-def whitened_residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
-    """`residuals` and Jacobians scaled to unit variance (M, 3), (M, 3, 6); zero where a pixel is missing."""
-    W, r, J = whitened(problem, T)
-    return (W @ np.nan_to_num(r)[:, :, None])[:, :, 0], W @ J
-
-
 def whitened(problem: PoseProblem, T: Array) -> tuple[Array, Array, Array]:
     """What scales to unit variance (M, 3, 3), and `residuals`."""
     return _whiteners(problem.noise, problem.z), *residuals(problem, T)

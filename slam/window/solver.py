@@ -184,11 +184,13 @@ class Solution:
         window: poses and points as found.
         equations: linearised next to the solution.
         cost: at the solution.
+        converged: False where the steps ran out, or none of them lessened the cost.
     """
 
     window: Window
     equations: NormalEquations
     cost: float
+    converged: bool = True
 
     @cached_property
     def inverse_factor(self) -> Array:
@@ -219,19 +221,39 @@ class Solution:
         )
         return X[3 * len(w.members) :], points
 
-    def point_covariances(self, pose: int, points: IndexArray | None = None) -> tuple[Array, Array]:
-        """Covariances (N, 3, 3) of points in the coordinates of a pose, and in the world; zero for known ones.
+    def point_covariances(self, pose: int) -> tuple[Array, Array]:
+        """Covariances (N, 3, 3) of the points in the coordinates of a pose, and in the world; zero for known ones."""
+        e = self.equations
+        w = e.window
+        return covariance_kernels.point_relations(
+            w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,
+            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members),
+        )  # fmt: skip
+
+    def left_out_distances(
+        self, pose: int, points: IndexArray, z: Array, local: Array, sigma: float, least: float = 0.0
+    ) -> Array:
+        """Squared distance (M,) of rows of one pose from what all others predict for them, χ² of 3 numbers or of 2.
+
+        It is zero for the only row of a point of which nothing else is known.
 
         Args:
             pose: which.
-            points: these alone (N,); None for all.
+            points: which the rows are of (M,).
+            z: the rows' measurements (M, 3), uR NaN where missing.
+            local: covariances of these points in the pose's coordinates (M, 3, 3), see `point_covariances`.
+            sigma: noise of the rows [px].
+            least: share of its noise that a row's residual must have to be tested; ∞ where it has less.
         """
-        w, e = self.window, self.equations
-        chosen = np.arange(len(w.points)) if points is None else points
-        return covariance_kernels.point_relations(
-            w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,
-            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members), chosen,
+        w, then, first = self.window, self.equations.window, self.window.by_point[0]
+        distances = kernels.left_out_distances(
+            w.stereo.intrinsics, w.poses[pose], w.points[points], z, local, sigma, least, then.poses[pose],
+            then.points[points],
         )  # fmt: skip
+        alone = (first[points + 1] - first[points] == 1) & (w.place[points] == kernels.ELIMINATED)
+        if w.information is not None:
+            alone &= w.information[points, 0, 0] == 0
+        return np.where(alone, 0.0, distances)
 
 
 def solve(window: Window, close: float = CLOSE) -> Solution:
@@ -251,14 +273,14 @@ def solve(window: Window, close: float = CLOSE) -> Solution:
             return Solution(now.after(x), now, now.cost - rest)
         following = _descended(now, x)
         if following is None:
-            return Solution(now.window, now, now.cost)
+            return Solution(now.window, now, now.cost, False)
         x, rest = following.step(now.factor)
         if not np.isfinite(rest):
             raise np.linalg.LinAlgError("a window's step is not finite")
         if rest < close:  # so near the end the last factor serves once more
             return Solution(following.after(x), now, following.cost - rest)
         now = linearised(following.window)
-    return Solution(now.window, now, now.cost)
+    return Solution(now.window, now, now.cost, False)
 
 
 def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:

@@ -128,6 +128,21 @@ def test_a_copy_goes_on_to_the_same_bytes(copied, after):
     np.testing.assert_array_equal(backend.trajectory().poses, other.trajectory().poses)
 
 
+def test_a_rig_whose_errors_move_nothing_changes_no_byte():
+    """Consider columns stand beside the estimate: they take no part in its arithmetic."""
+    found = []
+    for field in (None, lambda z: np.zeros((*z.shape, 5))):
+        backend = backends.create("window", WALK, models=MODELS)
+        if field is not None:
+            backend.consider(field)
+        walk(backend, 0, 40, np.random.default_rng(0), set())
+        found.append((backend.estimate(), backend.trajectory()))
+    (mine, path), (its, other) = found
+    for name in ("T_world_left", "covariance", "positions", "covariances"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(its, name))
+    np.testing.assert_array_equal(path.poses, other.poses)
+
+
 def test_a_revision_that_takes_a_depth_away_leaves_a_path():
     rig = RIG
     backend = backends.create("window", rig, models=EstimatorModels(pixel_sigma=0.5))

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from slam.data import StereoFeatures
+from slam.geometry.kernels import residuals
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.se3 import Array
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
-from slam.window.pose_only import PoseProblem, least_squares, whitened_residuals
+from slam.window.problem import Rows, Window
+from slam.window.solver import linearised, solve
 from slam.window.stereo import RectifiedStereo
-
-_ROUNDS = 2  # numerics: of least squares, with the points' noise in the pixels as seen from the last pose
 
 
 def verify(
@@ -53,10 +53,10 @@ def refined_pose(
 ) -> tuple[Array, Array]:
     """Least-squares pose (4, 4) and its covariance (6, 6) from points triangulated in one earlier stereo frame.
 
-    Both frames have noise: the points' covariance is propagated to the present pixels. From another viewpoint a feature
-    is found at another point of the surface, and some matches are wrong, so errors may be many times as large. The
-    residuals tell: the covariance has what the jackknife finds beyond that by pixel noise, how far the pose moves when
-    one match is left out (Efron and Stein, Annals of Statistics 9(3), 1981).
+    Both frames have noise: a window of two poses, the earlier one fixed. From another viewpoint a feature is found at
+    another point of the surface, and some matches are wrong, so errors may be many times as large. The residuals tell:
+    the covariance has what the jackknife finds beyond that by pixel noise, how far the pose moves when one match is
+    left out (Efron and Stein, Annals of Statistics 9(3), 1981).
 
     Args:
         rig: the cameras, rectified.
@@ -68,23 +68,27 @@ def refined_pose(
     Raises:
         LinAlgError: these points do not determine the pose.
     """
-    stereo, T = RectifiedStereo.of(rig), T_world_left
-    P: Array = np.eye(6)
-    z, own = measured - [0.0, 0.0, stereo.doffs], rig.triangulation_covariance(points, pixel_sigma)
-    for _ in range(_ROUNDS):
-        H = rig.project_stereo(transform(inverse(T), points))[1] @ T[:3, :3].T
-        noise = pixel_sigma**2 * np.eye(3) + H @ own @ np.swapaxes(H, 1, 2)
-        problem = PoseProblem(stereo, points, z, noise, T, np.zeros((6, 6)), 1.0)
-        T, P = least_squares(problem, T)
-    return T, P + covariance_growth(_jackknife(problem, T, P), P)
+    stereo, n = RectifiedStereo.of(rig), len(points)
+    z = np.concatenate([stereo.project(points)[0], measured - [0.0, 0.0, stereo.doffs]])
+    weight = (points[:, 2] > 0) / pixel_sigma  # none for what the earlier camera cannot have seen
+    rows = Rows(np.repeat([0, 1], n), np.tile(np.arange(n), 2), z, np.tile(weight, 2))
+    poses = np.stack([np.eye(4), T_world_left])
+    solution = solve(Window(stereo, poses, points, rows, free=np.array([False, True])))
+    P = solution.pose_covariance
+    return solution.window.poses[1], P + covariance_growth(_jackknife(solution.window, P), P)
 
 
-def _jackknife(problem: PoseProblem, T: Array, P: Array) -> Array:
-    """Covariance (6, 6) of a least-squares pose (4, 4) by leaving out each match in turn, to first order."""
-    r, G = whitened_residuals(problem, T)
-    leverage = G @ P @ np.swapaxes(G, 1, 2)
-    moved = P @ (np.swapaxes(G, 1, 2) @ np.linalg.solve(np.eye(3) - leverage, r[:, :, None]))
-    return np.asarray(moved[:, :, 0].T @ moved[:, :, 0])
+def _jackknife(w: Window, P: Array) -> Array:
+    """Covariance (6, 6) of the second pose, P by pixel noise, by leaving out each point in turn, to first order."""
+    e, n, T = linearised(w), len(w.points), w.poses[1]
+    r, J = residuals(w.stereo.intrinsics, w.points, w.rows.z[n:], T)
+    J[np.isnan(r)] = 0  # what is not measured
+    r, G = w.rows.weight[n:, None] * np.nan_to_num(r), w.rows.weight[n:, None, None] * J
+    by_pose, gain = np.swapaxes(G, 1, 2), e.cross[n:] @ e.inverse  # of a point, which is eliminated
+    own = by_pose @ G - gain @ np.swapaxes(e.cross[n:], 1, 2)
+    pull = by_pose @ r[:, :, None] - gain @ e.gradient[:, :, None]
+    moved = np.linalg.solve(np.linalg.inv(P) - own, pull)[:, :, 0]
+    return np.asarray(moved.T @ moved)
 
 
 def keyframe_landmarks(keyframe: Keyframe) -> LandmarkTable:

@@ -85,6 +85,51 @@ def test_covariances_are_those_of_dense_least_squares():
         np.testing.assert_allclose(local[m], J @ P @ J.T, rtol=1e-3, atol=1e-3 * np.trace(J @ P @ J.T))
 
 
+def test_distances_of_rows_are_those_of_leaving_each_out():
+    w = solve(window()).window
+    found, newest = solve(w), np.flatnonzero(w.rows.pose == POSES - 1)
+    local, _ = found.point_covariances(-1)
+    distances = found.left_out_distances(-1, w.rows.point[newest], w.rows.z[newest], local[w.rows.point[newest]], SIGMA)
+    for row, distance in list(zip(newest, distances))[:6]:
+        rest = solve(replace(w, rows=w.rows.select(np.arange(len(w.rows)) != row)))
+        m, T = w.rows.point[row], rest.window.poses[-1]
+        z, J = STEREO.project(se3.transform(se3.inverse(T), rest.window.points[m : m + 1]))
+        measured = np.isfinite(w.rows.z[row])
+        nu, J = (w.rows.z[row] - z[0])[measured], J[0][measured]
+        S = SIGMA**2 * np.eye(len(nu)) + J @ rest.point_covariances(-1)[0][m] @ J.T
+        assert distance == pytest.approx(nu @ np.linalg.solve(S, nu), rel=0.05)
+
+
+def test_the_only_row_of_a_point_is_at_no_distance():
+    """Whatever was measured, the point explains it: there is nothing to test, at any share of noise."""
+    w = window()
+    w = replace(w, rows=w.rows.select((w.rows.point != 3) | (w.rows.pose == POSES - 1)))
+    found, z = solver.solve(w), w.rows.z[(w.rows.point == 3)]
+    local, _ = found.point_covariances(-1)
+    assert found.left_out_distances(-1, np.array([3]), z, local[3:4], SIGMA, 0.01) == 0
+    known = replace(w, mean=w.points, information=np.tile(np.eye(3), (POINTS, 1, 1)))
+    found = solver.solve(known)
+    local, _ = found.point_covariances(-1)
+    assert found.left_out_distances(-1, np.array([3]), z, local[3:4], SIGMA) > 0
+
+
+def test_distances_are_finite_however_far_the_last_step_went():
+    """Covariances and derivatives are of one linearisation; of two, a residual's variance may be negative."""
+    rng = np.random.default_rng(0)
+    path, points = truth()
+    far = points * rng.uniform(1, 8, (POINTS, 1))
+    z = np.concatenate([STEREO.project(se3.transform(se3.inverse(T), far))[0] for T in path])
+    z += SIGMA * rng.standard_normal(z.shape)
+    z[:, 2] = np.where(rng.random(len(z)) < 0.5, np.nan, z[:, 2])
+    rows = Rows(np.repeat(np.arange(POSES), POINTS), np.tile(np.arange(POINTS), POSES), z, np.full(len(z), 1 / SIGMA))
+    start = far * rng.uniform(0.7, 1.4, (POINTS, 1))
+    found = solver.solve(Window(STEREO, path, start, rows, prior=RelativePrior.of_pose(path[0], START)), 10.0)
+    local, _ = found.point_covariances(-1)
+    newest = rows.pose == POSES - 1
+    points, z = rows.point[newest], rows.z[newest]
+    assert np.isfinite(found.left_out_distances(-1, points, z, local[points], SIGMA)).all()
+
+
 def test_nees_of_poses_is_in_its_band():
     squares = []
     for seed in range(40):
@@ -204,6 +249,12 @@ def test_the_prior_does_not_mind_where_all_stands():
     moved = Window(STEREO, far @ w.poses[1:], se3.transform(far, w.points), Rows.none(), prior=there)
     here = Window(STEREO, w.poses[1:], w.points, Rows.none(), prior=prior)
     assert cost(moved) == pytest.approx(cost(here), abs=1e-6)
+
+
+def test_a_solution_says_whether_it_was_reached(monkeypatch):
+    assert solver.solve(window(off=0.3)).converged
+    monkeypatch.setattr(solver, "_STEPS", 1)
+    assert not solver.solve(window(off=0.3)).converged
 
 
 def test_what_nothing_determines_is_refused():
