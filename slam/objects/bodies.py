@@ -47,7 +47,7 @@ class Body:
     moving: bool = True  # whether it moves now
     evidence: float = 0.0  # evidence that it has moved, given all that is uncertain; see `slam.objects.proof`
     far: bool = False  # whether it was followed for farther than it is wide before it became a body
-    certain: int = 0  # number of frames in succession in which its tracks said for certain that it moves
+    certain: int = 0  # what frames so far count for the proof that it moves, see `slam.objects.proof`
     proven: bool = False  # whether it has moved for certain by its tracks
     moved: bool = False  # whether it has by its estimate, too, see `slam.objects.estimator`: only then it is reported
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would

@@ -25,7 +25,7 @@ from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.measurement import measure
 from slam.objects.merging import merge
-from slam.objects.proof import PROOF, Way, with_frame
+from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Regions, follow_regions, proven_region
 from slam.objects.revision import CorrectRows, revise_tracks
@@ -229,10 +229,10 @@ class MovingObjectDetector:
             members = members[tracks.count(members) >= s.config.min_frames - 1]
             moved = displacements(tracks, members, frame.ages, frame.poses[:, :3, 3], s.slide)
             way = Way.of(body, frame)
-            evidence, certain = with_frame(body.evidence, moved, scene, way, body.far)
-            frames = body.certain + 1 if certain else 0
-            proven = body.proven or frames >= PROOF
-            body = replace(body, evidence=evidence, certain=frames, proven=proven)
+            left = 0.0 if body.proven else by_left_image(tracks, members, frame, scene)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, left, body.far)
+            certain = body.certain + counts
+            body = replace(body, evidence=evidence, certain=certain, proven=body.proven or certain >= PROOF)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
                 self._drop(body)
