@@ -154,7 +154,7 @@ def continued(body: Body, known: Body) -> Body:
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
         proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
         reported=known.reported, reported_unmeasured=known.reported_unmeasured,
-        measured_at=known.measured_at, belief=None,
+        measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
     )  # fmt: skip
 
 

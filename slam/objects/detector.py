@@ -98,8 +98,6 @@ class MovingObjectDetector:
         self._fit(frame)
         self._change_members(frame)
         found = finder.find_groups(frame, tracks, self.bodies)
-        suspected = tracks.landmark[found.suspects]
-        self.suspects = suspected[suspected >= 0]
         for group in found.groups:
             moving = finder.lasting(group, tracks, frame)
             new = finder.moving_group(frame, tracks, moving) if len(moving) else None
@@ -108,6 +106,9 @@ class MovingObjectDetector:
         if self.setup.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.objects.regions`
             self._follow_regions(frame)
         self._prove(frame, found.scene)
+        unproven = np.isin(tracks.body, [body.id for body in self.bodies.values() if not body.proven])
+        suspected = np.concatenate([tracks.landmark[found.suspects], tracks.landmark[unproven]])
+        self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(frame)
         self._begin_tracks(frame, landmark)
         return self._motion_labels(frame), reported(self.bodies, tracks, self.setup.config)

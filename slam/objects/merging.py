@@ -32,6 +32,9 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
         if body is None or not body.measured:
             continue
         mine = _members(tracks, id)
+        whole = bodies.get(-1 if body.apart_from is None else body.apart_from)
+        if whole is not None and whole.measured and whole.id not in body.distinct:
+            body = bodies[id] = _told_apart(body, mine, whole, _members(tracks, whole.id), tracks)
         older = {id: b for id, b in bodies.items() if id < body.id and id not in body.distinct}
         whole = membership.body_around(older, tracks, mine, body)
         alike = body.alike + 1 if whole is not None else 0
@@ -56,14 +59,20 @@ def _outgrow(bodies: dict[int, Body], body: Body, older: list[Body], tracks: Tra
             continue
         if not membership.moves_with(body, tracks, theirs):
             continue
-        distinctness = membership.distinctness(body, mine, known, theirs, tracks)
-        if distinctness > _DISTINCT:
-            body = bodies[body.id] = replace(body, distinct=body.distinct | {known.id})
-        elif distinctness < 1.0:
+        body = bodies[body.id] = _told_apart(body, mine, known, theirs, tracks)
+        if known.id not in body.distinct and membership.distinctness(body, mine, known, theirs, tracks) < 1.0:
             bodies[known.id] = _in_place_of(known, body, theirs, tracks)
             tracks.body[tracks.body == body.id] = known.id
             del bodies[body.id]
             return
+
+
+def _told_apart(
+    body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks
+) -> Body:
+    """A body that knows of another one, if their seen members have moved apart by now: they are never one again."""
+    apart = membership.distinctness(body, mine, other, theirs, tracks) > _DISTINCT
+    return replace(body, distinct=body.distinct | {other.id}) if apart else body
 
 
 def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks) -> Body:
