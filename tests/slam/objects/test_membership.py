@@ -189,15 +189,17 @@ def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:
     assert tracks.sure[:8].all() and not tracks.sure[8]
 
 
-@pytest.mark.parametrize("sure", [True, False])
-def test_a_body_at_rest_before_a_standing_camera_keeps_what_has_moved_with_it(sure: bool) -> None:
-    """What stays at its pixels belongs to it only if its motion with the body was certain before."""
+@pytest.mark.parametrize(("sure", "moving", "kept"), [(True, False, True), (False, False, False), (True, True, False)])
+def test_a_body_at_rest_before_a_standing_camera_keeps_what_has_moved_with_it(
+    sure: bool, moving: bool, kept: bool
+) -> None:
+    """What stays at its pixels belongs to a body that rests, if its motion with it was certain before."""
     still = np.tile(path(MOVING)[SLOT], (WINDOW, 1, 1))
     tracks = table(seen_from(still, corners(8, 9), 10))
-    body = body_along(still, np.arange(8), tracks)
+    body = replace(body_along(still, np.arange(8), tracks), moving=moving)
     tracks.still[:8], tracks.sure[:8] = True, sure
     membership.update_members({1: body}, FRAME, tracks)
-    assert (tracks.body[:8] == (1 if sure else -1)).all()
+    assert (tracks.body[:8] == (1 if kept else -1)).all()
 
 
 @pytest.mark.parametrize(("velocity", "same"), [(MOVING, True), (LID, False)])
