@@ -1,4 +1,4 @@
-"""The detectors of moving objects by mode, and the one that detects nothing."""
+"""What a detector of moving objects is, and the one that detects nothing."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ import numpy as np
 
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.geometry.arrays import IndexArray
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
-from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
-from slam.objects.config import ObjectsConfig
 from slam.objects.first_frames import Places
 from slam.objects.revision import CorrectRows
 
@@ -95,20 +92,3 @@ class NoDetector:
         """Nothing moves, nothing is undecided."""
         none = np.zeros(0, np.intp)
         return MotionLabels(none, none, np.zeros(0, np.int64)), ()
-
-
-def detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> ObjectDetector:
-    """The detector of the configured mode.
-
-    Raises:
-        ConfigurationError: the database of mode ``"procedure1"`` cannot be read.
-    """
-    if config.mode == "off":
-        return NoDetector()
-    if config.mode == "procedure1":
-        from slam.objects.procedure1 import Procedure1Detector
-
-        return Procedure1Detector(rig, config, models)
-    from slam.objects.detector import MovingObjectDetector
-
-    return MovingObjectDetector(rig, config, models)

@@ -52,7 +52,8 @@ def test_still_groups_are_not_proven(n, scatter):
     """Whatever the size of the members' errors."""
     rng = np.random.default_rng(n)
     runs = [
-        with_frame(0.0, group(n, 0.0, 0.01, rng, scatter), scene(), way(0.0, 0.01, rng), 0.0, False) for _ in range(1000)
+        with_frame(0.0, group(n, 0.0, 0.01, rng, scatter), scene(), way(0.0, 0.01, rng), 0.0, False)
+        for _ in range(1000)
     ]
     assert not any(proven for _, proven in runs)
 
