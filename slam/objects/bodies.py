@@ -178,13 +178,6 @@ def with_evidence(body: Body, gain: float) -> Body:
     return replace(body, existence=when_missed(body.existence, body.seen, body.age))
 
 
-def counted(body: Body, measured: bool) -> Body:
-    """The body after it was reported."""
-    if measured:
-        return replace(body, reported=body.reported + 1)
-    return replace(body, reported_unmeasured=body.reported_unmeasured + 1)
-
-
 def with_extent(body: Body, local: Array) -> Body:
     """The body with the extent of its points (K, 3)."""
     if len(local) < 3:

@@ -75,10 +75,7 @@ class NoDetector:
 
     suspects: IdArray = np.zeros(0, np.int64)
 
-    def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
-        T_world_left: Array,
-    ) -> IdArray:  # fmt: skip
+    def newly_moving(self, *_: object) -> IdArray:
         """None does."""
         return self.suspects
 
