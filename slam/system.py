@@ -27,7 +27,7 @@ from slam.models import EstimatorModels
 from slam.naming import count
 from slam.objects.config import ObjectsConfig
 from slam.objects.detector import MovingObjectDetector
-from slam.objects.modes import NoDetector, ObjectDetector
+from slam.objects.modes import ObjectDetector
 from slam.papers.procedure1 import Procedure1Detector
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
@@ -344,4 +344,4 @@ class StereoSlam:
 def _detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> ObjectDetector:
     """The detector of the configured mode; raises ConfigurationError where its database cannot be read."""
     detectors = {"detect": MovingObjectDetector, "procedure1": Procedure1Detector}
-    return NoDetector() if config.mode == "off" else detectors[config.mode](rig, config, models)
+    return ObjectDetector() if config.mode == "off" else detectors[config.mode](rig, config, models)

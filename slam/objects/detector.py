@@ -25,6 +25,7 @@ from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.measurement import measure
 from slam.objects.merging import merge
+from slam.objects.modes import ObjectDetector
 from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Regions, follow_regions, proven_region
@@ -37,7 +38,7 @@ _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as 
 _ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
 
 
-class MovingObjectDetector:
+class MovingObjectDetector(ObjectDetector):
     """Finds moving bodies without being told.
 
     Args:

@@ -59,7 +59,7 @@ class Way:
 
     @classmethod
     def of(cls, body: Body, frame: Frame) -> Way:
-        """Of a body in those frames of the window in which it was measured."""
+        """Of a body that is measured, in those frames of the window in which it was."""
         stamps, cameras = frame.stamps, frame.poses
         seen = np.flatnonzero(body.known & np.isfinite(stamps))
         seen = seen[np.argsort(stamps[seen])]
@@ -67,8 +67,6 @@ class Way:
         rays = places - cameras[seen, :3, 3]
         depth = np.einsum("ni,ni->n", rays, cameras[seen, :3, 2])
         off = rays * (frame.setup.depth_noise(depth) / depth)[:, None]  # by a disparity that is wrong by sigma
-        if not len(seen):
-            return cls(places, stamps[seen], np.zeros(3), 0.0)
         camera = float(np.linalg.norm(np.ptp(cameras[seen, :3, 3], axis=0)))
         by_rig = (off[-1] - off[0]) / max(len(seen) - 1, 1)
         return cls(places, stamps[seen], by_rig, camera, body.apart_from is not None)
@@ -76,7 +74,7 @@ class Way:
     @property
     def bar(self) -> float:
         """−log10 of the chance that is asked for: what goes farther than the camera hardly slides with it."""
-        length = float(np.linalg.norm(np.ptp(self.places, axis=0))) if len(self.places) else 0.0
+        length = float(np.linalg.norm(np.ptp(self.places, axis=0)))
         if self.part or length > _FARTHER * self.of_camera:
             return PROVEN
         return _SLIDES
