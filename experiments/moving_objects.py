@@ -44,7 +44,7 @@ from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, rotation_angle
 from slam.object_data import MovingObject
-from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
+from slam.papers.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother", "window")
 PARTS = ("table1", "moving", "boxes", "occlusion", "still", "people", "kitti", "cyclists")

@@ -23,8 +23,12 @@ from slam.interfaces import Backend, Frontend
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.step import Step
+from slam.models import EstimatorModels
 from slam.naming import count
-from slam.objects.modes import ObjectDetector, detector_for
+from slam.objects.config import ObjectsConfig
+from slam.objects.detector import MovingObjectDetector
+from slam.objects.modes import ObjectDetector
+from slam.papers.procedure1 import Procedure1Detector
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.one_thread import OneThread
@@ -112,7 +116,7 @@ class StereoSlam:
         inside.require_fits(first)
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
         self._session = Session(inside.rig, inner, names[1], first, self.calibration)
-        self._tracker = Tracker(self._session, detector_for(inside.rig, c.objects, inner.models), self.frontend)
+        self._tracker = Tracker(self._session, _detector_for(inside.rig, c.objects, inner.models), self.frontend)
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
@@ -335,3 +339,9 @@ class StereoSlam:
         """State for copying and pickling; refused while another thread is in a step."""
         with self._stepping:
             return vars(self).copy()
+
+
+def _detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> ObjectDetector:
+    """The detector of the configured mode; raises ConfigurationError where its database cannot be read."""
+    detectors = {"detect": MovingObjectDetector, "procedure1": Procedure1Detector}
+    return ObjectDetector() if config.mode == "off" else detectors[config.mode](rig, config, models)

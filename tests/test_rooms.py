@@ -21,11 +21,12 @@ MAY_IMPORT = {
     "calibration": {"data", "geometry", "kernels", "runtime"},
     "mapping": {"tracks", "window", "data", "geometry", "runtime"},
     "objects": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
+    "papers": {"objects", "data", "geometry", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},
     "evaluation": {"data", "geometry"},
     "input": {"tracks", "data", "geometry", "runtime"},
-    "system": {"objects", "mapping", "tracks", "calibration", "input", "data", "geometry", "runtime"},
+    "system": {"papers", "objects", "mapping", "tracks", "calibration", "input", "data", "geometry", "runtime"},
     "run": {
         "system", "calibration", "objects", "mapping", "tracks", "input", "sequences", "worlds", "evaluation", "data",
         "geometry", "runtime",

@@ -1,5 +1,5 @@
 """Moving objects: found without being told, measured with covariance.
 
 `detector` is the step: it follows features, classifies them as still or moving, and keeps the bodies that they make up.
-`procedure1` is paper B's own method. May import `slam.tracks`, `slam.geometry`, `slam.runtime` and the data.
+May import `slam.tracks`, `slam.window`, `slam.geometry`, `slam.runtime` and the data.
 """

@@ -47,7 +47,7 @@ class Body:
     moving: bool = True  # whether it moves now
     evidence: float = 0.0  # evidence that it has moved, given all that is uncertain; see `slam.objects.proof`
     far: bool = False  # whether it was followed for farther than it is wide before it became a body
-    certain: int = 0  # number of frames in succession in which its tracks said for certain that it moves
+    certain: int = 0  # what frames so far count for the proof that it moves, see `slam.objects.proof`
     proven: bool = False  # whether it has moved for certain by its tracks
     moved: bool = False  # whether it has by its estimate, too, see `slam.objects.estimator`: only then it is reported
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
@@ -154,7 +154,7 @@ def continued(body: Body, known: Body) -> Body:
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
         proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
         reported=known.reported, reported_unmeasured=known.reported_unmeasured,
-        measured_at=known.measured_at, belief=None,
+        measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
     )  # fmt: skip
 
 
@@ -176,13 +176,6 @@ def with_evidence(body: Body, gain: float) -> Body:
     if body.measured:
         return replace(body, existence=when_measured(body.existence, gain))
     return replace(body, existence=when_missed(body.existence, body.seen, body.age))
-
-
-def counted(body: Body, measured: bool) -> Body:
-    """The body after it was reported."""
-    if measured:
-        return replace(body, reported=body.reported + 1)
-    return replace(body, reported_unmeasured=body.reported_unmeasured + 1)
 
 
 def with_extent(body: Body, local: Array) -> Body:

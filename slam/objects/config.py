@@ -38,7 +38,7 @@ class ObjectsConfig:
         report_unmeasured: time for which a body is still reported after its last measurement [s].
         unmeasured_share: most frames in which a body is reported without being measured, as a share of those in which
             it was measured.
-        database: file of the object's features for ``"procedure1"``, see `slam.objects.procedure1`.
+        database: file of the object's features for ``"procedure1"``, see `slam.papers.procedure1`.
         least_side: of the triangle of features in ``"procedure1"``, its shortest side [m].
         least_sine: of the triangle of features in ``"procedure1"``, the least sine of its angles.
         margin: how far from a body's extent its further features may lie, as a share of the extent's diagonal, or of

@@ -25,7 +25,8 @@ from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.measurement import measure
 from slam.objects.merging import merge
-from slam.objects.proof import PROOF, Way, with_frame
+from slam.objects.modes import ObjectDetector
+from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Regions, follow_regions, proven_region
 from slam.objects.revision import CorrectRows, revise_tracks
@@ -37,7 +38,7 @@ _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as 
 _ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
 
 
-class MovingObjectDetector:
+class MovingObjectDetector(ObjectDetector):
     """Finds moving bodies without being told.
 
     Args:
@@ -98,8 +99,6 @@ class MovingObjectDetector:
         self._fit(frame)
         self._change_members(frame)
         found = finder.find_groups(frame, tracks, self.bodies)
-        suspected = tracks.landmark[found.suspects]
-        self.suspects = suspected[suspected >= 0]
         for group in found.groups:
             moving = finder.lasting(group, tracks, frame)
             new = finder.moving_group(frame, tracks, moving) if len(moving) else None
@@ -108,6 +107,9 @@ class MovingObjectDetector:
         if self.setup.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.objects.regions`
             self._follow_regions(frame)
         self._prove(frame, found.scene)
+        unproven = np.isin(tracks.body, [body.id for body in self.bodies.values() if not body.proven])
+        suspected = np.concatenate([tracks.landmark[found.suspects], tracks.landmark[unproven]])
+        self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(frame)
         self._begin_tracks(frame, landmark)
         return self._motion_labels(frame), reported(self.bodies, tracks, self.setup.config)
@@ -229,10 +231,10 @@ class MovingObjectDetector:
             members = members[tracks.count(members) >= s.config.min_frames - 1]
             moved = displacements(tracks, members, frame.ages, frame.poses[:, :3, 3], s.slide)
             way = Way.of(body, frame)
-            evidence, certain = with_frame(body.evidence, moved, scene, way, body.far)
-            frames = body.certain + 1 if certain else 0
-            proven = body.proven or frames >= PROOF
-            body = replace(body, evidence=evidence, certain=frames, proven=proven)
+            left = 0.0 if body.proven else by_left_image(tracks, members, frame, scene)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, left, body.far)
+            certain = body.certain + counts
+            body = replace(body, evidence=evidence, certain=certain, proven=body.proven or certain >= PROOF)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
                 self._drop(body)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from slam.geometry.se3 import Array, inverse
 from slam.object_data import MovingObject, ObjectEstimate
 from slam.objects.belief import BodyBelief
-from slam.objects.bodies import CUT, Body, counted, outermost
+from slam.objects.bodies import CUT, Body, outermost
 from slam.objects.config import ObjectsConfig
 from slam.objects.existence import EVEN
 from slam.objects.tracks import Tracks
@@ -20,7 +22,8 @@ def reported(bodies: dict[int, Body], tracks: Tracks, config: ObjectsConfig) -> 
         if body.belief is None or not (body.proven and body.moved):
             continue
         if _worth_reporting(body, body.belief.estimate, config):
-            bodies[id] = counted(body, body.belief.estimate.measured)
+            count = "reported" if body.belief.estimate.measured else "reported_unmeasured"
+            bodies[id] = replace(body, **{count: getattr(body, count) + 1})
             out.append(_report(body, body.belief, tracks))
     return tuple(out)
 

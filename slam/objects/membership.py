@@ -175,7 +175,8 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     v, seen = membership_test(body, tracks, mine), tracks.seen[mine]
     most_fit = v.fits[seen].sum() > _MOST * seen.sum()
     unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
-    wrong = tracks.still[mine] | (tracks.misfit[mine] >= MAX_REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
+    stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
+    wrong = stays | (tracks.misfit[mine] >= MAX_REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
     tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
     if wrong.any():
         remove_members(tracks, mine[wrong & ~seen], body)

@@ -1,33 +1,26 @@
-"""The detectors of moving objects by mode, and the one that detects nothing."""
+"""What the system asks of a detector of moving objects; this one takes everything for still."""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import numpy as np
 
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.geometry.arrays import IndexArray
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
-from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
-from slam.objects.config import ObjectsConfig
 from slam.objects.first_frames import Places
 from slam.objects.revision import CorrectRows
 
 
-class ObjectDetector(Protocol):
-    """What the system asks of a detector of moving objects, in every step.
+class ObjectDetector:
+    """What the system asks of a detector of moving objects in every step; by itself it takes everything for still.
 
     `newly_moving` and `suspects` are asked before the back end's update, `step` comes after it.
     """
 
-    @property
-    def suspects(self) -> IdArray:
-        """Ids of landmarks that may move: they do not measure the camera's next pose."""
-        ...
+    #: Ids of landmarks that may move: they do not measure the camera's next pose.
+    suspects: IdArray = np.zeros(0, np.int64)
 
     def newly_moving(
         self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
@@ -43,11 +36,10 @@ class ObjectDetector(Protocol):
             places: gives the positions of landmarks (K, 3) in the world [m] by their ids.
             T_world_left: the camera's pose (4, 4), as far as it is known.
         """
-        ...
+        return np.zeros(0, np.int64)
 
     def restart(self) -> None:
         """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
-        ...
 
     def revise(self, correct: CorrectRows) -> None:
         """Take note that the rig's correction changes before the next frame.
@@ -55,11 +47,10 @@ class ObjectDetector(Protocol):
         Args:
             correct: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
         """
-        ...
 
     def step(
         self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,
-        still: IndexArray = ...,
+        still: IndexArray,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Say which features move, before any of them becomes a landmark, and report the bodies.
 
@@ -70,45 +61,5 @@ class ObjectDetector(Protocol):
             landmark: id of the landmark that each feature was matched to (N,), -1 for none.
             still: rows of features that stay at their pixels while the camera stands.
         """
-        ...
-
-
-class NoDetector:
-    """Takes everything for still."""
-
-    suspects: IdArray = np.zeros(0, np.int64)
-
-    def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
-        T_world_left: Array,
-    ) -> IdArray:  # fmt: skip
-        """None does."""
-        return self.suspects
-
-    def restart(self) -> None:
-        """There is nothing to forget."""
-
-    def revise(self, correct: CorrectRows) -> None:
-        """There is nothing to revise."""
-
-    def step(self, *_: object) -> tuple[MotionLabels, tuple[MovingObject, ...]]:
-        """Nothing moves, nothing is undecided."""
         none = np.zeros(0, np.intp)
         return MotionLabels(none, none, np.zeros(0, np.int64)), ()
-
-
-def detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> ObjectDetector:
-    """The detector of the configured mode.
-
-    Raises:
-        ConfigurationError: the database of mode ``"procedure1"`` cannot be read.
-    """
-    if config.mode == "off":
-        return NoDetector()
-    if config.mode == "procedure1":
-        from slam.objects.procedure1 import Procedure1Detector
-
-        return Procedure1Detector(rig, config, models)
-    from slam.objects.detector import MovingObjectDetector
-
-    return MovingObjectDetector(rig, config, models)

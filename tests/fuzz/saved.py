@@ -20,7 +20,7 @@ from slam.calibration.saved import SavedCalibration, load_calibration, rig_numbe
 from slam.config import SystemConfig
 from slam.mapping.map_io import SavedMap, decode, encode
 from slam.objects.config import ObjectsConfig
-from slam.objects.procedure1 import ObjectDatabase
+from slam.papers.procedure1 import ObjectDatabase
 from slam.run.options import RunOptions
 from slam.run.recorded import record
 from slam.run.recording import load_recording, save_recording

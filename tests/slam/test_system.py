@@ -11,7 +11,7 @@ from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
-from slam.objects.modes import NoDetector
+from slam.objects.modes import ObjectDetector
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
@@ -157,7 +157,7 @@ def test_two_arrays_and_a_time_are_a_frame():
 def test_another_detector_takes_the_place_of_the_first_one():
     cloud, system = Cloud(150), StereoSlam(RIG, None, "ekf", config=CONFIG)
     system.process_features(cloud.features(np.eye(4), 0.0, 0.3)[0])
-    system.objects = NoDetector()
+    system.objects = ObjectDetector()
     suspects = system.objects.suspects = system.landmarks.ids[:6].copy()
     result = system.process_features(cloud.features(np.eye(4), 0.1, 0.3)[0])
     assert len(result.matched) > 20 and not np.isin(suspects, result.matched).any()

@@ -54,6 +54,20 @@ def test_moving_features_never_become_landmarks(box_run):
         assert not np.isin(result.added_features, result.moving_features).any()
 
 
+def test_landmarks_on_what_may_be_a_body_do_not_measure_the_camera():
+    """From the group's first suspicion until the body is proven, and its landmarks leave the map."""
+    sequence = slam.open_sequence("synthetic:box?density=300")
+    system, frames = system_for(sequence), 0
+    for k in range(50, 90):
+        system.process_features(sequence.simulate(k).features)
+        tracks, bodies = system.objects.tracks, system.objects.bodies
+        unproven = np.isin(tracks.body, [id for id, body in bodies.items() if not body.proven])
+        landmarks = tracks.landmark[unproven & (tracks.landmark >= 0)]
+        assert np.isin(landmarks, system.objects.suspects).all()
+        frames += len(landmarks) > 0
+    assert frames
+
+
 def test_nothing_moves_in_a_still_world():
     sequence = slam.open_sequence("synthetic:desk?density=150")
     system = system_for(sequence)

@@ -187,3 +187,34 @@ def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:
     body = body_along(still, np.arange(8), tracks)
     membership.update_members({1: body}, FRAME, tracks)
     assert tracks.sure[:8].all() and not tracks.sure[8]
+
+
+@pytest.mark.parametrize(("sure", "moving", "kept"), [(True, False, True), (False, False, False), (True, True, False)])
+def test_a_body_at_rest_before_a_standing_camera_keeps_what_has_moved_with_it(
+    sure: bool, moving: bool, kept: bool
+) -> None:
+    """What stays at its pixels belongs to a body that rests, if its motion with it was certain before."""
+    still = np.tile(path(MOVING)[SLOT], (WINDOW, 1, 1))
+    tracks = table(seen_from(still, corners(8, 9), 10))
+    body = replace(body_along(still, np.arange(8), tracks), moving=moving)
+    tracks.still[:8], tracks.sure[:8] = True, sure
+    membership.update_members({1: body}, FRAME, tracks)
+    assert (tracks.body[:8] == (1 if kept else -1)).all()
+
+
+@pytest.mark.parametrize(("velocity", "same"), [(MOVING, True), (LID, False)])
+def test_a_part_that_has_moved_apart_is_never_merged_again(velocity: Array, same: bool) -> None:
+    """A lid rests on its box for as long as it likes; a piece that never moved otherwise is the body's."""
+    local = corners(16, 4, lid=6)
+    poses, rows = path(MOVING), np.arange(10, 16)
+    tracks = table(np.concatenate([seen_from(poses, local[:10], 5), seen_from(path(velocity), local[10:], 6)]))
+    bodies = {1: body_along(poses, np.arange(10), tracks), 2: body_along(path(velocity), rows, tracks, id=2)}
+    bodies[2] = replace(bodies[2], apart_from=1)
+    merge(bodies, tracks)
+    assert bodies[2].distinct == (frozenset() if same else {1})
+    at_rest = table(seen_from(poses, local, 7))
+    bodies[2] = replace(bodies[2], alike=100, history=poses)
+    at_rest.body[:16] = np.where(np.arange(16) < 10, 1, 2)
+    at_rest.local[:16], at_rest.local_information[:16] = tracks.local[:16], tracks.local_information[:16]
+    merge(bodies, at_rest)
+    assert list(bodies) == ([1] if same else [1, 2])

@@ -7,7 +7,7 @@ from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.euler import rotation
 from slam.geometry.se3 import exp, inverse, log, pose, transform
-from slam.objects.procedure1 import (
+from slam.papers.procedure1 import (
     ObjectDatabase,
     body_frame,
     detect,

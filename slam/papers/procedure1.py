@@ -18,7 +18,6 @@ from slam.archives import array, unpack
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.files import read_bytes, whole_file
-from slam.geometry.arrays import IndexArray
 from slam.geometry.euler import angles
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log, pose, transform
@@ -26,9 +25,8 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
-from slam.objects.first_frames import Places
 from slam.objects.following import match_far
-from slam.objects.revision import CorrectRows
+from slam.objects.modes import ObjectDetector
 
 _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # guard: of its numbers
@@ -215,7 +213,7 @@ def _placed(current: Array, initial: Array, origin: Array) -> Array:
     return pose(R, origin + AA)
 
 
-class Procedure1Detector:
+class Procedure1Detector(ObjectDetector):
     """The papers' detector in the system's place for one; the object is number 1.
 
     Its body frame lies in the database's origin, along the world's axes in the initial scene.
@@ -226,8 +224,6 @@ class Procedure1Detector:
         models: pixel noise.
         database: the object's features.
     """
-
-    suspects: IdArray = np.zeros(0, np.int64)
 
     def __init__(
         self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels, database: ObjectDatabase | None = None
@@ -241,19 +237,9 @@ class Procedure1Detector:
         self._covariance: Array = np.eye(6)
         self._last: tuple[float, Array] | None = None
 
-    def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
-        T_world_left: Array,
-    ) -> IdArray:  # fmt: skip
-        """None is known to."""
-        return self.suspects
-
     def restart(self) -> None:
         """The database goes on; the last pose does not."""
         self._last = None
-
-    def revise(self, correct: CorrectRows) -> None:
-        """Nothing measured is kept."""
 
     def step(
         self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray, *_: object

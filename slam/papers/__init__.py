@@ -1,0 +1,4 @@
+"""Methods of the papers that the system has replaced by its own, as they were printed.
+
+May import `slam.objects`, `slam.geometry`, `slam.runtime` and the data.
+"""
