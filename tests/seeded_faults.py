@@ -122,7 +122,7 @@ FAULTS = (
     ),
     Fault(
         "the earlier velocity is taken over the later interval", "backends/batch.py",
-        "earlier = interval if first else float(dt[i - 1])", "earlier = interval",
+        "before = float(dt[i - 1]) if i else None", "before = interval if i else None",
         "tests/backends/test_same_uncertainty.py tests/backends/test_batch.py",
     ),
     # tracks

@@ -24,19 +24,18 @@ _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are as
 def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
     """Merge bodies that move as an older one does, in place: young ones at once, others only if that lasts.
 
-    It has to last because the parts of an articulated body move alike now and then; two that have once moved apart are
-    never one again. If fewer members of the older body are seen, that one is merged into the younger.
+    It has to last because the parts of an articulated body move alike now and then. If fewer members of the older
+    body are seen, that one is merged into the younger.
     """
     for id in sorted(bodies, reverse=True):
         body = bodies.get(id)  # it may have taken the place of another
         if body is None or not body.measured:
             continue
         mine = _members(tracks, id)
-        older = {b.id: b for b in bodies.values() if b.id < id and b.id not in body.distinct}
-        for other in [b for b in older.values() if b.measured and b.proven and _near(body, b)]:
-            if membership.distinctness(body, mine, other, _members(tracks, other.id), tracks) > _DISTINCT:
-                body = bodies[id] = replace(body, distinct=body.distinct | {other.id})
-                del older[other.id]
+        whole = bodies.get(-1 if body.apart_from is None else body.apart_from)
+        if whole is not None and whole.measured and whole.id not in body.distinct:
+            body = bodies[id] = _told_apart(body, mine, whole, _members(tracks, whole.id), tracks)
+        older = {id: b for id, b in bodies.items() if id < body.id and id not in body.distinct}
         whole = membership.body_around(older, tracks, mine, body)
         alike = body.alike + 1 if whole is not None else 0
         body = bodies[id] = replace(body, alike=alike) if alike != body.alike else body
@@ -56,13 +55,24 @@ def _outgrow(bodies: dict[int, Body], body: Body, older: list[Body], tracks: Tra
         mine, theirs = _members(tracks, body.id), _members(tracks, known.id)
         if not known.measured or known.id == body.apart_from or len(theirs) >= len(mine):
             continue
-        if not (_near(body, known) and membership.moves_with(body, tracks, theirs)):
+        if math.dist(body.middle, known.middle) > body.across + known.across:
             continue
-        if membership.distinctness(body, mine, known, theirs, tracks) < 1.0:
+        if not membership.moves_with(body, tracks, theirs):
+            continue
+        body = bodies[body.id] = _told_apart(body, mine, known, theirs, tracks)
+        if known.id not in body.distinct and membership.distinctness(body, mine, known, theirs, tracks) < 1.0:
             bodies[known.id] = _in_place_of(known, body, theirs, tracks)
             tracks.body[tracks.body == body.id] = known.id
             del bodies[body.id]
             return
+
+
+def _told_apart(
+    body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks
+) -> Body:
+    """A body that knows of another one, if their seen members have moved apart by now: they are never one again."""
+    apart = membership.distinctness(body, mine, other, theirs, tracks) > _DISTINCT
+    return replace(body, distinct=body.distinct | {other.id}) if apart else body
 
 
 def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks) -> Body:
@@ -73,11 +83,6 @@ def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks
     membership.take_to(tracks, own, inverse(grown.T) @ body.T)
     membership.add_members(grown, tracks, mine, sure=True)
     return grown
-
-
-def _near(one: Body, other: Body) -> bool:
-    """Whether two bodies are no farther apart than both measure across."""
-    return math.dist(one.middle, other.middle) <= one.across + other.across
 
 
 def _members(tracks: Tracks, id: int) -> NDArray[np.intp]:
