@@ -44,7 +44,7 @@ def find_groups(frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]) -> Fou
     parts = [
         (body.id, on[g.members])
         for body in bodies.values()
-        if body.measured and body.proven and body.moving
+        if body.measured and body.proven
         for on, test in [_classified(frame, tracks, membership.tracks_on(body, tracks, c.margin), body)]
         for g in test.groups
         if g.moves(c.group_test, least)
