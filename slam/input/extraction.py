@@ -11,7 +11,7 @@ from slam.data import StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.input.features import documented, outside_masks
-from slam.input.warnings import InputWarnings
+from slam.input.warnings import InputWarnings, shows_something
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
@@ -54,7 +54,7 @@ def checksum_of(frame: StereoFrame) -> tuple[int, int] | None:
     Images of a camera that stands still differ by their noise.
     """
     left, right = frame.left, frame.right
-    if not isinstance(left, np.ndarray) or not left.size or left.min() == left.max():
+    if not shows_something(left):
         return None
     return crc32(left.tobytes()), crc32(right.tobytes()) if isinstance(right, np.ndarray) else 0
 

@@ -192,7 +192,7 @@ class InputWarnings:
             SequenceError: left and right are equal, and there was no pair of two images before: it is one camera twice.
         """
         last, self._last = self._last, checksum
-        if checksum is None or frame.right is None or frame.right.min() == frame.right.max():
+        if checksum is None or not shows_something(frame.right):
             return frame, checksum
         copy = ""
         if checksum[0] == checksum[1]:
@@ -283,6 +283,13 @@ def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:
     """
     half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
     return float((half_view / models.motion.angular_acceleration) ** (2 / 3))
+
+
+def shows_something(image: object) -> bool:
+    """Whether this is an array of numbers that are not all the same; others the front end refuses."""
+    if not isinstance(image, np.ndarray) or image.dtype.kind not in "uif" or not image.size:
+        return False
+    return bool(image.min() != image.max())
 
 
 def _is_image(image: object, rig: StereoRig) -> bool:

@@ -60,6 +60,14 @@ def test_cameras_that_are_exchanged_for_certain_are_refused():
     assert len(lines([*stamped([0.0, 0.1]), *swapped[3:]], stereo=3)) <= 1  # they were right before
 
 
+@pytest.mark.parametrize(
+    "right", [np.zeros((0, 0), np.uint8), FRAME.right.tolist(), "x", FRAME.right.astype(object), FRAME.right.astype(str)]
+)
+def test_what_is_no_right_image_is_refused_in_one_line(right):
+    with pytest.raises(SequenceError, match="right"):
+        slam.StereoSlam(RIG, "surf", "ekf").process(replace(FRAME, right=right))
+
+
 def test_one_camera_twice_is_refused_and_a_single_frame_loses_its_right_image():
     doubled = [replace(f, right=f.left.copy()) for f in stamped(0.05 * np.arange(8))]
     for rig in (RIG, distorted()):
