@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
@@ -42,7 +42,7 @@ def as_frame(left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: fl
 class Extracted:
     """A frame and what the front end found in it."""
 
-    frame: StereoFrame  # as given
+    frame: StereoFrame  # as given, but for a right image that is a copy
     features: StereoFeatures
     milliseconds: dict[str, float]  # wall time of the extraction
     checksum: tuple[int, int] | None  # of the images, see `checksum_of`
@@ -84,7 +84,7 @@ class Extractor:
 
     @one_blas_thread
     def extract(self, frontend: Frontend | None, frame: StereoFrame) -> Extracted:
-        """A frame with its features.
+        """A frame with its features; where it raises, what is known of the frames before is unchanged.
 
         Raises:
             ConfigurationError: there is no front end.
@@ -97,8 +97,11 @@ class Extractor:
         if not isinstance(frame, StereoFrame):
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
-        frame, checksum = self._warnings.without_copies(frame, checksum_of(frame))
-        with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
-            features = outside_masks(documented(frontend.extract(frame), self._rig), frame, self._rig)
-        self._warnings.look(frame, features)
-        return Extracted(frame, features, stages.milliseconds, checksum)
+        with self._extracting:
+            checksum, copy = self._warnings.copied(frame, checksum_of(frame))
+            used = replace(frame, right=None) if copy else frame
+            with stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
+                features = outside_masks(documented(frontend.extract(used), self._rig), used, self._rig)
+            self._warnings.look(used, features)
+            self._warnings.used(frame, checksum, copy)
+        return Extracted(used, features, stages.milliseconds, checksum)

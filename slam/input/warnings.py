@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 
@@ -64,6 +63,7 @@ class InputWarnings:
         self._texture_is_known = self._partners_are_known = False
         self._two_images = self._copied = False  # a pair of different images was seen, a copy was named
         self._last: Checksum | None = None  # of the frame before
+        self._last_copy = ""  # why its right image was a copy
         self._before: StereoFrame | None = None
         self._fits = np.zeros(3, int)  # matches with the right image of this frame, the next one and the one before
         for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig.left, rig.right))):
@@ -75,16 +75,19 @@ class InputWarnings:
 
         Raises:
             SequenceError: left and right are exchanged, for certain: no pair before was right, features fit the rig
-                the other way round, and hardly any has a right match as it is.
+                the other way round, and hardly any has a right match as it is. Nothing is changed then.
         """
+        own = None
+        if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK:  # a power of two
+            own = self._own_geometry(frame, 10 * int(features.has_stereo.sum()) < len(features))
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
                 self._check_intervals(float(np.median(np.diff(self._stamps))))
         if not self._texture_is_known:
             self._check_texture(frame.left, len(features))
-        if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK:  # a power of two
-            self._check_pair(frame, 10 * int(features.has_stereo.sum()) < len(features))
+        if own is not None:
+            self._check_pair(frame, own)
         if not self._partners_are_known and frame.right is not None:
             self._check_partners(features)
         self._before = frame
@@ -132,15 +135,17 @@ class InputWarnings:
         found = f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image"
         self._warn(found + cause)
 
-    def _check_pair(self, frame: StereoFrame, unpaired: bool) -> None:
-        """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
+    def _own_geometry(self, frame: StereoFrame, unpaired: bool) -> PairGeometry | None:
+        """How left and right image fit, None where that is not asked; SequenceError where they are exchanged."""
         own = None if self._pair_is_named else self._geometry(frame, frame)
-        if own is None:
-            return
+        if own is not None and not self._pair_is_known and own.swapped and unpaired:
+            raise SequenceError(_swapped(own))
+        return own
+
+    def _check_pair(self, frame: StereoFrame, own: PairGeometry) -> None:
+        """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
         if not self._pair_is_known and (own.swapped or own.same):
             self._pair_is_named = True
-            if own.swapped and unpaired:
-                raise SequenceError(_swapped(own))
             self._warn(_swapped(own) if own.swapped else _the_same(own, self._rig))
         elif self._before is not None and (not self._moment_is_known or own.as_given < _FITS * own.matches):
             self._check_moment(frame, own)
@@ -182,36 +187,39 @@ class InputWarnings:
             self._pair_is_named = True
             return None
 
-    def without_copies(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[StereoFrame, Checksum | None]:
-        """A frame, and its checksum, without a right image that is a copy, which measures nothing.
+    def copied(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[Checksum | None, str]:
+        """Why the right image is a copy, which measures nothing (empty if it is none), and the frame's checksum.
 
-        That is one equal, byte for byte, to the left image, or to the right one of the frame before. A left image that
-        is that of the frame before makes the frame a repeated one, whatever the right one is.
+        A copy is equal, byte for byte, to the left image, or to the right one of the frame before. A left image that
+        is that of the frame before makes the frame a repeated one, whatever the right one is: its checksum is that of
+        the frame before. Nothing is changed until `used`.
 
         Raises:
             SequenceError: left and right are equal, and there was no pair of two images before: it is one camera twice.
         """
-        last, self._last = self._last, checksum
+        last = self._last
         if checksum is None or not shows_something(frame.right):
-            return frame, checksum
-        copy = ""
+            return checksum, ""
         if checksum[0] == checksum[1]:
             copy = "left and right are one and the same image"
             if not self._two_images:
                 raise SequenceError(f"frame {frame.index}: {copy}: two cameras are needed (see left=… and right=…)")
-        elif last is not None and checksum != last:
-            if checksum[0] == last[0]:
-                self._last = last
-                return frame, last
-            if checksum[1] == last[1]:
-                copy = "the right image is that of the frame before: its camera froze, or has a lower frame rate"
-        self._two_images = True
-        if not copy:
-            return frame, checksum
-        if not self._copied:
+            return checksum, copy
+        if last is None or checksum == last:
+            return checksum, self._last_copy
+        if checksum[0] == last[0]:
+            return last, ""
+        frozen = "the right image is that of the frame before: its camera froze, or has a lower frame rate"
+        return checksum, frozen if checksum[1] == last[1] else ""
+
+    def used(self, frame: StereoFrame, checksum: Checksum | None, copy: str) -> None:
+        """Take note of a frame, as it was given, that is used; `checksum` and `copy` are the answer of `copied`."""
+        self._two_images |= checksum is not None and shows_something(frame.right)
+        if checksum != self._last:
+            self._last, self._last_copy = checksum, copy
+        if copy and not self._copied:
             self._copied = True
             self._warn(f"frame {frame.index}: {copy}; it and others like it are used without the right image")
-        return replace(frame, right=None), checksum
 
     def note_repeated(self, number: int) -> None:
         """Warn of a frame with the images of the frame before, by its number in its sequence."""

@@ -96,6 +96,28 @@ def test_a_camera_that_freezes_measures_nothing():
     assert before[3:5] == ["predicted"] * 2 and before[5] == "tracked"
 
 
+def test_a_refused_pair_is_refused_again_and_the_right_one_is_used():
+    frames = list(slam.open_sequence("synthetic:desk?frames=3"))
+    for wrong in (replace(frames[0], left=frames[0].right, right=frames[0].left), replace(frames[0], right=FRAME.left)):
+        system = slam.StereoSlam(RIG, "surf", "ekf")
+        for _ in range(3):
+            with pytest.raises(SequenceError, match="swapped|one and the same"):
+                system.process(wrong)
+        assert [system.process(frame).located for frame in frames] == [True] * 3 and system.warnings == []
+
+
+def test_a_frame_that_is_extracted_again_has_the_same_features():
+    first, second = slam.open_sequence("synthetic:desk?frames=2")
+    frozen = replace(second, right=first.right)
+    system = slam.StereoSlam(RIG, "surf", "ekf")
+    system.process(first)
+    broken = replace(frozen, left=frozen.left[:, :-1])
+    with pytest.raises(SequenceError, match="left image"):
+        system.process(broken)  # a failed call leaves no trace
+    extract = system._extractor.extract
+    assert [extract(system.frontend, frozen).frame.right is None for _ in range(3)] == [True] * 3
+
+
 def test_right_images_that_slip_later_are_named():
     frames = list(slam.open_sequence("synthetic:desk?frames=80"))[::4]
     slipped = [replace(b, right=b.right if b.index < 24 else a.right) for a, b in pairwise(frames)]
