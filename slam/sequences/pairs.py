@@ -189,8 +189,9 @@ def pair_up(
 ) -> Pairs:  # fmt: skip
     """The images of two cameras that belong together by their keys, the option ``tolerance`` apart at most.
 
-    Left images before the first pair and after the last are left out, and so are right images without a partner;
-    what is left out or stands alone is reported. Without a right listing both images are in one file, side by side.
+    Left images before the first pair and after the last are left out, and so are right images without a partner; with
+    the option ``swap`` also left ones, which are the right camera's. What is left out or stands alone is reported.
+    Without a right listing both images are in one file, side by side.
 
     Time is by the file of `times`, else by ``fps``, else by stamps, else by numbers at `RATE`. Rows of the file belong
     to the left images in order; with `by_number` a row's number is a frame's. SequenceError where nothing pairs, or
@@ -205,7 +206,9 @@ def pair_up(
         kept = kept[trim(partner)]
         if not len(kept):
             raise SequenceError(_no_pair(left, right, tolerance))
-        _report_alone(left, right, partner, kept, faults)
+        swap = options.get("swap", False)
+        _report_alone(left, right, partner, kept, swap, faults)
+        kept = kept[partner[kept] >= 0] if swap else kept
     pairs = Pairs(left.keys[kept], np.stack([kept, partner[kept]], axis=1), 1e-9 * left.keys[kept])
     if times is not None:
         path, rows = times
@@ -237,7 +240,9 @@ def _tolerance(left: Listing, options: Options, told: bool) -> float:
     return round(1e9 * options.get("tolerance", 1e-9 * default))
 
 
-def _report_alone(left: Listing, right: Listing, partner: IntArray, kept: IntArray, faults: FaultLog) -> None:
+def _report_alone(
+    left: Listing, right: Listing, partner: IntArray, kept: IntArray, swap: bool, faults: FaultLog
+) -> None:
     """Report the images that have no partner."""
     head, tail = int(kept[0]), len(left) - 1 - int(kept[-1])
     alone = kept[partner[kept] < 0]
@@ -247,7 +252,7 @@ def _report_alone(left: Listing, right: Listing, partner: IntArray, kept: IntArr
         faults.report("pairs", line)
     if len(alone):
         line = f"{left.folder}: {len(alone)} images have no partner in {right.folder} (first: {left.names[alone[0]]})"
-        faults.report("pairs", f"{line}; given without a right image")
+        faults.report("pairs", f"{line}; {'left out' if swap else 'given without a right image'}")
     if unused:
         faults.report("pairs", f"{right.folder}: {unused} images have no partner in {left.folder}; left out")
 

@@ -200,6 +200,16 @@ def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str])
     assert seeds(open_sequence(f"{two_folders}?swap=yes")) == [(b, a) for a, b in PAIRS]
 
 
+@pytest.mark.parametrize("missing", ["left", "right"])
+def test_exchanged_images_without_a_partner_are_left_out_and_said(two_folders: Path, missing: str) -> None:
+    sorted((two_folders / missing).iterdir())[3].unlink()
+    sequence = open_sequence(f"{two_folders}?swap=yes&fps=10")
+    assert len(sequence) == 5 and seeds(sequence) == [(b, a) for a, b in PAIRS if a != 3]
+    assert np.allclose(sequence.stamps, [0.0, 0.1, 0.2, 0.4, 0.5])
+    (line,) = [line for line in sequence.warnings if "no partner" in line]
+    assert line.endswith("left out")
+
+
 def test_one_folder_with_both_cameras_in_it_and_patterns(two_folders: Path) -> None:
     for side in ("left", "right"):
         for path in (two_folders / side).iterdir():
