@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,20 +26,6 @@ if TYPE_CHECKING:
 
 _SMALLEST_STRIPE = 48  # cost: rows [px] that are worth a task of their own
 _REACH = 0.15  # furthest that localisation moves a feature, in units of its size
-
-
-def _accessors(setting: str, meaning: str) -> tuple[Callable[[Surf], Any], Callable[[Surf, Any], None]]:
-    """OpenCV's getter and setter of a setting."""
-
-    def getter(self: Surf) -> Any:
-        return getattr(self.config, setting)
-
-    def setter(self: Surf, value: Any) -> None:
-        """Set it; raises ConfigurationError for a value out of range."""
-        self.config = replace(self.config, **{setting: value})
-
-    getter.__doc__ = meaning
-    return getter, setter
 
 
 class Surf:
@@ -102,7 +88,8 @@ class Surf:
             >>> Surf.create(400).config.octaves
             4
         """
-        surf = cls(hessianThreshold, nOctaves, nOctaveLayers, 64, upright)
+        surf = cls(hessianThreshold, nOctaves, nOctaveLayers, 64)
+        surf.setUpright(upright)
         surf.setExtended(extended)
         return surf
 
@@ -219,10 +206,38 @@ class Surf:
         keypoints, described = self.detect_and_describe(image, mask)
         return tuple(keypoints), described
 
-    getHessianThreshold, setHessianThreshold = _accessors("threshold", "Least determinant of the Hessian.")
-    getNOctaves, setNOctaves = _accessors("octaves", "Number of octaves.")
-    getNOctaveLayers, setNOctaveLayers = _accessors("layers", "Layers searched for maxima in each octave.")
-    getUpright, setUpright = _accessors("upright", "Whether the orientation is left out.")
+    def getHessianThreshold(self) -> float:
+        """Least determinant of the Hessian."""
+        return self.config.threshold
+
+    def setHessianThreshold(self, hessianThreshold: float) -> None:
+        """Set it; raises ConfigurationError for a value out of range, as the other setters do."""
+        self.config = replace(self.config, threshold=hessianThreshold)
+
+    def getNOctaves(self) -> int:
+        """Number of octaves."""
+        return self.config.octaves
+
+    def setNOctaves(self, nOctaves: int) -> None:
+        """Set it, 1 to 4."""
+        self.config = replace(self.config, octaves=nOctaves)
+
+    def getNOctaveLayers(self) -> int:
+        """Layers searched for maxima in each octave."""
+        return self.config.layers
+
+    def setNOctaveLayers(self, nOctaveLayers: int) -> None:
+        """Set it, 2 or 3."""
+        self.config = replace(self.config, layers=nOctaveLayers)
+
+    def getUpright(self) -> bool:
+        """Whether the orientation is left out."""
+        return self.config.upright
+
+    def setUpright(self, upright: bool) -> None:
+        """Set it; a whole number is taken as OpenCV does: 0 is False, others are True."""
+        number = isinstance(upright, (int, np.integer, np.bool_))
+        self.config = replace(self.config, upright=bool(upright) if number else upright)
 
     def getExtended(self) -> bool:
         """Whether descriptors have 128 numbers: never."""

@@ -70,10 +70,11 @@ def test_the_arguments_and_defaults_are_opencv_s():
 def test_setters_change_what_is_found():
     surf = frontends.surf.create()
     many = len(surf.detect(IMAGE))
-    surf.setHessianThreshold(5000)
-    surf.setNOctaves(2)
-    surf.setNOctaveLayers(2)
-    surf.setUpright(True)
+    surf.setHessianThreshold(hessianThreshold=5000)
+    surf.setNOctaves(nOctaves=2)
+    surf.setNOctaveLayers(nOctaveLayers=2)
+    surf.setUpright(upright=1)
+    surf.setExtended(extended=False)
     keypoints, descriptors = surf.detectAndCompute(IMAGE)
     other, same = Surf(5000, 2, 2).detectAndCompute(IMAGE)
     assert 0 < len(keypoints) < many
@@ -87,6 +88,7 @@ def test_setters_change_what_is_found():
         ("HessianThreshold", "a", "threshold must be"),
         ("NOctaves", 5, "octaves must be .* from 1 to 4"),
         ("NOctaveLayers", 4, "layers must be .* from 2 to 3"),
+        ("Upright", "no", "upright"),
         ("Extended", True, "no descriptors of 128 numbers"),
     ],
 )
