@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from slam.compare.plan import CLOSED_LOOP, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
-from slam.compare.sweep import Run, check, sweep
+from slam.compare.sweep import Run, check, is_done, sweep
 from slam.compare.tables import groups, most_tests, write_tables
-from slam.compare.trial import RESULT, run_trial
+from slam.compare.trial import COMPLETED, RESULT, run_trial
 from slam.compare.wording import caution
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
@@ -72,12 +73,11 @@ def compare(
     total, done = sum(frames[trial.sequence] for trial in plan.every), 0
     limits = caution(plan.trials if any(map(is_world, plan.sequences)) else 1, most_tests(plan))
     if not quiet:
-        about = (
-            ""
-            if address is not None
-            else f": about {_seconds(plan, frames) / count:.0f} s, by the first frames of each"
-        )
-        print(f"{len(plan.every)} runs, {total} frames in all, {where}{about}")
+        left = [trial for trial in plan.every if overwrite or not is_done(trial, out)]
+        before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
+        seconds = _seconds(left, frames) if left and address is None else None
+        about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
+        print(f"{len(plan.every)} runs{before}, {total} frames in all, {where}{about}")
         if most_tests(plan):
             print(limits or f"{plan.trials} trials are enough for certainty in all figures.", flush=True)
     with said_before(), counting(total, "frames", quiet) as tell:  # `check` has said what opening says
@@ -97,15 +97,21 @@ def compare(
     return runs
 
 
-def _seconds(plan: Plan, frames: Mapping[str, int]) -> float:
-    """How long all runs of a plan take one after the other [s], by the first frames of one of each kind."""
-    seconds = 0.0
-    for sequence in plan.sequences:
-        for variant in plan.variants:
-            trial = Trial(sequence, variant, plan.backends[0], 0, CLOSED_LOOP, plan.start, plan.start + _TRIED)
+def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
+    """How long these runs take one after the other [s], by the first frames of one of each kind; None if one fails."""
+    seconds, tried = 0.0, dict[tuple[str, Variant], dict[str, float]]()
+    for trial in left:
+        kind = trial.sequence, trial.variant
+        if kind not in tried:
             with said_before():
-                times = json.loads(run_trial(trial)[RESULT])["milliseconds"]
-            runs = len(plan.backends) * (plan.trials if is_world(sequence) else 1) * frames[sequence]
-            estimator = times.get("total", 0.0) - times.get("read", 0.0) - times.get("extract", 0.0)
-            seconds += 1e-3 * runs * (times.get("total", 0.0) + (estimator if plan.replay else 0.0))
+                first = replace(trial, seed=0, mode=CLOSED_LOOP, stop=trial.start + _TRIED)
+                result = json.loads(run_trial(first)[RESULT])
+            if result["outcome"] != COMPLETED:
+                return None
+            tried[kind] = result["milliseconds"]
+        times = tried[kind]
+        spent = times.get("total", 0.0)
+        if trial.mode != CLOSED_LOOP:  # a replay: without images
+            spent -= times.get("read", 0.0) + times.get("extract", 0.0)
+        seconds += 1e-3 * frames[trial.sequence] * spent
     return seconds

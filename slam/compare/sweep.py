@@ -91,7 +91,7 @@ def sweep(
     for mode in plan.modes:  # a replay needs the closed loop
         jobs = []
         for trial in plan.trials_of(mode):
-            if overwrite or not _is_done(trial, out):
+            if overwrite or not is_done(trial, out):
                 jobs.append(Job(trial.folder, run_trial, partial(_arguments, plan, out, trial)))
             else:
                 told(trial)
@@ -176,8 +176,8 @@ def _arguments(plan: Plan, out: Path, trial: Trial) -> tuple[Trial, bytes | None
     return trial, (run.folder / RECORDING).read_bytes() if run.completed else None
 
 
-def _is_done(trial: Trial, out: Path) -> bool:
-    """Whether the trial has ended before; raises SlamError where its folder holds one with other settings."""
+def is_done(trial: Trial, out: Path) -> bool:
+    """Whether the trial has ended before, in `sweep`'s folder; raises SlamError where its folder holds one with other settings."""
     path = out / RUNS / trial.folder / RESULT
     try:
         before = read_object(path).get("trial") if path.exists() else None

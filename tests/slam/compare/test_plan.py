@@ -52,11 +52,42 @@ def test_no_more_workers_than_anybody_has(tmp_path):
 
 def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     """It was told by a time of a frame from another machine."""
-    times = {"milliseconds": {"total": 100.0, "read": 60.0, "extract": 20.0}}
-    monkeypatch.setattr(command, "run_trial", lambda trial: {"result.json": json.dumps(times)})
+    tried = []
+
+    def run_trial(trial):
+        tried.append(trial)
+        times = {"outcome": outcome, "milliseconds": {"total": 100.0, "read": 60.0, "extract": 20.0}}
+        return {"result.json": json.dumps(times)}
+
+    outcome = "completed"
+    monkeypatch.setattr(command, "run_trial", run_trial)
     plan = Plan(("synthetic:aisle", "/data"), ("ekf", "window"), trials=3)
     frames = {"synthetic:aisle": 50, "/data": 40}
-    assert command._seconds(plan, frames) == pytest.approx(2 * (3 * 50 + 40) * (0.1 + 0.02))  # replay: without images
+    whole = 2 * (3 * 50 + 40) * (0.1 + 0.02)  # replay: without images
+    assert command._seconds(plan.every, frames) == pytest.approx(whole)
+    assert [(trial.sequence, trial.seed, trial.stop) for trial in tried] == [(name, 0, 15) for name in plan.sequences]
+    tried.clear()
+    assert command._seconds(plan.every[-1:], frames) == pytest.approx(40 * 0.02) and len(tried) == 1
+    outcome = "failed: SlamError: no"
+    assert command._seconds(plan.every, frames) is None
+
+
+def test_the_time_told_is_that_of_what_is_left_at_once(monkeypatch, tmp_path, capsys):
+    """Two runs on eight workers take the time of one; a finished comparison tries nothing and tells no time."""
+    tried, seconds = [], 40.0
+    monkeypatch.setattr(command, "_seconds", lambda left, frames: tried.append(len(left)) or seconds)
+    plan = Plan(("synthetic:desk?frames=2&width=160&height=120",), ("ekf", "iekf"), trials=1, replay=False)
+    compare(plan, tmp_path, workers=8)
+    assert "2 runs, 4 frames in all, 8 at a time on this machine: about 20 s, by the first" in capsys.readouterr().out
+    (tmp_path / "runs" / next(iter(plan.every)).folder / "result.json").unlink()
+    compare(plan, tmp_path, workers=8)
+    said = capsys.readouterr().out
+    assert "2 runs, 1 of them done before, 4 frames in all, 8 at a time on this machine: about 40 s" in said
+    compare(plan, tmp_path, workers=8)
+    assert "2 of them done before" in (said := capsys.readouterr().out) and "about" not in said and tried == [2, 1]
+    seconds = None
+    compare(plan, tmp_path, workers=8, overwrite=True)
+    assert "about" not in capsys.readouterr().out and tried == [2, 1, 2]
 
 
 def test_variants():
