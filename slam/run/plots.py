@@ -31,8 +31,8 @@ KINDS = ("summary", "path", "map", "errors", "time")
 #: The picture that a run leaves.
 PICTURE = "summary.png"
 
-#: Widths that a picture may be given [mm].
-NARROWEST, WIDEST = 50.0, 1000.0
+#: Widths that a picture may be given [mm]; names of stages leave no room for their times in a narrower one.
+NARROWEST, WIDEST = 80.0, 1000.0
 
 _MOST_MAPS = 3  # side by side in the summary
 _PAGE = 8.0  # [in] below which text is small, as in a paper
