@@ -20,6 +20,7 @@ SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1",
 _MOST_FRAMES = 10**12  # numbers of frames go up to this: as floating-point numbers they are still told apart
 _SHORTEST = 10**6  # [ns] between frames: no camera is faster, and no count of frames has such steps
 _LONGEST = 10**11  # [ns] between frames: a hundred seconds
+_SPARSE = 10  # guard: largest step of a count behind seconds, of which every so many frames were kept
 _SHORTEST_MICRO = 10**4  # [µs] between frames: a hundred a second; no count of frames has such steps, either
 
 _DATE = re.compile(
@@ -90,9 +91,10 @@ def keys_of(sides: Sequence[Sequence[str]]) -> Keys | None:
         found = [read([stem(name) for name in names]) for names in sides]
         if all(keys is not None for keys in found):
             keys = [own for own in found if own is not None]
-            inside = any(not (_STAMP.fullmatch(stem(n)) or _SECONDS.fullmatch(stem(n))) for own in sides for n in own)
+            stems = [stem(name) for own in sides for name in own]
+            plain = all(_SECONDS.fullmatch(own) or (own.isdecimal() and _STAMP.fullmatch(own)) for own in stems)
             moment = f"{1e-9 * keys[0][0]:.6f} s" + " since 1970" * bool(keys[0][0] >= 10**17)
-            return Keys(keys, True, f"the stamp in {sides[0][0]} is taken as {moment}" if inside else "")
+            return Keys(keys, True, f"the stamp in {sides[0][0]} is taken as {moment}" if not plain else "")
     return _numbers(sides)
 
 
@@ -116,12 +118,30 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
     return None
 
 
-def _counters(seconds: Sequence[str], fractions: Sequence[str]) -> bool:
-    """Whether what stands behind the seconds counts the frames of each second, and is no fraction of it."""
-    rows = sorted((int(s), int(f), len(f)) for s, f in zip(seconds, fractions) if s and f)
-    each = [[row[1] for row in group] for _, group in groupby(rows, key=lambda row: row[0])]
-    counted = all(own == list(range(own[0], own[0] + len(own))) and own[0] <= 1 for own in each)
-    return len(each) > 1 and counted and len(rows) > len(each) and max(max(own) for own in each) < 10 ** rows[0][2] - 1
+def _counters(seconds: Sequence[str], digits: Sequence[str]) -> bool:
+    """Whether what stands behind the seconds counts frames, of which a few may be missing, and is no fraction.
+
+    It does where it goes on through the seconds, begins anew in each without filling it, or has steps too short for a
+    camera's times; and where ones without zeros in front are of unequal length, 9 and 10.
+    """
+    if not all(seconds) or not all(digits):
+        return False
+    rows = sorted((int(second), int(counter)) for second, counter in zip(seconds, digits))
+    each = [[counter for _, counter in group] for _, group in groupby(rows, key=lambda row: row[0])]
+    within = Counter(step for own in each for step in _steps(own))
+    step, count = within.most_common(1)[0] if within else (0, 0)
+    if not 1 <= step <= _SPARSE or 4 * count < 3 * within.total():
+        return False
+    width = max(map(len, digits))
+    unpadded = all(str(int(own)) == own for own in digits) and any(own != "0" and own[-1] == "0" for own in digits)
+    if step * 10 ** (9 - width) <= _SHORTEST or (len(set(map(len, digits))) > 1 and unpadded):
+        return True
+    across = [after[0] - before[-1] for before, after in pairwise(each)]
+    if across and min(across) > 0 and 2 * across.count(step) >= len(across):
+        return True
+    whole = all(own == list(range(own[0], own[0] + len(own))) and own[0] <= 1 for own in each)
+    anew = across and step == 1 and 2 * sum(own[0] <= 1 for own in each[1:]) >= len(across)
+    return bool(anew) and max(own[-1] for own in each) < 10**width - (1 if whole else 2)
 
 
 def _nanoseconds(part: tuple[str, ...], width: int) -> int:
@@ -138,8 +158,13 @@ def _dates(names: Sequence[str]) -> IntArray | None:
     found = [match for name in names if (match := _DATE.search(name))]
     if len(found) < len(names):
         return None
-    if len(names) > 1 and set(np.diff([int(match[7] or 0) for match in found]).tolist()) == {1}:
-        return None  # it counts frames, also beyond the end of a second: no fraction
+    digits = [match[7] or "" for match in found]
+    counters = [int(own or 0) for own in digits]
+    together = len({match.groups()[:6] for match in found}) == 1  # then a count of few digits is likelier than 100 Hz
+    steps = _steps(counters) if together else np.diff(counters).tolist()
+    counted = 4 * steps.count(1) >= 3 * len(steps) if together else set(steps) == {1}
+    if steps and (counted or _counters(["".join(match.groups()[:6]) for match in found], digits)):
+        return None
     moments = ["{}-{}-{}T{}:{}:{}".format(*match.groups()) for match in found]
     fractions = [int((match[7] or "0").ljust(9, "0")) for match in found]
     try:

@@ -64,11 +64,39 @@ def test_names_are_read_as_numbers_and_stamps(two_folders: Path, name: str) -> N
     assert any("10 frames per second assumed" in w for w in sequence.warnings) == (first == 0)
 
 
+@pytest.mark.parametrize(
+    ("form", "kept"),
+    [
+        ("2024-01-05_12-00-00_{i:04d}", 1), ("2024-01-05_12-00-00_{i:02d}", 1), ("2024-01-05_12-00-{s:02d}_{i:04d}", 1),
+        ("2024-01-05_12-00-{s:02d}_{f:03d}", 1), ("16000000{s:02d}_{i:04d}", 1), ("16000000{s:02d}_{f:03d}", 1),
+        ("16000000{s:02d}.{f}", 1), ("1600000000_{i:03d}", 1), ("1600000000_{i:06d}", 5), ("16000000{s:02d}_{i}", 1),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("missing", [None, 1, 7, 10])
+def test_a_count_behind_the_seconds_of_which_a_frame_is_missing_is_no_time(form, kept, missing):
+    names = [form.format(i=i * kept, s=i // 5, f=i % 5) + ".png" for i in range(20) if i != missing]
+    keys = keys_of([names, names])
+    assert keys is not None and not keys.stamped
+    assert np.median(np.diff(np.sort(keys.sides[0]))) == kept
+
+
+@pytest.mark.parametrize("rate", [3, 10, 15, 29.97, 60, 90, 200])
+@pytest.mark.parametrize("width", [2, 3, 6])
+def test_times_of_which_some_are_missing_are_no_count(rate, width):
+    moments = [(int(10**width * (0.337 + i / rate)), i) for i in range(300) if i % 11 != 5]
+    names = [f"{1_600_000_000 + t // 10**width}_{t % 10**width:0{width}d}.png" for t, _ in moments]
+    if len(set(names)) == len(names):  # not at 200 Hz with two digits
+        keys = keys_of([names, names])
+        assert keys is not None and keys.stamped and "is taken as" in keys.guess
+        assert keys.sides[0].tolist() == [1_600_000_000 * 10**9 + t * 10 ** (9 - width) for t, _ in moments]
+
+
 def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
     for form, words in (
         (lambda i, _: f"img_{i:03d}_{9 - i}", "numbers in the names disagree"),
         (lambda i, side: "abcdef"[i] + side, "their order does"),
         (lambda i, _: f"x_{1_700_000_000 + i}.500000", "is taken as 1700000000.500000 s"),
+        (lambda i, _: f"{1_700_000_000}_{50 * i:03d}", "_000.png is taken as 1700000000.000000 s"),
         (lambda i, _: f"{33 * i}", "33 apart and taken as frame numbers; if they are times, see times="),
         (lambda i, _: ("3fa9c10", "3fa9c25", "5e1b", "71", "8ac0", "9")[i], "their order does"),
         (lambda i, _: "preview" if i == 5 else f"{i}", "1 of 6 images are named unlike the others .first: preview.png"),
