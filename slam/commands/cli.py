@@ -167,7 +167,7 @@ def run_command(
         gathered = RunRecord()  # its time of compiling begins here
         if options.config.objects.mode != "off":
             with compiling(quiet):
-                compile_kernels(options.backend)
+                compile_kernels(options.backend, options.frontend)
         seen = watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:

@@ -67,10 +67,10 @@ def _with_bodies(backend: str) -> Iterator[FrameResult]:
     yield from (system.process_features(seen.features) for seen in world.observe())  # type: ignore[attr-defined]
 
 
-def compile_kernels(backend: str) -> None:
+def compile_kernels(backend: str, frontend: str = "surf") -> None:
     """Where nothing is compiled yet, compile what a run needs in two processes: Numba compiles one function at a time.
 
-    This one takes the front end's kernels, another one those of the back end and of moving objects, about twice as
+    This one takes the front end's kernels, which `surf` alone has, another one those of the back end and of moving objects, about twice as
     long, which are then loaded from Numba's cache. No kernel is compiled by both.
     """
     from slam.objects.scene_kernels import groups_apart
@@ -85,8 +85,9 @@ def compile_kernels(backend: str) -> None:
     environment = {**os.environ, "PYTHONPATH": paths}
     process = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=environment)
     try:
-        images = open_sequence(_IMAGES)
-        create("frontends", "surf", images.rig).extract(next(iter(images)))
+        if frontend == "surf":
+            images = open_sequence(_IMAGES)
+            create("frontends", frontend, images.rig).extract(next(iter(images)))
         compile_clock.change(1)
         try:
             while process.poll() is None:
