@@ -34,9 +34,7 @@ class SmootherLandmarks(LandmarkRows):
     world: BoolArray  # whether that does not depend on any pose (S,)
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
-    begun: (
-        IndexArray  # number of the pose from which its present smart factor counts (S,); it may begin later; VARIABLE
-    )
+    begun: IndexArray  # number of the pose from which its smart factor counts (S,), or later; or VARIABLE
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
     @classmethod
