@@ -177,7 +177,7 @@ def _arguments(plan: Plan, out: Path, trial: Trial) -> tuple[Trial, bytes | None
 
 
 def is_done(trial: Trial, out: Path) -> bool:
-    """Whether the trial has ended before, in `sweep`'s folder; raises SlamError where its folder holds one with other settings."""
+    """Whether the trial has ended before; raises SlamError where its folder holds one with other settings."""
     path = out / RUNS / trial.folder / RESULT
     try:
         before = read_object(path).get("trial") if path.exists() else None

@@ -70,8 +70,8 @@ def _with_bodies(backend: str) -> Iterator[FrameResult]:
 def compile_kernels(backend: str, frontend: str = "surf") -> None:
     """Where nothing is compiled yet, compile what a run needs in two processes: Numba compiles one function at a time.
 
-    This one takes the front end's kernels, which `surf` alone has, another one those of the back end and of moving objects, about twice as
-    long, which are then loaded from Numba's cache. No kernel is compiled by both.
+    This one takes the front end's kernels, which `surf` alone has, another one those of the back end and of moving
+    objects, about twice as long, which are then loaded from Numba's cache. No kernel is compiled by both.
     """
     from slam.objects.scene_kernels import groups_apart
 

@@ -61,7 +61,8 @@ def test_cameras_that_are_exchanged_for_certain_are_refused():
 
 
 @pytest.mark.parametrize(
-    "right", [np.zeros((0, 0), np.uint8), FRAME.right.tolist(), "x", FRAME.right.astype(object), FRAME.right.astype(str)]
+    "right",
+    [np.zeros((0, 0), np.uint8), FRAME.right.tolist(), "x", FRAME.right.astype(object), FRAME.right.astype(str)],
 )
 def test_what_is_no_right_image_is_refused_in_one_line(right):
     with pytest.raises(SequenceError, match="right"):
@@ -101,7 +102,7 @@ def test_a_refused_pair_is_refused_again_and_the_right_one_is_used():
     for wrong in (replace(frames[0], left=frames[0].right, right=frames[0].left), replace(frames[0], right=FRAME.left)):
         system = slam.StereoSlam(RIG, "surf", "ekf")
         for _ in range(3):
-            with pytest.raises(SequenceError, match="swapped|one and the same"):
+            with pytest.raises(SequenceError, match=r"swapped|one and the same"):
                 system.process(wrong)
         assert [system.process(frame).located for frame in frames] == [True] * 3 and system.warnings == []
 
