@@ -211,7 +211,8 @@ class SelfCalibration:
         found = self.evidence()
         if found is None:
             return self._kept or SavedCalibration(self.posterior, rig_numbers(self.rig))
-        return joint_calibration(self.model, self._prior, [found], self.config.systematic)
+        before = None if self._kept is None else self._kept.evidence
+        return joint_calibration(self.model, factory_prior(self.model), [found], self.config.systematic, before)
 
     def summary(self) -> dict[str, Any]:
         """The result as plain types."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from base64 import b64decode, b64encode
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +60,46 @@ class RecordingEvidence(NamedTuple):
     def fields(self) -> float:
         """Variance of each coefficient of the residual fields [focal lengths²]."""
         return field_variance(self.residual)
+
+
+class RigEvidence(NamedTuple):
+    """The evidence of any number of recordings of one rig, without any prior; the residual fields are still in it."""
+
+    plain: Evidence  # as it is
+    apart: Evidence  # each recording with a systematic error of its own, which averages out over recordings
+    scales: Array  # log-likelihoods (K,) of the scales of the residual fields
+
+    @classmethod
+    def of(cls, recording: RecordingEvidence, variance: Array) -> RigEvidence:
+        """Of one recording, whose systematic error has this variance (n,)."""
+        return cls(recording.whole, recording.whole.with_error(variance), recording.scales)
+
+    def __add__(self, other: RigEvidence) -> RigEvidence:  # type: ignore[override]
+        """Of the recordings of both."""
+        return RigEvidence(self.plain + other.plain, self.apart + other.apart, self.scales + other.scales)
+
+    def to_text(self) -> str:
+        """All numbers as one word."""
+        arrays = (*self.plain, *self.apart, self.scales)
+        return b64encode(np.concatenate([a.ravel() for a in arrays]).astype("<f8").tobytes()).decode("ascii")
+
+    @classmethod
+    def from_text(cls, text: str, n: int) -> RigEvidence:
+        """The inverse of `to_text`, for n parameters; ValueError where it is none."""
+        numbers = np.frombuffer(b64decode(text, validate=True), "<f8").astype(float)
+        m, rest = divmod(len(numbers) - len(RESIDUAL_SCALES) - 2 * n * (n + 1), 2 * n)
+        if m < 0 or rest or not np.isfinite(numbers).all():
+            raise ValueError("its evidence is incomplete")
+        sizes = 2 * [n * n, n, n * m]
+        S, e, cross, S2, e2, cross2, scales = np.split(numbers, np.cumsum(sizes))
+        halves = ((S, e, cross), (S2, e2, cross2))
+        plain, apart = (Evidence(s.reshape(n, n), v, c.reshape(n, m)) for s, v, c in halves)
+        if not all(
+            np.abs(s - s.T).max() <= 1e-6 * np.trace(s) and np.linalg.eigvalsh(s)[0] >= -1e-6 * np.trace(s)
+            for s in (plain.S, apart.S)  # 1e-6: rounding
+        ):
+            raise ValueError("its evidence is none")
+        return cls(plain, apart, scales)
 
 
 def residual_scale(logs: Array) -> float:

@@ -8,7 +8,7 @@ from operator import add
 
 import numpy as np
 
-from slam.calibration.evidence import RecordingEvidence, residual_scale
+from slam.calibration.evidence import RecordingEvidence, RigEvidence, residual_scale
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import solve
 from slam.calibration.prior import Prior, factory_prior, field_variance, systematic_variance
@@ -22,7 +22,11 @@ _AGREES, _DIFFERS = 2.0, 3.0
 
 
 def joint_calibration(
-    model: RigModel, prior: Prior, evidence: Sequence[RecordingEvidence], systematic: float
+    model: RigModel,
+    prior: Prior,
+    evidence: Sequence[RecordingEvidence],
+    systematic: float,
+    before: RigEvidence | None = None,
 ) -> SavedCalibration:
     """The calibration of a rig from several recordings.
 
@@ -36,20 +40,20 @@ def joint_calibration(
         prior: of the parameters.
         evidence: of each recording, without any prior.
         systematic: error of rows and disparities that all frames of a recording may share [px].
+        before: of earlier recordings, as a saved calibration holds it.
 
     Raises:
         CalibrationError: there is no evidence at all.
     """
-    if not evidence:
-        raise CalibrationError("calibration: in no recording was there a motion that shows the rig's errors")
     variance = systematic_variance(model, systematic)
-    residual = residual_scale(np.sum([part.scales for part in evidence], axis=0))
+    parts = [*([] if before is None else [before]), *(RigEvidence.of(one, variance) for one in evidence)]
+    if not parts:
+        raise CalibrationError("calibration: in no recording was there a motion that shows the rig's errors")
+    total = reduce(add, parts)
+    residual = residual_scale(total.scales)
     # The scales of the prior follow from the evidence as it is: the systematic errors would excuse a bad calibration.
-    together, known = (
-        reduce(add, parts).with_error(0.0 * variance, field_variance(residual))
-        for parts in ([part.whole for part in evidence], [part.whole.with_error(variance) for part in evidence])
-    )
-    return SavedCalibration(solve(prior, together, known), rig_numbers(model.rig), residual)
+    together, known = (part.with_error(0.0 * variance, field_variance(residual)) for part in (total.plain, total.apart))
+    return SavedCalibration(solve(prior, together, known), rig_numbers(model.rig), residual, total)
 
 
 def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> Array | None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from slam.calibration.evidence import RigEvidence
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import RigPosterior
 from slam.calibration.prior import RESIDUAL_SCALES
@@ -54,11 +55,13 @@ class SavedCalibration:
         posterior: estimated corrections of the rig as calibrated.
         rig: numbers of the rig as calibrated, to recognise it, see `rig_numbers`.
         residual: scale of the errors that no parameter describes (see `slam.calibration.prior`).
+        evidence: of the recordings that it is of, to which that of later ones is added; None where none showed motion.
     """
 
     posterior: RigPosterior
     rig: Mapping[str, float]
     residual: float = 1.0
+    evidence: RigEvidence | None = None
 
     def __repr__(self) -> str:
         r = self.rig
@@ -76,7 +79,13 @@ class SavedCalibration:
 
     def to_json(self) -> dict[str, Any]:
         """As plain types."""
-        return {"rig": dict(self.rig), "residual_scale": self.residual, **self.posterior.to_json()}
+        evidence = None if self.evidence is None else self.evidence.to_text()
+        return {
+            "rig": dict(self.rig),
+            "residual_scale": self.residual,
+            **self.posterior.to_json(),
+            "evidence": evidence,
+        }
 
     @classmethod
     def from_json(cls, tree: Mapping[str, Any]) -> SavedCalibration:
@@ -90,6 +99,8 @@ class SavedCalibration:
             names = tuple(str(row["name"]) for row in rows)
             mean = np.array([row["mean"] for row in rows], float)
             covariance = np.array(tree["covariance"], float).reshape(len(rows), len(rows))
+            text = tree.get("evidence")
+            evidence = None if text is None else RigEvidence.from_text(text, len(rows))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
         try:
@@ -106,9 +117,9 @@ class SavedCalibration:
         symmetric = np.allclose(covariance, covariance.T, rtol=1e-6, atol=0)
         if not symmetric or np.linalg.eigvalsh(covariance).min() <= 0:
             raise CalibrationError("calibration: its covariance is none")
-        if not isinstance(residual, (int, float)) or not 0 <= residual <= RESIDUAL_SCALES[-1]:
+        if not isinstance(residual, (int, float)) or not 0 <= residual <= float(RESIDUAL_SCALES[-1]):
             raise CalibrationError(f"calibration: residual_scale must lie in 0..{RESIDUAL_SCALES[-1]:g}")
-        return cls(RigPosterior(mean, covariance), rig, float(residual))
+        return cls(RigPosterior(mean, covariance), rig, float(residual), evidence)
 
 
 def load_calibration(path: str | Path) -> SavedCalibration:

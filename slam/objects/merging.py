@@ -67,9 +67,7 @@ def _outgrow(bodies: dict[int, Body], body: Body, older: list[Body], tracks: Tra
             return
 
 
-def _told_apart(
-    body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks
-) -> Body:
+def _told_apart(body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks) -> Body:
     """A body that knows of another one, if their seen members have moved apart by now: they are never one again."""
     apart = membership.distinctness(body, mine, other, theirs, tracks) > _DISTINCT
     return replace(body, distinct=body.distinct | {other.id}) if apart else body

@@ -50,13 +50,12 @@ def test_a_body_out_of_view_is_reported_for_a_short_while_only(moving_box):
 @pytest.mark.slow
 def test_a_body_whose_covariance_has_run_away_is_not_reported_and_starts_anew(moving_box, monkeypatch):
     step, detector = moving_box
-    ids = {thing.id for k in range(EVEN, GONE - 10) for thing in step(k).objects}
+    ids = {thing.id for k in range(EVEN, GONE - 13) for thing in step(k).objects}
     with monkeypatch.context() as patch:
         patch.setattr(type(detector.setup.models), "known", lambda *_: False)
-        assert not step(GONE - 10).objects
+        assert not step(GONE - 13).objects
         assert all(body.belief is None for body in detector.bodies.values())
-    after = [step(k).objects for k in range(GONE - 9, GONE)]
-    # The largest one of a frame: a part of the box may be taken for a body of its own until its pose is known again.
-    after = [max(things, key=lambda thing: len(thing.features)) for things in after if things]
-    assert after and {thing.id for thing in after} <= ids
-    assert min(thing.found_at for thing in after) > 0
+    after = [step(k).objects for k in range(GONE - 12, GONE - 6)]
+    # Beside it a group may be found that goes on as the box does, while the body's pose is not known well again.
+    assert ids and all(ids <= {thing.id for thing in things} for things in after)
+    assert min(thing.found_at for things in after for thing in things) > 0
