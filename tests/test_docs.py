@@ -249,6 +249,7 @@ def reader_has(name):
     return {}
 
 
+@pytest.mark.slow
 @each_page
 def test_python_in_pages_runs(page, tmp_path, monkeypatch):
     name = page.relative_to(ROOT).as_posix()

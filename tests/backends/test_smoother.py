@@ -113,6 +113,7 @@ def test_what_removed_landmarks_have_told_stays_known():
     assert np.linalg.eigvalsh(backend.estimate().covariance - P).max() > 0
 
 
+@pytest.mark.slow
 def test_the_lag_bounds_what_is_kept_and_not_what_is_known():
     data = drive(120, points=600)
     full, lagged = (tracked(data, motion=0.0, **options) for options in ({"lag": None}, {"lag": 8, "past": 10}))

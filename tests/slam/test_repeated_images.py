@@ -61,6 +61,7 @@ def test_a_camera_that_stands_still_is_tracked_by_its_noise():
     assert {r.status for r in results[1:]} == {FrameStatus.TRACKED} and s.warnings == []
 
 
+@pytest.mark.slow
 def test_what_another_thread_has_read_ahead_is_not_taken_for_the_frame_before():
     frames = shown([0, 1, 2])
     s = system()

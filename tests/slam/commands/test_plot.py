@@ -30,6 +30,7 @@ def runs(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_runs_with_and_without_truth_are_drawn(runs, tmp_path, kind):
     shutil.copytree(runs / "a", tmp_path / "a")

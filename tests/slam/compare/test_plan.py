@@ -72,6 +72,7 @@ def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     assert command._seconds(plan.every, frames) is None
 
 
+@pytest.mark.slow
 def test_the_time_told_is_that_of_what_is_left_at_once(monkeypatch, tmp_path, capsys):
     """Two runs on eight workers take the time of one; a finished comparison tries nothing and tells no time."""
     tried, seconds = [], 40.0

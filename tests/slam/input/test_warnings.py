@@ -119,6 +119,7 @@ def test_a_frame_that_is_extracted_again_has_the_same_features():
     assert [extract(system.frontend, frozen).frame.right is None for _ in range(3)] == [True] * 3
 
 
+@pytest.mark.slow
 def test_right_images_that_slip_later_are_named():
     frames = list(slam.open_sequence("synthetic:desk?frames=80"))[::4]
     slipped = [replace(b, right=b.right if b.index < 24 else a.right) for a, b in pairwise(frames)]

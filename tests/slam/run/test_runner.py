@@ -57,6 +57,7 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_landmarks_that_have_left_the_map_are_kept_where_they_were(tmp_path):
     few = SystemConfig.for_kind("handheld").with_settings(["map.max_landmarks=80", "atlas.keyframe_distance=0.05"])
     run(open_sequence("synthetic:aisle?frames=30&speed=6"), RunOptions("ekf", "surf", few, tmp_path))

@@ -28,6 +28,7 @@ def test_without_a_display_one_line_says_what_to_do(monkeypatch):
         Viewer("live")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # Rerun's own
 def test_a_run_is_kept_for_rerun(tmp_path):
     pytest.importorskip("rerun")

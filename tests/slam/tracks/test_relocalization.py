@@ -80,6 +80,7 @@ def test_a_carried_camera_is_believed_when_three_frames_agree(backend):
     assert right_share(results, points) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_shaken_camera_with_sharp_images_is_tracked(backend):
     """Each frame is far beyond what the prediction allows, but most of what is in view agrees.

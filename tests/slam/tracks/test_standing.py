@@ -107,6 +107,7 @@ def test_a_truck_that_passes_does_not_take_the_camera_along(backend):
     assert farthest < 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_what_fills_the_view_of_a_standing_vehicle_does_not_take_it_along(backend):
     """It hides all for three seconds, so that a new map begins on it; then the old view is recognised."""
