@@ -117,8 +117,8 @@ def quiet_libraries() -> Iterator[None]:
     import cv2
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    logging = cv2.utils.logging
-    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    logging = getattr(cv2.utils, "logging", cv2)  # before OpenCV 5, the functions are in `cv2` itself
+    before = logging.setLogLevel(0)  # 0: silent
     try:
         yield
     finally:
