@@ -25,7 +25,6 @@ PICTURES = {
 }
 WIDE = ("people", "street", "town")  #: worlds whose images are wide
 HEIGHT = 300  #: of a frame in a picture [px]
-FAULTS = ("black=0", "bright=0", "blur=0", "burst=0", "hand=0", "shutter=1")
 
 
 def main() -> None:
@@ -37,7 +36,6 @@ def main() -> None:
     save("rigs", [shown(image) for frame in rigs for image in (frame.left, frame.right)])
     sequence = large("boxes", "")
     save("truth", [shown(sequence.frame(200).left), depth_picture(sequence, 200), object_picture(sequence, 200)])
-    save("faults", [shown(large("aisle", f"{fault}&speed=3").frame(0).left, 200) for fault in FAULTS])
 
 
 def large(name: str, query: str) -> WorldSequence:

@@ -53,7 +53,7 @@ def open_world(text: str) -> WorldSequence:
     if share != 1 or turn != 0:  # the cameras that record are others than the system is told
         left, right = (replace(c, fu=share * c.fu, fv=share * c.fv) for c in (told.left, told.right))
         true = StereoRig(left, right, so3_exp(np.full(3, turn)) @ told.R, told.b)
-        recorded = replace(world, rig=true, seen={})
+        recorded = replace(world, rig=true)
     return WorldSequence(text, recorded, values, told)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,6 @@ FACING = 0.25
 
 _MARGIN = 2.0  # no feature so near to the image's border [px]
 _SMALLEST = 9.0  # no feature is smaller: SURF's first filter [px]
-_KEPT = 20_000  # frames whose visible landmarks are kept; fewer in a world of many landmarks
-_USUAL = 2000  # landmarks of a world that is small enough for that
 _VISIT = 60.0  # landmarks that change do so after as long a time [s]
 _POOL = 4096  # errors of descriptors that are drawn beforehand
 _COMMON = 1.2  # what all descriptors have in common, over what is each one's own
@@ -39,15 +37,12 @@ class SimulatedFeatures:
     objects: IdArray  # object of each feature (N,), 0 for the still world, −1 for false features
     false_stereo: BoolArray  # true features whose right pixel is false (N,)
 
-    def select(self, keep: BoolArray, noise: Array, stereo: bool) -> SimulatedFeatures:
-        """Some of the features, with `noise` (N, 3) [px] added to uL, vL and uR; without `stereo` no right pixels."""
-        f = self.features
-        right = f.uv_right[keep] + noise[keep][:, [2, 1]] if stereo else np.full((int(keep.sum()), 2), np.nan)
-        features = StereoFeatures(
-            f.stamp, f.uv_left[keep] + noise[keep, :2], right, f.scale[keep], f.angle[keep], f.response[keep],
-            f.laplacian[keep], f.descriptors[keep], f.threshold,
-        )  # fmt: skip
-        return SimulatedFeatures(features, self.ids[keep], self.objects[keep], self.false_stereo[keep])
+    def without(self, all_rows: bool, right: bool) -> SimulatedFeatures:
+        """What is left in a frame that shows nothing, or that has no `right` image."""
+        keep, features = slice(0 if all_rows else None), self.features
+        if right:
+            features = replace(features, uv_right=np.full_like(features.uv_right, np.nan))
+        return SimulatedFeatures(features.select(keep), self.ids[keep], self.objects[keep], self.false_stereo[keep])
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +55,6 @@ class VisibleLandmarks:
     uv_right: Array  # right pixels (M, 2), NaN where the right camera does not see it
     in_right: BoolArray  # whether it does (M,)
     size: Array  # diameters in the left image (M,) [px]
-
-
-def seen_landmarks(world: World, frame: int) -> VisibleLandmarks:
-    """`visible_landmarks`, kept with the world: the next recording of it sees the same."""
-    found: VisibleLandmarks | None = world.seen.get(frame)
-    if found is None:
-        if len(world.seen) >= _KEPT // max(1, len(world.landmarks) // _USUAL):
-            world.seen.clear()
-        found = world.seen[frame] = visible_landmarks(world, frame)
-    return found
 
 
 def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
@@ -129,7 +114,7 @@ def simulate(
     The noise is isotropic on uL, vL and uR; vR follows from the epipolar geometry of the three, so that the noisy
     rays meet. A feature that noise takes out of the left image is not detected.
     """
-    rig, seen = world.rig, seen_landmarks(world, frame)
+    rig, seen = world.rig, visible_landmarks(world, frame)
     chance = rng.random((len(seen.ids), 3))
     rows = np.flatnonzero(chance[:, 0] < values["detect"])
     matched = seen.in_right[rows] & (chance[rows, 1] < values["stereo"])

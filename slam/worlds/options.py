@@ -11,10 +11,8 @@ import numpy as np
 
 from slam.data import BoolArray
 from slam.errors import ConfigurationError
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.naming import suggestion
-from slam.worlds.observe import SimulatedFeatures
 
 
 @dataclass(frozen=True)
@@ -98,10 +96,6 @@ FAULTS = (
     Option("drop", "", "frames that are missing from the recording"),
     Option("dropright", "", "frames without a right image"),
     Option("black", "", "black frames"),
-    Option("bright", "", "over-exposed frames"),
-    Option("blur", "", "blurred frames"),
-    Option("burst", "", "frames with eight times the noise"),
-    Option("hand", "", "frames with a hand before the lens"),
     Option("jump", "", "FRAME:SECONDS: the clock jumps ahead before this frame"),
 )
 
@@ -163,32 +157,6 @@ class Faults:
             delay[start:] += by
         return cls(chosen, delay)
 
-    def of_frame(self, frame: int) -> set[str]:
-        """What a frame suffers from."""
-        return {name for name, suffers in self.frames.items() if suffers[frame]}
-
-    def spoil(self, frame: int, seen: SimulatedFeatures, rig: StereoRig, rng: np.random.Generator) -> SimulatedFeatures:
-        """What is left of a frame's features under its faults.
-
-        Black and over-exposed frames show nothing, a hand hides a part, blur leaves a third, which are three times as
-        noisy; bursts of noise double the noise.
-        """
-        faults = self.of_frame(frame)
-        if not faults:
-            return seen
-        keep = np.full(len(seen.ids), not faults & {"black", "bright"})
-        if "hand" in faults:
-            keep &= ~in_hand(seen.features.uv_left, rig.width, rig.height)
-        if "blur" in faults:
-            keep &= rng.random(len(keep)) < 1 / 3
-        noise = 3.0 if "blur" in faults else 1.7 if "burst" in faults else 0.0
-        return seen.select(keep, noise * rng.standard_normal((len(keep), 3)), "dropright" not in faults)
-
-
-def in_hand(uv: Array, width: int, height: int) -> BoolArray:
-    """Which pixels (N, 2) a hand before the lens covers: it comes in from below on the right."""
-    x, y = uv[:, 0] / width, uv[:, 1] / height
-    return (x - 0.75) ** 2 / 0.4**2 + (y - 0.9) ** 2 / 0.6**2 < 1
 
 
 def _frames(name: str, text: str, frames: int, rng: np.random.Generator) -> BoolArray:

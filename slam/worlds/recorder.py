@@ -14,7 +14,7 @@ import numpy as np
 from slam.data import StereoFrame
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, exp, inverse, log
-from slam.worlds.options import Faults, in_hand
+from slam.worlds.options import Faults
 from slam.worlds.painting import paint
 from slam.worlds.raster import NEAR, Ripmap, View, draw, place
 from slam.worlds.world import World
@@ -52,7 +52,7 @@ class Recorder:
         else:
             image = self._picture(frame, lens, T_left_camera, 0.0)
         rng = np.random.default_rng([self._values["seed"], frame, stream])
-        return sense(image, self._values, self._faults.of_frame(frame), rng)
+        return sense(image, self._values, self._faults.frames["black"][frame], rng)
 
     def _picture(self, frame: int, lens: Lens, T_left_camera: Array, ahead: float) -> np.ndarray:
         """One camera's light, `ahead` of the frame's time by a share of a frame."""
@@ -156,23 +156,17 @@ def truth_images(world: World, frame: int) -> TruthImages:
         return TruthImages(np.where(nearness > 0, 1 / nearness, 0.0).astype(np.float32), objects)
 
 
-def sense(image: np.ndarray, values: Mapping[str, Any], faults: set[str], rng: np.random.Generator) -> np.ndarray:
-    """The image that the camera gives, uint8, by the values of the options and the frame's faults."""
-    if "hand" in faults:
-        image = _cover(image)
-    if "blur" in faults:
-        image = cv2.GaussianBlur(image, (0, 0), image.shape[1] / 80)
-    elif values["lens"] > 0.05:
+def sense(image: np.ndarray, values: Mapping[str, Any], black: bool, rng: np.random.Generator) -> np.ndarray:
+    """The image that the camera gives, uint8, by the values of the options; nothing but noise in a `black` frame."""
+    if values["lens"] > 0.05:
         image = cv2.GaussianBlur(image, (0, 0), values["lens"])
-    gain = 0.0 if "black" in faults else 12.0 if "bright" in faults else 1.0
-    light = _shading(values["vignetting"], image.shape[1], image.shape[0]) * np.float32(gain)
+    light = _shading(values["vignetting"], image.shape[1], image.shape[0]) * np.float32(not black)
     out = cv2.multiply(image, light if image.ndim == 2 else cv2.merge([light] * 3), dtype=cv2.CV_32F)
-    noise = values["noise"] * (8.0 if "burst" in faults else 1.0)
-    if noise > 0:
+    if values["noise"] > 0:
         # Each number is the sum of two drawn from 256 quantiles of the normal law: a tenth of the time of exact ones.
         drawn = cv2.LUT(rng.integers(0, 256, 2 * image.size, np.uint8).reshape(-1, 1), _quantiles())
         first, second = drawn.reshape(2, *image.shape)
-        cv2.scaleAdd(cv2.add(first, second), noise, out, dst=out)
+        cv2.scaleAdd(cv2.add(first, second), values["noise"], out, dst=out)
     return cv2.convertScaleAbs(cv2.max(out, 0.0))  # to the nearest grey level
 
 
@@ -189,14 +183,3 @@ def _quantiles() -> np.ndarray:
     """Middles of 256 equally likely parts of the normal law, with variance ½ (256,) float32."""
     values = np.array([NormalDist().inv_cdf((i + 0.5) / 256) for i in range(256)])
     return (values / (values.std() * np.sqrt(2))).astype(np.float32)
-
-
-def _cover(image: np.ndarray) -> np.ndarray:
-    """The image with a hand before the lens: near, dark, out of focus."""
-    height, width = image.shape[:2]
-    y, x = np.mgrid[:height, :width]
-    inside = in_hand(np.stack([x.ravel(), y.ravel()], axis=1), width, height).reshape(height, width)
-    weight = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), width / 40)
-    skin = np.float32(55) if image.ndim == 2 else np.array([45, 55, 80], np.float32)
-    weight = weight if image.ndim == 2 else weight[..., None]
-    return (image * (1 - weight) + skin * weight).astype(np.uint8)

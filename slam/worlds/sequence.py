@@ -132,7 +132,8 @@ class WorldSequence:
         source = self.source(k)
         rng = np.random.default_rng([self.values["seed"], source, 1])
         seen = simulate(self.world, self._looks, self.values, source, float(self.stamps[int(k)]), rng)
-        return self.faults.spoil(source, seen, self.rig, rng)
+        faults = self.faults.frames
+        return seen.without(all_rows=faults["black"][source], right=faults["dropright"][source])
 
     @cached_property
     def _looks(self) -> Appearance:

@@ -29,7 +29,6 @@ class World:
     reach: tuple[float, float]  # nearest and farthest distance at which a landmark can be detected [m]
     texels: float  # per metre, at which the surfaces are painted
     painted: dict[Any, Any] = field(default_factory=dict, repr=False)  # textures painted so far, by the recorder
-    seen: dict[int, Any] = field(default_factory=dict, repr=False)  # visible landmarks of frames, by the simulator
 
     def __len__(self) -> int:
         return len(self.stamps)

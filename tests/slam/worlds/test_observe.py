@@ -101,10 +101,8 @@ def test_only_what_the_camera_sees_is_visible():
 
 
 def test_faults_take_features_away():
-    sequence = open_world("aisle?black=3&dropright=4&hand=5&blur=6&bright=7")
-    counts = [len(sequence.observations(k)) for k in range(8)]
-    assert counts[3] == counts[7] == 0
+    sequence = open_world("aisle?black=3&dropright=4")
+    counts = [len(sequence.observations(k)) for k in range(5)]
+    assert counts[3] == 0 < counts[4]
     assert not sequence.observations(4).has_stereo.any()
-    assert 0.3 * counts[2] < counts[5] < 0.95 * counts[2]
-    assert counts[6] < 0.6 * counts[2]
     assert len(sequence.observations(3).descriptors) == 0

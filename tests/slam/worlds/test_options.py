@@ -41,10 +41,10 @@ def test_frames_outside_the_recording_are_refused():
 
 
 def test_faults_by_number_range_and_chance():
-    sequence = worlds.open_world("box?frames=200&black=3,10:12&blur=0.1&drop=20:30&jump=50:2.0")
+    sequence = worlds.open_world("box?frames=200&black=3,10:12&dropright=0.1&drop=20:30&jump=50:2.0")
     faults = sequence.faults
     assert np.flatnonzero(faults.frames["black"]).tolist() == [3, 10, 11]
-    assert 5 < faults.frames["blur"].sum() < 40  # 20 expected of 200, far beyond five deviations either way
+    assert 5 < faults.frames["dropright"].sum() < 40  # 20 expected of 200, far beyond five deviations either way
     assert len(sequence) == 190
     gaps = np.full(189, 1 / 30)
     gaps[[19, 39]] += 10 / 30, 2.0

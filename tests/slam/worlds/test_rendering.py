@@ -131,16 +131,9 @@ def test_no_pixel_of_a_room_is_without_a_surface():
 
 
 def test_faults_in_images():
-    query = "box?frames=12&black=1&bright=2&blur=3&burst=4&hand=5&dropright=6"
-    frames = list(open_world(query))
-    images = [frame.left.astype(float) for frame in frames]
-    assert images[1].mean() < 4
-    assert images[2].mean() > 230
-    sharpness = [cv2.Laplacian(frame.left, cv2.CV_64F).std() for frame in frames]
-    assert sharpness[3] < 0.7 * sharpness[0]
-    assert np.std(images[4] - images[7]) > 3 * np.std(images[8] - images[7])
-    assert images[5][180:, 200:280].std() < 0.3 * images[0][180:, 200:280].std(), "the hand is out of focus"
-    assert frames[6].right is None and frames[5].right is not None
+    frames = list(open_world("box?frames=4&black=1&dropright=2"))
+    assert frames[1].left.mean() < 4 < frames[0].left.mean()
+    assert frames[2].right is None and frames[1].right is not None
 
 
 def test_options_of_the_camera():
