@@ -8,10 +8,12 @@ import sys
 import numpy as np
 import pytest
 
+import frontends
 from frontends.surf import SurfFrontend
 from slam.data import StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
+from slam.interfaces import Frontend
 from tests.frontends.scenes import stereo_pair
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
@@ -28,7 +30,9 @@ def bytes_of(features):
 
 
 def test_fields():
-    features = SurfFrontend(RIG, features=150).extract(StereoFrame(3, 1.5, LEFT, RIGHT))
+    frontend = frontends.create("surf", RIG, features=150)
+    features = frontend.extract(StereoFrame(3, 1.5, LEFT, RIGHT))
+    assert isinstance(frontend, Frontend)
     assert features.stamp == 1.5
     assert 100 < len(features) <= 150
     assert features.descriptors.shape == (len(features), 64)
@@ -39,7 +43,11 @@ def test_fields():
     assert (features.angle == 0).all()
     assert (np.diff(features.response) <= 0).all()
     assert features.response.min() > 0.5 * features.threshold
-    assert np.isfinite(features.uv_left).all()
+    assert RIG.left.in_image(features.uv_left).all()
+    assert RIG.right.in_image(features.uv_right[features.has_stereo]).all()
+    points = RIG.triangulate(features.uv_left, features.uv_right)[features.has_stereo]
+    assert len(points) > 30
+    assert np.median(points[:, 2]) == pytest.approx(260 * 0.12 / 12.0, rel=0.02), "they are on the wall"
     assert np.isnan(features.uv_right).any(axis=1).tolist() == np.isnan(features.uv_right).all(axis=1).tolist()
 
 
@@ -54,10 +62,14 @@ def test_same_bytes_whatever_the_threads(options):
 
 def test_nothing_to_see():
     frontend = SurfFrontend(RIG)
-    assert len(frontend.extract(StereoFrame(0, 0.0, BLACK, BLACK))) == 0
+    for right in (None, RIGHT, BLACK):
+        features = frontend.extract(StereoFrame(0, 0.0, BLACK, right))
+        assert len(features) == 0 and features.descriptors.ndim == 2
     # The next image does not suffer from it: D_threshold is found again at once.
     assert len(frontend.extract(StereoFrame(1, 0.1, LEFT, RIGHT))) > 100
-    assert not SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, BLACK)).has_stereo.any()
+    for right in (None, BLACK):
+        features = SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, right))
+        assert len(features) > 50 and not features.has_stereo.any()
 
 
 def test_colour_and_16_bit():
@@ -141,7 +153,10 @@ def test_unusable_images(left, right, says):
         ({"features": 0}, "surf: features "),
         ({"features": 10.5}, "surf: features "),
         ({"features": "many"}, "surf: features "),
+        ({"threshold": -1}, "surf: threshold "),
         ({"threshold": float("nan")}, "surf: threshold "),
+        ({"octaves": 0}, "surf: octaves "),
+        ({"layers": 4}, "surf: layers "),
         ({"descriptor": 32}, "surf: descriptor must be 16 or 64"),
         ({"upright": 1.0}, "surf: upright "),
         ({"min_depth": 5, "max_depth": 2}, "surf: min_depth "),

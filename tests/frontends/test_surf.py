@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from frontends.surf import Surf
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import SequenceError
 from tests.frontends.scenes import photograph, texture, warped, zoom_about
 
 VALUES = texture(240, 320)
@@ -185,19 +185,3 @@ def test_unusable_images(image, says):
         Surf().detect(image)
     with pytest.raises(SequenceError, match="mask: shape"):
         Surf().detect(IMAGE, np.ones((3, 3)))
-
-
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        ({"threshold": -1}, "threshold"),
-        ({"threshold": float("nan")}, "threshold"),
-        ({"octaves": 0}, "octaves"),
-        ({"layers": 4}, "layers"),
-        ({"descriptor": 128}, "descriptor"),
-        ({"threads": 0}, "threads"),
-    ],
-)
-def test_bad_settings_name_their_key(options, key):
-    with pytest.raises(ConfigurationError, match=f"^surf: {key} "):
-        Surf(**options)
