@@ -78,7 +78,9 @@ class SurfFrontend:
         views = self._surf.workers.run([partial(self._view, image, k, white, len(given) > 1)
                                         for k, image in enumerate(given)])  # fmt: skip
         left = views[0].picture
-        keypoints, threshold = self._keypoints(left)
+        keypoints, threshold = self._detect(left)
+        keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
+        keypoints = self._spread(self._surf.localise(left, keypoints), self.config.features)
         keypoints, descriptors = self._surf.describe(left, keypoints)
         images = ImagePair(views[0].pixels, None if frame.right is None else views[1].pixels)
         uv, size = keypoints.uv, keypoints.size
@@ -157,13 +159,6 @@ class SurfFrontend:
             if 2 * len(keypoints) >= target or self._threshold >= threshold:
                 break
         return keypoints, threshold
-
-    def _keypoints(self, picture: Picture) -> tuple[Keypoints, float]:
-        """Features of the left image, spread over it, and the D_threshold that found them."""
-        keypoints, threshold = self._detect(picture)
-        keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
-        keypoints = self._surf.localise(picture, keypoints)
-        return self._spread(keypoints, self.config.features), threshold
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:
         """At most `limit` features, spread over the image."""

@@ -25,15 +25,11 @@ class Picture:
     white: float  # grey value that counts as white
 
     @classmethod
-    def of(cls, image: NDArray | Picture, what: str = "image") -> Picture:
-        """From an image in grey, BGR or BGRA of any layout.
-
-        Raises:
-            SequenceError: not an array (H, W), (H, W, 3|4), uint8 or uint16; the line begins with `what`.
-        """
+    def of(cls, image: NDArray | Picture) -> Picture:
+        """From an image that `grey` takes, or as it is."""
         if isinstance(image, Picture):
             return image
-        pixels = grey(image, what)
+        pixels = grey(image)
         return cls(pixels, _FULL_SCALE[pixels.dtype])
 
     @cached_property
@@ -43,7 +39,11 @@ class Picture:
 
 
 def grey(image: NDArray, what: str = "image") -> NDArray:
-    """A grey image (H, W), C-contiguous and writeable, see `Picture.of`."""
+    """A grey image (H, W), C-contiguous and writeable, from one in grey, BGR or BGRA of any layout.
+
+    Raises:
+        SequenceError: not an array (H, W), (H, W, 3|4), uint8 or uint16; the line begins with `what`.
+    """
     image = np.asarray(image)
     if image.dtype.newbyteorder("=") not in _FULL_SCALE:
         raise SequenceError(f"{what}: pixels must be uint8 or uint16, not {image.dtype}")
