@@ -39,7 +39,7 @@ class SimulatedFeatures:
 
     def without(self, all_rows: bool, right: bool) -> SimulatedFeatures:
         """What is left in a frame that shows nothing, or that has no `right` image."""
-        keep, features = slice(0 if all_rows else None), self.features
+        keep, features = np.arange(0 if all_rows else len(self.ids)), self.features
         if right:
             features = replace(features, uv_right=np.full_like(features.uv_right, np.nan))
         return SimulatedFeatures(features.select(keep), self.ids[keep], self.objects[keep], self.false_stereo[keep])

@@ -158,7 +158,6 @@ class Faults:
         return cls(chosen, delay)
 
 
-
 def _frames(name: str, text: str, frames: int, rng: np.random.Generator) -> BoolArray:
     """Which frames a text such as ``0.02``, ``17`` or ``100:110,200`` means."""
     out = np.zeros(frames, bool)
