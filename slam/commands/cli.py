@@ -248,7 +248,6 @@ def compare_command(
     frames: _Frames = None,
     replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
-    scheduler: Annotated[_Text, option("A Dask scheduler to be used.", "ADDRESS")] = None,
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
@@ -264,7 +263,7 @@ def compare_command(
     variants = command.variants_of(names[1], variant or [], settings or [])
     plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
     with leaving("trials done so far are kept: the same command continues"):
-        command.compare(plan, out, workers, scheduler, quiet, overwrite, command_line())
+        command.compare(plan, out, workers, quiet, overwrite, command_line())
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")

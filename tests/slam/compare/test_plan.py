@@ -54,10 +54,10 @@ def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     """It was told by a time of a frame from another machine."""
     tried = []
 
-    def run_trial(trial):
+    def run_trial(trial, folder):
         tried.append(trial)
         times = {"outcome": outcome, "milliseconds": {"total": 100.0, "read": 60.0, "extract": 20.0}}
-        return {"result.json": json.dumps(times)}
+        (folder / "result.json").write_text(json.dumps(times))
 
     outcome = "completed"
     monkeypatch.setattr(command, "run_trial", run_trial)
