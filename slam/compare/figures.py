@@ -52,8 +52,6 @@ def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
             "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
         )
         yield "NEES over time", text, _nees(group)
-    text = f"Time per frame by stage{of_seed}, one thread; it depends on the machine."
-    yield "Time per stage", text, _svg(drawn(runs, "time", _WIDTH)[0])
 
 
 def _example(group: Group) -> dict[str, Run]:

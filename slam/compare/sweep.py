@@ -32,7 +32,7 @@ from slam.sequences.faults import said_before
 RUNS, SWEEP = "runs", "sweep.json"
 
 #: What a comparison leaves in its folder.
-NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "timings.csv", "report.html")
+NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "report.html")
 
 
 @dataclass(frozen=True)

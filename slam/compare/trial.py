@@ -204,7 +204,6 @@ class MapRecord:
             "association_precision": np.mean(self._right) if self._right else None,
             "map_size": np.mean(self._sizes) if self._sizes else None,
             "landmark_error_m": np.median(errors) if len(errors) else None,
-            "landmark_error_90_m": np.quantile(errors, 0.9) if len(errors) else None,
         }
         return {key: float(value) for key, value in found.items() if value is not None}
 
