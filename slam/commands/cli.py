@@ -215,14 +215,12 @@ def plot_command(
     folders: Annotated[list[Path], argument("Left by `slam run`.", "DIR")],
     out: Annotated[_File, option("PNG, PDF or SVG; default: a PNG in the first folder.", "FILE", "--out", "-o")] = None,
     figure: Annotated[str, option("summary, path, map, errors or time.", "NAME")] = "summary",
-    width: Annotated[float | None, option("Width of the picture, such as 88 for a journal's column.", "MM")] = None,
     overwrite: _Overwrite = False,
 ) -> None:
-    """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
+    """Draw finished runs, those of one sequence in one picture: path, map, errors, time per stage."""
     from slam.run.plots import plot_folders
 
-    file, caption = plot_folders(folders, out, figure, width, overwrite)
-    print(f"{file}: {caption}")
+    print(f"Files: {plot_folders(folders, out, figure, overwrite)}")
 
 
 @app.command("settings", short_help="List all settings.")

@@ -43,10 +43,10 @@ def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
     if "ate_online_m" in known and group.trials > 1:
         label = BY_KEY["ate_online_m"].label
         yield label, f"{label}, of every trial; lines join the back ends' runs on the same recording.", _pairs(group)
-    yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path", _WIDTH)[0])
+    yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path"))
     if "nees_per_dof" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
-        yield "Error over time", text, _svg(drawn(runs, "errors", _WIDTH)[0])
+        yield "Error over time", text, _svg(drawn(runs, "errors"))
         text = (
             "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
             "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."

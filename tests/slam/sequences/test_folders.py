@@ -196,7 +196,7 @@ def test_a_wrong_option_is_said_before_anything_of_the_files(
     with pytest.raises(ConfigurationError):
         open_sequence(f"{two_folders}?{query}")
     assert caplog.records == []
-    assert "1 images are missing between the first and the last" in open_sequence(two_folders).warnings[0]
+    assert "1 image missing between the first and the last" in open_sequence(two_folders).warnings[0]
     assert "have no partner" in caplog.text
 
 
