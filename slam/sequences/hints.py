@@ -45,9 +45,7 @@ def sequences_near(folder: Path, format_of: Format) -> str:
         if (name := _format(parent, format_of)) is not None:
             return f"; it is a part of one: give {parent} (format {name})"
     if any(path.suffix.lower() in IMAGE_SUFFIXES for path in _inside(folder)):
-        return (
-            f"; of images with both cameras side by side: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"
-        )
+        return f"; where each image holds both cameras: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"
     return f"; where two cameras are in it by other names: '{folder.name}?left=…&right=…'"
 
 

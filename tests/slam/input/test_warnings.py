@@ -266,7 +266,7 @@ def distorted():
 
 
 def alike():
-    """Cameras side by side with one and the same lens: most rows agree to a pixel all the same, those at the edges not."""
+    """Cameras with one and the same lens: most rows agree to a pixel all the same, those at the edges do not."""
     lens = PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240, "radtan", (-0.37, 0.2, 0.0, 0.0))
     return slam.StereoRig(lens, lens, np.eye(3), np.array([-0.12, 0.0, 0.0]))
 
