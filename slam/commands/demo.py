@@ -28,6 +28,7 @@ focal length, the right one turned by 0.7 mrad. Covariances count such errors;
 with exact cameras they would be too large."""
 
 _FRAME = "frame.png"
+_SECONDS = 0.07  # of a frame, about
 
 
 def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -> list[dict[str, Any]]:
@@ -43,6 +44,11 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
     sequence = open_sequence(_WORLD.format(frames))
     sequence.keep_images()  # type: ignore[attr-defined]
+    if not quiet:
+        seconds = _SECONDS * len(ONLINE) * frames
+        print(
+            f"{len(ONLINE)} runs of {frames} frames: about {seconds:.0f} s on two idle cores, 40 s more the first time"
+        )
     with compiling(quiet):
         compile_kernels(ONLINE[-1])
     for backend in ONLINE:

@@ -84,9 +84,10 @@ class Viewer:
             self.log(place, self._transform(moving.estimate.T_world_object))
             boxes = rr.Boxes3D(centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=_MOVING)
             self.log(f"{place}/box", boxes)
-        at, loops = system.atlas.poses_in_map[:, :3, 3], [(loop.first, loop.second) for loop in system.atlas.loops]
+        loops = [(loop.first, loop.second) for loop in system.atlas.loops]
         if loops and result.keyframe:
-            self.log("/loops", rr.LineStrips3D(at[np.array(loops)], colors=_CLOSED))
+            ends = system.atlas.poses_in_map[np.array(loops), :3, 3]
+            self.log("/loops", rr.LineStrips3D(ends, colors=_CLOSED))
         if result.index % _MAP_EVERY == 0:
             whole = system.estimate()
             self.show_map(whole.positions, whole.covariances, np.isin(whole.ids, result.matched))
