@@ -137,7 +137,7 @@ def run_command(
     quiet: _Quiet = False,
 ) -> None:
     """Run one sequence through one back end."""
-    from slam.commands.display import compiling, progress
+    from slam.commands.display import progress
     from slam.commands.run import finish, frame_count, prepare, run_folder, title, watches
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
@@ -166,7 +166,7 @@ def run_command(
         require_outputs(written, [*inputs, *options.inputs], overwrite)
         gathered = RunRecord()  # its time of compiling begins here
         if options.config.objects.mode != "off":
-            with compiling(quiet):
+            with progress(None, "", quiet):
                 compile_kernels(options.backend, options.frontend)
         seen = watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
@@ -339,11 +339,11 @@ def list_command(
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
 def warm_up_command(quiet: _Quiet = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
-    from slam.commands.display import compiling
+    from slam.commands.display import progress
     from slam.run.warm_up import compile_kernels, warm_up
     from slam.runtime.compile_clock import compile_clock
 
-    with compiling(quiet):
+    with progress(None, "", quiet):
         compile_kernels(ONLINE[-1])
         warm_up()
     seconds = compile_clock.seconds()

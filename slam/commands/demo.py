@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from slam.commands.display import compiling, print_summary, progress
+from slam.commands.display import print_summary, progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.files import write_png
@@ -49,7 +49,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
         print(
             f"{len(ONLINE)} runs of {frames} frames: about {seconds:.0f} s on two idle cores, 40 s more the first time"
         )
-    with compiling(quiet):
+    with progress(None, "", quiet):
         compile_kernels(ONLINE[-1])
     for backend in ONLINE:
         config = SystemConfig.for_kind(sequence.kind, "surf", backend)

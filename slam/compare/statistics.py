@@ -140,11 +140,6 @@ def fewest(tests: int) -> int:
     return int(np.ceil(np.log2(2 * max(tests, 1) / ALPHA)))
 
 
-def certain_of(trials: int) -> int:
-    """The most tests of which one can be certain with so many trials, see `fewest`."""
-    return int(ALPHA * 2 ** min(trials - 1, 60))
-
-
 #: Values from which on a mean has a confidence interval.
 FEWEST = fewest(1)
 
