@@ -23,7 +23,6 @@ from experiments.common import script_options
 from experiments.tables import picture, show
 from frontends.surf import Surf
 from slam.compare.plan import Plan, Variant
-from slam.compare.scheduler import LocalScheduler
 from slam.compare.statistics import difference
 from slam.compare.sweep import sweep
 from slam.compare.wording import shown_p
@@ -53,7 +52,7 @@ def known_points(frames: int, seeds: int, out: Path) -> tuple[list[list[str]], d
     rows, errors = [], {}
     plan = Plan(tuple(w.format(frames) for w in WORLDS), ("ekf",), VARIANTS, seeds, replay=False)
     shutil.rmtree(out / "runs", ignore_errors=True)  # those of another form or version
-    runs = sweep(plan, out / "runs", LocalScheduler(available_cores()))
+    runs = sweep(plan, out / "runs", available_cores())
     for world in plan.sequences:
         own = [[r for r in runs if (r.trial.sequence, r.trial.variant) == (world, v)] for v in plan.variants]
         for metric in map(BY_KEY.__getitem__, FIGURES):

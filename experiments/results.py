@@ -67,7 +67,7 @@ PAGES = {
     "faults": ("Faults", "What do blackouts, lost frames, a kidnapped camera, and spoilt images do?"),
     "cost": ("Cost", "What does a frame cost, next to others, and how does that grow?"),
 }
-ERRORS = "Error of the position along the world's axes, and three times its claimed standard deviation."
+ERRORS = "Error of the online pose (solid), and the standard deviation that is claimed (dashed)."
 EXPERIMENTS = (
     Experiment(
         "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}

@@ -18,7 +18,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from experiments.common import script_options
 from experiments.tables import show
 from slam.compare.plan import Plan
-from slam.compare.scheduler import LocalScheduler
 from slam.compare.sweep import Run, sweep
 from slam.registry import ONLINE
 from slam.run.plots import plot
@@ -52,7 +51,7 @@ def main() -> int:
     stop = 20 if arguments.quick else None
     plan = Plan(("synthetic:field",), ONLINE, stop=stop, replay=False)
     shutil.rmtree(arguments.out / "runs", ignore_errors=True)  # those of another form or version
-    runs = sweep(plan, arguments.out / "runs", LocalScheduler(available_cores()))
+    runs = sweep(plan, arguments.out / "runs", available_cores())
     show(arguments.out / "table.json", HEADER, [row(run) for run in runs])
     data = [RunData.read(run.folder, run.trial.backend) for run in runs if run.completed]
     plot(data, arguments.out / "errors.png", "errors")

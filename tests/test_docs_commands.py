@@ -24,8 +24,6 @@ FEW = 4  # frames
 SHELLS = ("sh", "shell", "bash")  # consoles have tests of their own
 #: First words of what installs, tests or builds the package itself: `.ci/run` does all of it.
 OF_THE_PACKAGE = {"pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "python3", ".", ".ci/run"}
-#: They end by a signal only.
-SERVERS = {"dask"}
 #: A camera, recordings of ROS, and timings.
 NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchmarks/|^experiments/cost\.py$")
 #: What the page shows, and what is run in its place.
@@ -35,8 +33,8 @@ STAND_INS = {
     "path/to/drive_2": "synthetic:street?layout=1",
     "truth.txt": "mine_ekf/trajectory.txt",
 }
-#: Options that get another value, or (None) are left out with theirs.
-SHORTER = {"--trials": "1", "--seeds": "1", "--scheduler": None}
+#: Options that get another value.
+SHORTER = {"--trials": "1", "--seeds": "1"}
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +121,7 @@ def test_commands_run(page, reader, slam_command, tmp_path, monkeypatch):
         (code,) = [block for block in blocks(page, "python") if "ObjectDatabase" in block]
         exec(compile(code, page.name, "exec", dont_inherit=True), {})
     for words in commands(page, *SHELLS):
-        if words[0] in OF_THE_PACKAGE | SERVERS or words[:3] == ["python", "-m", "tests.fuzz"]:
+        if words[0] in OF_THE_PACKAGE or words[:3] == ["python", "-m", "tests.fuzz"]:
             continue  # hostile input has tests of its own
         if any(NOT_AT_HAND.search(word) for word in words):
             continue  # tests/slam/sequences plays the device and writes such recordings; benchmarks take minutes

@@ -65,7 +65,7 @@ def _print(done: Calibrated) -> None:
     if not console.is_terminal:  # a file or a pipe is not 80 columns wide
         console = Console(width=_NARROW + _COLUMN * (1 + len(done.found)))
     fits = _NARROW + _COLUMN * len(done.found) <= console.width
-    shown = done.found if fits else ()
+    shown = done.found if fits and len(done.found) > 1 else ()  # of a single one, all is that
     table = Table(title="corrections: mean ± standard deviation", show_lines=False)
     table.add_column("parameter")
     table.add_column("unit")

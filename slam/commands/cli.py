@@ -137,7 +137,7 @@ def run_command(
     quiet: _Quiet = False,
 ) -> None:
     """Run one sequence through one back end."""
-    from slam.commands.display import compiling, progress
+    from slam.commands.display import progress
     from slam.commands.run import finish, frame_count, prepare, run_folder, title, watches
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
@@ -166,7 +166,7 @@ def run_command(
         require_outputs(written, [*inputs, *options.inputs], overwrite)
         gathered = RunRecord()  # its time of compiling begins here
         if options.config.objects.mode != "off":
-            with compiling(quiet):
+            with progress(None, "", quiet):
                 compile_kernels(options.backend, options.frontend)
         seen = watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
@@ -215,14 +215,12 @@ def plot_command(
     folders: Annotated[list[Path], argument("Left by `slam run`.", "DIR")],
     out: Annotated[_File, option("PNG, PDF or SVG; default: a PNG in the first folder.", "FILE", "--out", "-o")] = None,
     figure: Annotated[str, option("summary, path, map, errors or time.", "NAME")] = "summary",
-    width: Annotated[float | None, option("Width of the picture, such as 88 for a journal's column.", "MM")] = None,
     overwrite: _Overwrite = False,
 ) -> None:
-    """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
+    """Draw finished runs, those of one sequence in one picture: path, map, errors, time per stage."""
     from slam.run.plots import plot_folders
 
-    file, caption = plot_folders(folders, out, figure, width, overwrite)
-    print(f"{file}: {caption}")
+    print(f"Files: {plot_folders(folders, out, figure, overwrite)}")
 
 
 @app.command("settings", short_help="List all settings.")
@@ -248,7 +246,6 @@ def compare_command(
     frames: _Frames = None,
     replay: Annotated[bool, option("Also feed the first back end's measurements to all.")] = True,
     workers: Annotated[int | None, option("Processes; default: the number of cores.", "N")] = None,
-    scheduler: Annotated[_Text, option("A Dask scheduler to be used.", "ADDRESS")] = None,
     overwrite: _Overwrite = False,
     quiet: Annotated[bool, option("No progress, no conclusions.", None, "--quiet", "-q")] = False,
 ) -> None:
@@ -264,7 +261,7 @@ def compare_command(
     variants = command.variants_of(names[1], variant or [], settings or [])
     plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
     with leaving("trials done so far are kept: the same command continues"):
-        command.compare(plan, out, workers, scheduler, quiet, overwrite, command_line())
+        command.compare(plan, out, workers, quiet, overwrite, command_line())
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
@@ -342,11 +339,11 @@ def list_command(
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
 def warm_up_command(quiet: _Quiet = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
-    from slam.commands.display import compiling
+    from slam.commands.display import progress
     from slam.run.warm_up import compile_kernels, warm_up
     from slam.runtime.compile_clock import compile_clock
 
-    with compiling(quiet):
+    with progress(None, "", quiet):
         compile_kernels(ONLINE[-1])
         warm_up()
     seconds = compile_clock.seconds()

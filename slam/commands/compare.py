@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from slam.compare.plan import CLOSED_LOOP, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import write_report
-from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
 from slam.compare.sweep import Run, check, is_done, sweep
 from slam.compare.tables import groups, most_tests, write_tables
 from slam.compare.trial import COMPLETED, RESULT, run_trial
 from slam.compare.wording import caution
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
+from slam.files import read_object
 from slam.runtime.cores import available_cores
 from slam.sequences.faults import said_before
 from slam.settings import require_settable
@@ -42,7 +42,6 @@ def compare(
     plan: Plan,
     out: Path,
     workers: int | None = None,
-    address: str | None = None,
     quiet: bool = False,
     overwrite: bool = False,
     command: str = "",
@@ -53,7 +52,6 @@ def compare(
         plan: what to run.
         out: folder; a sweep that was stopped in it goes on.
         workers: processes on this machine; None for as many as there are cores.
-        address: of a Dask scheduler to be used instead.
         quiet: show nothing.
         overwrite: run all again, and replace files that are there.
         command: what was typed, for the report.
@@ -67,15 +65,14 @@ def compare(
         wanted = "at least one worker" if workers < 1 else f"at most {_MOST_WORKERS} workers"
         raise ConfigurationError(f"comparison: there must be {wanted}, got {workers}")
     count = workers or available_cores()
-    scheduler: Scheduler = LocalScheduler(count) if address is None else DaskScheduler(address)
-    where = f"{count} at a time on this machine" if address is None else f"on the Dask cluster at {address}"
+    where = f"{count} at a time on this machine"
     frames = check(plan, out, overwrite)  # before there is a progress bar
     total, done = sum(frames[trial.sequence] for trial in plan.every), 0
     limits = caution(plan.trials if any(map(is_world, plan.sequences)) else 1, most_tests(plan))
     if not quiet:
         left = [trial for trial in plan.every if overwrite or not is_done(trial, out)]
         before = f", {len(plan.every) - len(left)} of them done before" if len(left) < len(plan.every) else ""
-        seconds = _seconds(left, frames) if left and address is None else None
+        seconds = _seconds(left, frames) if left else None
         about = "" if seconds is None else f": about {seconds / min(count, len(left)):.0f} s, by the first frames"
         print(f"{len(plan.every)} runs{before}, {total} frames in all, {where}{about}")
         if most_tests(plan):
@@ -87,7 +84,7 @@ def compare(
             done += frames[trial.sequence]
             tell(done)
 
-        runs = sweep(plan, out, scheduler, ended, overwrite)
+        runs = sweep(plan, out, count, ended, overwrite)
     every = groups(plan, runs)
     write_tables(every, runs, out)
     report = write_report(plan, every, runs, out, where, command)
@@ -103,9 +100,9 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
     for trial in left:
         kind = trial.sequence, trial.variant
         if kind not in tried:
-            with said_before():
-                first = replace(trial, seed=0, mode=CLOSED_LOOP, stop=trial.start + _TRIED)
-                result = json.loads(run_trial(first)[RESULT])
+            with said_before(), TemporaryDirectory(prefix="slam_trial_") as folder:
+                run_trial(replace(trial, seed=0, mode=CLOSED_LOOP, stop=trial.start + _TRIED), Path(folder))
+                result = read_object(Path(folder) / RESULT)
             if result["outcome"] != COMPLETED:
                 return None
             tried[kind] = result["milliseconds"]

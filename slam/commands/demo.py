@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from slam.commands.display import compiling, print_summary, progress
+from slam.commands.display import print_summary, progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.files import write_png
@@ -28,6 +28,7 @@ focal length, the right one turned by 0.7 mrad. Covariances count such errors;
 with exact cameras they would be too large."""
 
 _FRAME = "frame.png"
+_SECONDS = 0.07  # of a frame, about
 
 
 def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -> list[dict[str, Any]]:
@@ -43,7 +44,12 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
     sequence = open_sequence(_WORLD.format(frames))
     sequence.keep_images()  # type: ignore[attr-defined]
-    with compiling(quiet):
+    if not quiet:
+        seconds = _SECONDS * len(ONLINE) * frames
+        print(
+            f"{len(ONLINE)} runs of {frames} frames: about {seconds:.0f} s on two idle cores, 40 s more the first time"
+        )
+    with progress(None, "", quiet):
         compile_kernels(ONLINE[-1])
     for backend in ONLINE:
         config = SystemConfig.for_kind(sequence.kind, "surf", backend)

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from slam.compare.tables import Group
 
 _console = Console()
-_COMPILING = "compiling, once on this machine"
 _COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}  # of badges, by direction
 
 
@@ -38,11 +37,11 @@ def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
 def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[FrameResult], None]]:
     """A progress bar over frames, without an end where `total` is None; it appears with the first one.
 
-    Kernels that have to be compiled have a bar of their own above it.
+    Kernels that have to be compiled have a bar of their own above it. Their number is that of modules loaded so far.
     """
     bar = _bar(TextColumn("{task.fields[status]}"), quiet=quiet, get_time=working_time)
-    kernels = bar.add_task(_COMPILING, total=None, status="", visible=False)
-    task = bar.add_task(title, total=total, status="")
+    kernels = bar.add_task("compiling, once on this machine", total=None, status="", visible=False)
+    task = bar.add_task(title, total=total, status="", visible=False)
 
     def compiling(done: int, of: int) -> None:
         bar.start()
@@ -52,14 +51,15 @@ def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
         bar.start()
         speed = bar.tasks[task].speed
         said = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
-        bar.update(task, advance=1, status=f"{speed:.1f} Hz {said}" if speed else said)
+        bar.update(task, advance=1, status=f"{speed:.1f} Hz {said}" if speed else said, visible=True)
 
-    with _watching(compiling):
-        try:
-            yield frame
-        finally:
-            if bar.live.is_started:
-                bar.stop()
+    compile_clock.watch = compiling
+    try:
+        yield frame
+    finally:
+        compile_clock.watch = None
+        if bar.live.is_started:
+            bar.stop()
 
 
 @contextmanager
@@ -68,36 +68,6 @@ def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
     with _bar(quiet=quiet) as bar:
         task = bar.add_task(title, total=total)
         yield lambda done: bar.update(task, completed=done)
-
-
-@contextmanager
-def compiling(quiet: bool = False) -> Iterator[None]:
-    """A bar that counts kernels which are compiled meanwhile; it appears with the first one.
-
-    Their number is that of the modules loaded so far.
-    """
-    bar = _bar(quiet=quiet)
-    task = bar.add_task(_COMPILING, total=None)
-
-    def tell(done: int, of: int) -> None:
-        bar.start()
-        bar.update(task, completed=done, total=of)
-
-    with _watching(tell):
-        try:
-            yield
-        finally:
-            if bar.live.is_started:
-                bar.stop()
-
-
-@contextmanager
-def _watching(watch: Callable[[int, int], None]) -> Iterator[None]:
-    compile_clock.watch = watch
-    try:
-        yield
-    finally:
-        compile_clock.watch = None
 
 
 def print_conclusions(every: Sequence[Group], caution: str) -> None:

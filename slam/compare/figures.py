@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +16,11 @@ from slam.compare.trial import SERIES, SERIES_COLUMNS
 from slam.errors import SlamError
 from slam.evaluation.metrics import chi_square_band
 from slam.files import read_numbers
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array
 from slam.run.panels import backend_colours
 from slam.run.plots import drawn
 from slam.run.results import BY_KEY
-from slam.run.run_data import RunData, place_of_truth, well_known
+from slam.run.run_data import RunData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 _MOST_TICKS = 15
 _SHORT = 20  # letters of names that stand side by side
 _WIDTH = 132.0  # [mm] about that of a phone: text stays readable where the picture fills the screen
-_MOST_LANDMARKS, _MOST_POSES = 700, 600  # of a run in the map that can be turned
 
 
 def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
@@ -44,17 +43,15 @@ def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
     if "ate_online_m" in known and group.trials > 1:
         label = BY_KEY["ate_online_m"].label
         yield label, f"{label}, of every trial; lines join the back ends' runs on the same recording.", _pairs(group)
-    yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path", _WIDTH)[0])
+    yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path"))
     if "nees_per_dof" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
-        yield "Error over time", text, _svg(drawn(runs, "errors", _WIDTH)[0])
+        yield "Error over time", text, _svg(drawn(runs, "errors"))
         text = (
             "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
             "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
         )
         yield "NEES over time", text, _nees(group)
-    text = f"Time per frame by stage{of_seed}, one thread; it depends on the machine."
-    yield "Time per stage", text, _svg(drawn(runs, "time", _WIDTH)[0])
 
 
 def _example(group: Group) -> dict[str, Run]:
@@ -117,31 +114,6 @@ def _series(run: Run) -> Array:
     if not len(rows):
         raise SlamError(f"{run.folder / SERIES}: has no row")
     return rows
-
-
-def map_data(group: Group) -> dict[str, Any]:
-    """The first trial's maps and paths for the picture in 3D that can be turned."""
-    runs = [RunData.read(run.folder, backend) for backend, run in _example(group).items()]
-    truth: Array = np.zeros((0, 3))
-    if runs[0].truth is not None:
-        truth = transform(place_of_truth(runs[0]), runs[0].truth.positions)
-    layers = []
-    for run, colour in zip(runs, backend_colours([run.backend for run in runs])):
-        rows = well_known(run)[-_MOST_LANDMARKS:]
-        values, vectors = np.linalg.eigh(run.covariances[rows])
-        axes = 2 * np.sqrt(np.maximum(values, 0))[:, None, :] * vectors  # of the 2σ ellipsoids
-        layers.append({
-            "name": run.name,
-            "colour": colour,
-            "path": _rounded(run.online.positions[:: max(1, len(run.online) // _MOST_POSES)]),
-            "points": _rounded(run.positions[rows]),
-            "axes": _rounded(np.swapaxes(axes, 1, 2).reshape(-1, 9)),
-        })  # fmt: skip
-    return {"layers": layers, "truth": _rounded(truth[:: max(1, len(truth) // _MOST_POSES)])}
-
-
-def _rounded(rows: Array) -> list[list[float]]:
-    return [[round(float(x), 4) for x in row] for row in rows]
 
 
 def _style() -> AbstractContextManager[None]:

@@ -29,7 +29,6 @@ def write_report(
     was typed.
     """
     from jinja2 import Environment, FileSystemLoader
-    from markupsafe import Markup
 
     timed = {stage for run in runs for stage in run.milliseconds}
     stages = {"total": "whole frame"} | {stage: name for stage, name in STAGE_NAMES.items() if stage in timed}
@@ -51,7 +50,6 @@ def write_report(
         times=[_times(group, backend, stages) for group in every for backend in group.runs],
         command=command,
         versions=read_object(out / SWEEP)["versions"],
-        script=Markup((TEMPLATES / "map3d.js").read_text(encoding="utf-8")),
     )
     write_text(out / "report.html", text)
     return out / "report.html"
@@ -69,7 +67,6 @@ def _section(plan: Plan, modes: Sequence[Group]) -> dict[str, Any]:
         "modes": modes,
         "pictures": pictures,
         "given": wording.measurements(first.mode, plan.backends[0]),
-        "map": figures.map_data(first) if pictures else None,
     }
 
 

@@ -50,30 +50,19 @@ class Difference:
     """How far a back end lies from the reference in one figure, over paired trials.
 
     For figures whose ideal is one, what is compared is the distance from it, ``|log10 value|``.
-
-    Attributes:
-        metric: the figure.
-        pairs: trials in which both have it.
-        missing: trials in which one or both have not, because they failed.
-        reference, other: mean over the pairs.
-        mean: of the differences, other less reference.
-        low, high: bounds of its confidence interval; NaN with fewer than `FEWEST` pairs.
-        p: of the sign-flip test, two-sided; NaN with fewer than two pairs, and where nothing is better or worse.
-        p_holm: p adjusted over the tests of a report, see `adjusted`; p itself where there is no other test.
-        lower, higher: pairs in which the other is lower, and higher.
     """
 
     metric: Metric
-    pairs: int
-    missing: int
-    reference: float
+    pairs: int  # trials in which both have the figure
+    missing: int  # trials in which one or both have not, because they failed
+    reference: float  # mean over the pairs
     other: float
-    mean: float
-    low: float
+    mean: float  # of the differences, other less reference
+    low: float  # bounds of its confidence interval; NaN with fewer than `FEWEST` pairs
     high: float
-    p: float
-    p_holm: float
-    lower: int
+    p: float  # of the sign-flip test, two-sided; NaN with fewer than two pairs, and where nothing is better or worse
+    p_holm: float  # adjusted over the tests of a report, see `adjusted`; `p` itself where there is no other test
+    lower: int  # pairs in which the other is lower
     higher: int
 
     @property
@@ -149,11 +138,6 @@ def holm(p: Array) -> Array:
 def fewest(tests: int) -> int:
     """Trials that it takes for one of so many tests to be certain: p is at least 2 / 2ᴺ, and Holm's factor `tests`."""
     return int(np.ceil(np.log2(2 * max(tests, 1) / ALPHA)))
-
-
-def certain_of(trials: int) -> int:
-    """The most tests of which one can be certain with so many trials, see `fewest`."""
-    return int(ALPHA * 2 ** min(trials - 1, 60))
 
 
 #: Values from which on a mean has a confidence interval.

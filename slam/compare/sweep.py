@@ -1,4 +1,4 @@
-"""All trials of a comparison, each once: a sweep that was stopped continues where it was.
+"""All trials of a comparison, each once, in processes of this machine; a sweep that was stopped continues where it was.
 
 A trial's folder is its own checkpoint: ``result.json`` is written last.
 """
@@ -6,19 +6,23 @@ A trial's folder is its own checkpoint: ``result.json`` is written last.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from slam import registry
 from slam.compare.plan import CLOSED_LOOP, REPLAY, SIMULATED, Plan, Trial
-from slam.compare.scheduler import Job, Scheduler
-from slam.compare.trial import COMPLETED, RECORDING, RESULT, Files, config_of, failed, run_trial
+from slam.compare.trial import COMPLETED, RECORDING, RESULT, config_of, keep_result, run_trial
 from slam.errors import SlamError
-from slam.files import noting_inputs, read_object, remove_file
+from slam.files import noting_inputs, read_object
 from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder, write_json
 from slam.run.repeat import changed_versions, running_code
@@ -28,7 +32,7 @@ from slam.sequences.faults import said_before
 RUNS, SWEEP = "runs", "sweep.json"
 
 #: What a comparison leaves in its folder.
-NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "timings.csv", "report.html")
+NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "report.html")
 
 
 @dataclass(frozen=True)
@@ -56,47 +60,81 @@ class Run:
 
 
 def sweep(
-    plan: Plan, out: Path, scheduler: Scheduler, on_done: Callable[[Trial], None] | None = None, overwrite: bool = False
+    plan: Plan, out: Path, workers: int, on_done: Callable[[Trial], None] | None = None, overwrite: bool = False
 ) -> list[Run]:
     """Run what is not done yet, and read all runs of the plan, in its order.
 
     Args:
         plan: what to run.
         out: folder; one of an earlier sweep with the same versions is gone on with.
-        scheduler: where trials run.
+        workers: processes on this machine, of one thread each.
         on_done: called for each trial that ends, or was done before.
         overwrite: whether to run all again, and to replace files that are there.
 
     Raises:
-        SlamError: a sequence, name or setting is bad (nothing is run then), or the folder holds something else.
+        SlamError: a sequence, name or setting is bad (nothing is run then), the folder holds something else, or a
+            worker process died.
     """
     check(plan, out, overwrite)
     told = on_done or (lambda trial: None)
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
     write_json(out / SWEEP, {"plan": asdict(plan), "versions": running_code()})
-    trials = {trial.folder: trial for trial in plan.every}
-
-    def keep(job: Job, files: Files | None, error: BaseException | None) -> None:
-        trial = trials[job.name]
-        files, folder = files or failed(trial, error or SlamError("nothing came back")), out / RUNS / job.name
-        with naming_folder(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / RESULT).unlink(missing_ok=True)
-            for name in sorted(files, key=lambda name: name == RESULT):  # last: what is there then is whole
-                remove_file(folder / name)
-                (folder / name).write_bytes(files[name])
-        told(trial)
-
     for mode in plan.modes:  # a replay needs the closed loop
-        jobs = []
+        left = []
         for trial in plan.trials_of(mode):
             if overwrite or not is_done(trial, out):
-                jobs.append(Job(trial.folder, run_trial, partial(_arguments, plan, out, trial)))
+                left.append(trial)
             else:
                 told(trial)
-        scheduler.run(jobs, keep)
+        _run_all(left, plan.backends[0], out, workers, told)
     return [read_run(trial, out) for trial in plan.every]
+
+
+def _run_all(trials: Sequence[Trial], first: str, out: Path, workers: int, told: Callable[[Trial], None]) -> None:
+    """Run trials in processes, which end with this call however it ends; `first` is the back end that is replayed."""
+    if not trials:
+        return
+    before = set(multiprocessing.active_children())
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(workers, len(trials)), context, _begin_worker)
+    try:
+        running = {}
+        for trial in trials:
+            recording = None
+            if trial.mode == REPLAY:
+                given = read_run(replace(trial, backend=first, mode=CLOSED_LOOP), out)
+                recording = given.folder / RECORDING if given.completed else None
+            running[pool.submit(run_trial, trial, out / RUNS / trial.folder, recording)] = trial
+        for future in as_completed(running):
+            trial, error = running[future], future.exception()
+            if isinstance(error, BrokenProcessPool):
+                raise SlamError(
+                    "a worker process died, as where there is too little memory: the same command goes on, with fewer "
+                    "--workers if need be"
+                ) from error
+            if error is not None:  # a defect of a program
+                keep_result(trial, out / RUNS / trial.folder, error)
+            told(trial)
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    """Leave interrupts to the parent, and end when it is gone, however it went."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def end_with_parent() -> None:
+        if (parent := multiprocessing.parent_process()) is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
@@ -166,14 +204,6 @@ def read_run(trial: Trial, out: Path) -> Run:
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise SlamError(f"{folder / RESULT}: its figures are no numbers by name") from error
     return Run(trial, result["outcome"], metrics, milliseconds, folder)
-
-
-def _arguments(plan: Plan, out: Path, trial: Trial) -> tuple[Trial, bytes | None]:
-    """A trial, and for a replay the measurements of the first back end's closed loop."""
-    if trial.mode != REPLAY:
-        return trial, None
-    run = read_run(replace(trial, backend=plan.backends[0], mode=CLOSED_LOOP), out)
-    return trial, (run.folder / RECORDING).read_bytes() if run.completed else None
 
 
 def is_done(trial: Trial, out: Path) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -97,23 +97,17 @@ def most_tests(plan: Plan) -> int:
 
 
 def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None:
-    """Write runs.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
-    stages = list(dict.fromkeys(stage for run in runs for stage in run.milliseconds))
+    """Write runs.csv and differences.csv; times, in which no two runs agree, are in each run's ``summary.json``."""
     differences = [row for group in every for row in _difference_rows(group)]
-    tables: dict[str, list[tuple[object, ...]]] = {
-        "runs": [(*RUN_COLUMNS, *BY_KEY), *(_row(run, run.metrics, BY_KEY) for run in runs)],
-        "differences": [DIFFERENCE_COLUMNS, *differences],
-        "timings": [(*RUN_COLUMNS, *(f"ms_{s}" for s in stages)), *(_row(r, r.milliseconds, stages) for r in runs)],
-    }
-    for name, rows in tables.items():
-        write_text(out / f"{name}.csv", csv_rows(rows))
+    write_text(out / "runs.csv", csv_rows([(*RUN_COLUMNS, *BY_KEY), *map(_row, runs)]))
+    write_text(out / "differences.csv", csv_rows([DIFFERENCE_COLUMNS, *differences]))
 
 
-def _row(run: Run, values: Mapping[str, float], keys: Iterable[str]) -> tuple[str, ...]:
-    """Cells of `RUN_COLUMNS`, and values by their keys."""
+def _row(run: Run) -> tuple[object, ...]:
+    """Cells of `RUN_COLUMNS`, and figures by their keys."""
     t = run.trial
-    head = t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
-    return *head, *(_number(values.get(key, np.nan)) for key in keys)
+    head = t.sequence, t.variant.name, t.variant.frontend, t.mode, t.seed, t.backend, run.outcome
+    return *head, *(_number(run.metrics.get(key, np.nan)) for key in BY_KEY)
 
 
 def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:

@@ -1,15 +1,13 @@
-"""One run of a comparison, anywhere: it takes a `Trial` and gives back files, and touches nothing else."""
+"""One run of a comparison: it takes a `Trial` and leaves files in its folder."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,12 +19,13 @@ from slam.errors import SlamError
 from slam.evaluation.association_truth import SurfacePoints
 from slam.evaluation.consistency import stretch_nees
 from slam.evaluation.summary import with_truth
-from slam.files import read_text
+from slam.files import read_text, remove_file, write_text
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.geometry.stamps import frame_range, pair
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.interfaces import Frontend
 from slam.run.options import RunOptions
+from slam.run.outputs import csv_rows, naming_folder, write_json
 from slam.run.recording import load_recording
 from slam.run.results import figures
 from slam.run.runner import run, run_recording
@@ -34,9 +33,6 @@ from slam.run.summary import RunRecord
 from slam.sequences import Sequence, open_sequence
 from slam.sequences.faults import said_before
 from slam.worlds import WorldSequence
-
-#: Files of a run by name.
-Files = dict[str, bytes]
 
 RESULT, SERIES, RECORDING = "result.json", "series.csv", "recording.npz"
 COMPLETED = "completed"
@@ -54,29 +50,39 @@ _SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
 # ---------------------------------------------------------------------------------------------------- running it
 
 
-def run_trial(trial: Trial, recording: bytes | None = None) -> Files:
-    """Run a trial on one thread; its files come back, `RESULT` among them.
+def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None:
+    """Run a trial on one thread; its files are left in `folder`, `RESULT` last: what is there then is whole.
 
     Bad input and failures of the estimator that the package knows are an outcome, kept with the frames done so far;
     anything else is a defect of a program and is raised.
 
     Args:
         trial: what to run.
+        folder: for its files; made where it is missing.
         recording: for a replay, the measurements of the run that is replayed; a closed loop leaves them as `RECORDING`.
     """
-    with TemporaryDirectory(prefix="slam_trial_") as folder, one_thread():
-        out = Path(folder)
+    remove_file(folder / RESULT)
+    with one_thread():
         try:
-            found = _run(trial, recording, out)
+            keep_result(trial, folder, COMPLETED, *_run(trial, recording, folder))
         except SlamError as error:
-            found = failed(trial, error)
-        return {path.name: path.read_bytes() for path in sorted(out.iterdir()) if path.is_file()} | found
+            keep_result(trial, folder, error)
 
 
-def failed(trial: Trial, error: BaseException) -> Files:
-    """What is kept of a run that an exception ended: its outcome, and no figures."""
-    outcome = f"failed: {type(error).__name__}: {' '.join(str(error).split())}"
-    return {RESULT: _json({"trial": asdict(trial), "outcome": outcome, "metrics": {}, "milliseconds": {}})}
+def keep_result(
+    trial: Trial,
+    folder: Path,
+    outcome: str | BaseException,
+    metrics: Mapping[str, float] | None = None,
+    milliseconds: Mapping[str, float] | None = None,
+) -> None:
+    """Write how a trial ended, also where an exception ended it, and its figures."""
+    if isinstance(outcome, BaseException):
+        outcome = f"failed: {type(outcome).__name__}: {' '.join(str(outcome).split())}"
+    result = {"trial": asdict(trial), "outcome": outcome, "metrics": metrics or {}, "milliseconds": milliseconds or {}}
+    with naming_folder(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / RESULT, result)
 
 
 def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
@@ -133,8 +139,11 @@ class WithoutImages:
             yield StereoFrame(k, float(self._recording.stamps[k]), nothing, None)
 
 
-def _run(trial: Trial, recording: bytes | None, out: Path) -> Files:
-    """The whole system on the sequence, whose measurements are recorded; or a back end alone on recorded ones."""
+def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """The whole system on the sequence, whose measurements are recorded; or a back end alone on recorded ones.
+
+    Returns figures, and median times of stages [ms].
+    """
     closed, record = trial.mode == CLOSED_LOOP, RunRecord()
     if not closed and recording is None:
         raise SlamError(f"{trial.source}: the run to be replayed has failed, there are no measurements")
@@ -143,11 +152,7 @@ def _run(trial: Trial, recording: bytes | None, out: Path) -> Files:
     collected = MapRecord(sequence, trial.start, closed)
     names = trial.backend, trial.variant.frontend, config_of(trial, sequence), out
     if recording is not None:
-        path = out / RECORDING
-        path.write_bytes(recording)
-        loaded = load_recording(path)
-        path.unlink()
-        summary = run_recording(loaded, RunOptions(*names), collected.add, record)
+        summary = run_recording(load_recording(recording), RunOptions(*names), collected.add, record)
     else:
         frontend: Frontend | None = None
         shown: Any = sequence
@@ -163,14 +168,8 @@ def _run(trial: Trial, recording: bytes | None, out: Path) -> Files:
     times = summary.get("milliseconds", {})
     milliseconds = {stage: value for stage, value in times.get("median", {}).items() if value}
     milliseconds |= {"total": times["median_total"]} if times else {}
-    text = io.StringIO()
-    np.savetxt(text, nees_series(record, sequence), "%.9g", ",", header=",".join(SERIES_COLUMNS), comments="")
-    result = {"trial": asdict(trial), "outcome": COMPLETED, "metrics": metrics, "milliseconds": milliseconds}
-    return {RESULT: _json(result), SERIES: text.getvalue().encode()}
-
-
-def _json(tree: Any) -> bytes:
-    return (json.dumps(tree, indent=2) + "\n").encode()
+    write_text(out / SERIES, csv_rows([SERIES_COLUMNS, *nees_series(record, sequence).tolist()]))
+    return metrics, milliseconds
 
 
 # --------------------------------------------------------------------------------- what only a comparison measures
@@ -205,7 +204,6 @@ class MapRecord:
             "association_precision": np.mean(self._right) if self._right else None,
             "map_size": np.mean(self._sizes) if self._sizes else None,
             "landmark_error_m": np.median(errors) if len(errors) else None,
-            "landmark_error_90_m": np.quantile(errors, 0.9) if len(errors) else None,
         }
         return {key: float(value) for key, value in found.items() if value is not None}
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.compare.plan import REPLAY
-from slam.compare.statistics import ALPHA, Difference, Verdict, certain_of, fewest
+from slam.compare.statistics import ALPHA, Difference, Verdict, fewest
 from slam.compare.tables import Group, mean_and_sd
 from slam.run.results import COMPLETED, Metric, verdict
 
@@ -132,9 +132,7 @@ def caution(trials: int, tests: int) -> str:
         return f"One trial cannot tell a difference from chance: a recorded sequence has no more. In worlds {more}"
     if trials < fewest(1):
         return f"With {trials} trials nothing can be certain, even where all agree. {more}"
-    few = certain_of(trials)
-    at_most = "a single figure is" if few == 1 else f"up to {few} figures are"
-    return f"With {trials} trials a difference that has the same sign in all is certain where {at_most} tested. {more}"
+    return f"With {trials} trials only few figures can be told apart for certain. {more}"
 
 
 def measurements(mode: str, reference: str) -> str:

@@ -38,6 +38,8 @@ class PairGeometry:
     off_rows: int = 0  # whose rows differ, by more than the front end finds reliably
     row_offset: float = 0.0  # median difference of their rows [px]
     raw_offset: float = 0.0  # the same of the images as they are, not rectified [px]
+    better_raw: int = 0  # whose rows rectification changes, and that agree better without it
+    better_rectified: int = 0  # that agree better with it
 
     @property
     def swapped(self) -> bool:
@@ -53,6 +55,11 @@ class PairGeometry:
     def rows_differ(self) -> bool:
         """The rows of most matches differ."""
         return self.conclusive and most(self.off_rows, self.matches - self.off_rows)
+
+    @property
+    def rectified_before(self) -> bool:
+        """The rows of the images agree, and those of the rectified ones do not, be it near the edges alone."""
+        return self.conclusive and most(self.better_raw, self.better_rectified)
 
 
 def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) -> PairGeometry:
@@ -77,6 +84,9 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
     band = max(rows, _TOLERANCE)
     shift, offset = _offsets(rig, a, b)
     shift_swapped, offset_swapped = _offsets(rig, b, a)
+    raw = b[:, 1] - a[:, 1]
+    changed = np.abs(offset - raw) > _ROWS_AGREE  # by more than whole pixels of ORB's hide
+    better = np.abs(raw) < np.abs(offset)
     return PairGeometry(
         len(a),
         True,
@@ -85,7 +95,9 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         int((np.abs(b - a).max(axis=1) <= _TOLERANCE).sum()),
         int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
-        float(np.median(np.abs(b[:, 1] - a[:, 1]))),
+        float(np.median(np.abs(raw))),
+        int((changed & better).sum()),
+        int((changed & ~better).sum()),
     )
 
 

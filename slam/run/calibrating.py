@@ -89,21 +89,10 @@ def calibrate(
     kalibr: Path | None = None,
     overwrite: bool = False,
 ) -> Calibrated:
-    """Run a range of frames of recordings of one rig, and write what they say of it.
+    """Run a range of frames of recordings of one rig, and write what they say of it to `out`, with its covariance.
 
-    Args:
-        sequences: the recordings.
-        out: file for what has been found, with its covariance.
-        show: shows the progress.
-        settings: as ``--set`` takes them.
-        frames: range of frames of each.
-        inputs: files and folders that must not be replaced.
-        opencv: file for the corrected calibration in OpenCV's form.
-        kalibr: the same in Kalibr's.
-        overwrite: whether files that are there may be replaced.
-
-    Raises:
-        SlamError: bad input, before anything is run.
+    `opencv` and `kalibr` are files for the corrected calibration in those forms; `inputs` are never replaced. Raises
+    SlamError on bad input, before anything is run.
     """
     rig = sequences[0].rig
     for sequence in sequences:

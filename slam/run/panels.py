@@ -183,7 +183,8 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
             axis.yaxis.set_minor_formatter("")
         axis.set_ylabel(name)
         axis.grid(color="0.9", lw=0.5)
-        axis.margins(x=0.01)
+        end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
+        axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
     title = "Error of the online pose (solid), claimed σ (dashed)"
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")

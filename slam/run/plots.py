@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import textwrap
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,18 +30,12 @@ KINDS = ("summary", "path", "map", "errors", "time")
 #: The picture that a run leaves.
 PICTURE = "summary.png"
 
-#: Widths that a picture may be given [mm]; names of stages leave no room for their times in a narrower one.
-NARROWEST, WIDEST = 80.0, 1000.0
-
 _MOST_MAPS = 3  # side by side in the summary
-_PAGE = 8.0  # [in] below which text is small, as in a paper
 _LETTERS = 13  # an inch of the head holds
-_COLUMN = 5.0  # [in] below which panels do not stand side by side
 _STYLE: dict[str, Any] = {
     "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 10, "legend.fontsize": 8, "legend.edgecolor": "none",
     "svg.hashsalt": "slam", "pdf.fonttype": 42, "text.parse_math": False,
 }  # fmt: skip
-_SMALL_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
 
 #: What a file of a format says of itself: nothing that changes from run to run.
 _METADATA: dict[str, dict[str, Any]] = {
@@ -52,10 +45,8 @@ _METADATA: dict[str, dict[str, Any]] = {
 }
 
 
-def plot_folders(
-    folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None, overwrite: bool = False
-) -> tuple[Path, str]:
-    """Draw finished runs of one sequence in one picture, as `plot` does; returns the file and its caption.
+def plot_folders(folders: Sequence[Path], out: Path | None, kind: str, overwrite: bool = False) -> Path:
+    """Draw finished runs of one sequence in one picture, as `plot` does; returns the file.
 
     Without `out`, a PNG goes to the first folder. Raises SlamError where a folder is none of a finished run, where runs
     are of several sequences, or where a file cannot be written.
@@ -69,7 +60,8 @@ def plot_folders(
         )
     file = out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png")
     require_outputs([Output(file, "--out", makes_folder=True)], inputs, overwrite)
-    return file, plot(runs, file, kind, width)
+    plot(runs, file, kind)
+    return file
 
 
 def leave_picture(folder: Path) -> None:
@@ -90,108 +82,73 @@ def _read(folders: Sequence[Path]) -> list[RunData]:
     return [replace(run, name=f"{run.name} ({i})") for i, run in enumerate(runs, start=1)]
 
 
-def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: float | None = None) -> str:
-    """Draw runs of one sequence into a file; returns a caption.
-
-    A picture for a screen has its caption inside, as titles. One for a paper, which is a PDF, an SVG, or any with a
-    width, has none inside but what tells its panels apart.
+def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
+    """Draw runs of one sequence into a file; another picture there is overwritten.
 
     Args:
         runs: of the same sequence.
-        path: PNG, PDF or SVG by its suffix; another picture there is overwritten.
+        path: PNG, PDF or SVG by its suffix.
         kind: one of `KINDS`.
-        width: of the picture [mm], such as 88 for a column of many journals; None for one that suits a screen.
 
     Raises:
-        SlamError: the format or the kind is not known, the width is out of range, or the file cannot be written.
+        SlamError: the format or the kind is not known, or the file cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix not in _METADATA:
         raise SlamError(f"{path}: a picture is a file .png, .pdf or .svg")
     if kind not in KINDS:
         raise SlamError(unknown("figure", kind, KINDS))
-    if width is not None and not NARROWEST <= width <= WIDEST:
-        raise SlamError(f"the width of a picture is {NARROWEST:g} to {WIDEST:g} mm, got {width:g}")
-    figure, caption = drawn(runs, kind, width, titles=suffix == ".png" and width is None)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as file, _style(width):
-            metadata = {"Title": _title(runs), **_METADATA[suffix]}
-            figure.savefig(file, format=suffix[1:], dpi=110 if width is None else 300, metadata=metadata)
-    except OSError as error:
-        raise SlamError(f"cannot write to {path}: {error.strerror or error}") from error
-    return caption
-
-
-def drawn(runs: Sequence[RunData], kind: str, width: float | None, titles: bool = False) -> tuple[Figure, str]:
-    """A picture, so wide [mm], and its titles in one text; maps side by side keep the names of their runs anyway."""
-    with _style(width):
-        figure = _draw(kind, runs, None if width is None else width / 25.4)
-        texts = [" ".join(axis.get_title().split()) for axis in figure.axes]
-        if not titles:
-            figure.suptitle("")
-            names = [run.name for run in runs] if kind == "map" and len(runs) > 1 else []
-            for i, axis in enumerate(figure.axes if kind != "summary" else ()):
-                axis.set_title(names[i] if i < len(names) else "")
-    return figure, ". ".join([_title(runs), *filter(None, texts)]) + "."
-
-
-def _style(width: float | None) -> AbstractContextManager[None]:
-    """Sizes of the letters: small ones where a picture is, as in a paper."""
     from matplotlib import rc_context
 
-    return rc_context(_STYLE | (_SMALL_STYLE if width is not None and width / 25.4 < _PAGE else {}))
+    figure = drawn(runs, kind)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as file, rc_context(_STYLE):
+            metadata = {"Title": _title(runs), **_METADATA[suffix]}
+            figure.savefig(file, format=suffix[1:], dpi=110, metadata=metadata)
+    except OSError as error:
+        raise SlamError(f"cannot write to {path}: {error.strerror or error}") from error
 
 
-def _layout(kind: str, maps: list[str], width: float | None) -> tuple[float, list[list[Any]], list[float]]:
-    """Width of a picture [in], names of its panels in rows, and heights of the rows [in].
-
-    Nested rows have margins of their own. In a narrow column panels stand one below the other.
-    """
-    column, count = width is not None and width < _COLUMN, len(maps)
-    if kind == "summary":
-        wide = width or max(10.0, 4.4 * (1 + count))
-        if column:
-            rows = [[[[name]]] for name in ("path", *maps, "key")] + [[[["position"], ["rotation"]]], [[["time"]]]]
-            return wide, rows, [0.9 * wide, *[0.95 * wide] * count, 1.0, 3.2, 2.6]
-        below = [["position", "time"], ["rotation", "time"]]
-        return wide, [[[["path", *maps]]], ["key"], [below]], [wide / (1 + count), 0.5, 4.2]
-    if kind == "map":
-        wide = width or 5.0 * count
-        if column:
-            return wide, [*([name] for name in maps), ["key"]], [*[wide] * count, 0.9]
-        return wide, [maps, ["key"] * count], [wide / count, 0.5]
-    if kind == "path":
-        return width or 5.0, [["path"]], [0.92 * (width or 5.0)]
-    if kind == "errors":
-        return width or 6.0, [["position"], ["rotation"]], [1.8, 1.8]
-    return width or 6.0, [["time"]], [2.6]
-
-
-def _draw(kind: str, runs: Sequence[RunData], width: float | None) -> Figure:
-    """The panels of a picture with all that is in them."""
+def drawn(runs: Sequence[RunData], kind: str) -> Figure:
+    """A picture."""
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     maps = [f"map {k}" for k in range(len(runs[:_MOST_MAPS] if kind == "summary" else runs))]
-    wide, rows, heights = _layout(kind, maps, width)
+    wide, rows, heights = _layout(kind, maps)
     lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
     head = "\n".join(textwrap.fill(line, int(_LETTERS * wide)) for line in lines) if kind == "summary" else ""
-    figure = Figure(figsize=(wide, sum(heights) + (0.17 * head.count("\n") + 0.3 if head else 0.0)))
-    figure.set_layout_engine("constrained", w_pad=0.08)
-    panels: dict[str, Axes] = figure.subplot_mosaic(rows, height_ratios=heights)
-    if "path" in panels:
-        draw_paths(panels["path"], runs)
-    if "key" in panels:
-        draw_maps([panels[name] for name in maps], runs, panels["key"])
-    if "position" in panels:
-        draw_errors([panels["position"], panels["rotation"]], runs)
-    if "time" in panels:
-        draw_times(panels["time"], runs)
-    if head:
-        for axis in panels.values():
-            axis.set_title(textwrap.fill(axis.get_title(), int(_LETTERS * min(wide, 5.0))))
-        figure.suptitle(head, x=0.01, ha="left")
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(wide, sum(heights) + (0.17 * head.count("\n") + 0.3 if head else 0.0)))
+        figure.set_layout_engine("constrained", w_pad=0.08)
+        panels: dict[str, Axes] = figure.subplot_mosaic(rows, height_ratios=heights)
+        if "path" in panels:
+            draw_paths(panels["path"], runs)
+        if "key" in panels:
+            draw_maps([panels[name] for name in maps], runs, panels["key"])
+        if "position" in panels:
+            draw_errors([panels["position"], panels["rotation"]], runs)
+        if "time" in panels:
+            draw_times(panels["time"], runs)
+        if head:
+            figure.suptitle(head, x=0.01, ha="left")
     return figure
+
+
+def _layout(kind: str, maps: list[str]) -> tuple[float, list[list[Any]], list[float]]:
+    """Width of a picture [in], names of its panels in rows, and heights of the rows [in].
+
+    Nested rows have margins of their own.
+    """
+    if kind == "summary":
+        wide, below = max(10.0, 4.4 * (1 + len(maps))), [["position", "time"], ["rotation", "time"]]
+        return wide, [[[["path", *maps]]], ["key"], [below]], [wide / (1 + len(maps)), 0.5, 4.2]
+    if kind == "map":
+        return 5.0 * len(maps), [maps, ["key"] * len(maps)], [5.0, 0.5]
+    if kind == "path":
+        return 5.2, [["path"]], [4.8]
+    return 5.2, *(([["position"], ["rotation"]], [1.8, 1.8]) if kind == "errors" else ([["time"]], [2.6]))
 
 
 def _title(runs: Sequence[RunData]) -> str:

@@ -24,17 +24,17 @@ _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-con
 
 
 def origin(options: RunOptions) -> dict[str, Any]:
-    """What ``config.json`` says besides names and settings: the command, and files by absolute and by relative path."""
+    """What ``config.json`` says besides names and settings: the command, and files by absolute path."""
     if not options.source:  # of a recording, or a sequence made in Python
         return {"command": options.command}
-    no_file = options.format in ("synthetic", "camera")
     files = {"prior_map": options.prior_map, "calibration": options.calibration}
     return {
         "command": options.command,
-        "source": {"format": options.format, **_places(options.source, options.out, no_file)},
+        "source": options.source if options.format in ("synthetic", "camera") else _place(options.source),
+        "source_format": options.format,
         "kind": options.kind,
         "mono": options.mono,
-        **{key: file and _places(str(file), options.out) for key, file in files.items()},
+        **{key: file and _place(str(file)) for key, file in files.items()},
     }
 
 
@@ -55,16 +55,19 @@ def load(
         tree = _restored(read_object(file))
         if str(tree.get("command", "")).startswith("slam replay"):
             raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
-        before, (start, stop) = tree.get("source") or {}, tree["frames"]
-
-        def own(key: str) -> Path | None:
-            return Path(_found(tree[key], file)) if tree.get(key) else None
-
+        start, stop = tree["frames"]
+        files = {"source": source, "prior_map": prior_map, "calibration": calibration}
+        places = {key: str(given or tree.get(key) or "") for key, given in files.items()}
+        for key, place in places.items():
+            there = place.startswith(_NO_FILES) or any(map(os.path.exists, (place, place.rpartition("?")[0])))
+            if place and not (files[key] or there or tree.get("source_format") in ("synthetic", "camera")):
+                raise SlamError(f"{file}: {place} is no longer there: give its new place beside --config")
         options = RunOptions(
             str(tree["backend"]), str(tree["frontend"]), SystemConfig.from_json(tree["settings"]), Path(), int(start),
-            None if stop is None else int(stop), mono=bool(tree.get("mono", False)), format=before.get("format"),
-            source=source or (_found(before, file) if before else ""), kind=str(tree.get("kind", "handheld")),
-            prior_map=prior_map or own("prior_map"), calibration=calibration or own("calibration"),
+            None if stop is None else int(stop), mono=bool(tree.get("mono", False)), source=places["source"],
+            format=tree.get("source_format"), kind=str(tree.get("kind", "handheld")),
+            prior_map=Path(places["prior_map"]) if places["prior_map"] else None,
+            calibration=Path(places["calibration"]) if places["calibration"] else None,
         )  # fmt: skip
         return options, dict(tree.get("versions", {}))
     except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
@@ -120,35 +123,11 @@ def _restored(tree: Any) -> Any:
     return float(tree) if tree in ("Infinity", "-Infinity") else tree
 
 
-def _places(text: str, folder: Path, no_file: bool = False) -> dict[str, str]:
-    """Where a file is, options behind it included: as it was given, absolute, and as seen from `folder`."""
-    if no_file or text.startswith(_NO_FILES):
-        return {"given": text}
+def _place(text: str) -> str:
+    """A sequence or file by its absolute path, options behind it included; what is no file as it was given."""
+    if text.startswith(_NO_FILES):
+        return text
     name, mark, query = text.rpartition("?")
     if not mark or Path(text).expanduser().exists():
         name, mark, query = text, "", ""
-    absolute = Path(os.path.abspath(Path(name).expanduser()))  # noqa: PTH100 without following links
-    found = {"given": text, "absolute": f"{absolute}{mark}{query}"}
-    try:
-        relative = os.path.relpath(absolute, os.path.abspath(folder))  # noqa: PTH100
-    except ValueError:  # another drive
-        return found
-    return {**found, "relative": f"{Path(relative).as_posix()}{mark}{query}"}
-
-
-def _found(places: Mapping[str, str], file: Path) -> str:
-    """The first place of a file that exists: the absolute one, then the one relative to ``config.json``.
-
-    Raises:
-        SlamError: it is at neither.
-    """
-    if "absolute" not in places:
-        return str(places["given"])
-    candidates = [places["absolute"]]
-    if "relative" in places:
-        candidates.append(os.path.normpath(file.parent.absolute() / places["relative"]))
-    for text in candidates:
-        if Path(text).exists() or ("?" in text and Path(text.rpartition("?")[0]).exists()):
-            return text
-    where = " nor ".join(dict.fromkeys(candidates))
-    raise SlamError(f"{file}: {places['given']} is no longer at {where}: give its new place beside --config")
+    return f"{os.path.abspath(Path(name).expanduser())}{mark}{query}"  # noqa: PTH100 without following links

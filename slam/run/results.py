@@ -18,25 +18,15 @@ from slam.evaluation.metrics import chi_square_band
 
 @dataclass(frozen=True)
 class Metric:
-    """One figure.
+    """One figure."""
 
-    Attributes:
-        key: column of the tables.
-        label: for people.
-        unit: in which people see it.
-        scale: of that unit, by the unit of the key.
-        better: ``"lower"``, ``"higher"``, ``"one"`` (1 is honest; both ways off is worse), or ``""`` (neither).
-        place: keys of a run's summary one below the other; empty where it is not simply there.
-        main: one of those that a comparison's conclusions speak of.
-    """
-
-    key: str
-    label: str
-    unit: str = ""
-    scale: float = 1.0
-    better: str = ""
-    place: tuple[str, ...] = ()
-    main: bool = False
+    key: str  # column of the tables
+    label: str  # for people
+    unit: str = ""  # in which people see it
+    scale: float = 1.0  # of that unit, by the unit of the key
+    better: str = ""  # "lower", "higher", "one" (1 is honest; both ways off is worse), or "" (neither)
+    place: tuple[str, ...] = ()  # keys of a summary one below the other; empty where it is not simply there
+    main: bool = False  # one of those that a comparison's conclusions speak of
 
     @property
     def title(self) -> str:
@@ -87,11 +77,9 @@ METRICS = (
       for key, (over, name, main) in _NEES.items()),
     Metric("nis_per_dof", "NIS / dof (up to 1 is right)", place=(*_HONEST, "NIS per degree of freedom")),
     Metric("landmark_error_m", "median landmark error", *_MM, "lower", (), True),
-    Metric("landmark_error_90_m", "landmark error, 90 % are below", *_MM, "lower"),
     Metric("association_precision", "association precision", *_PERCENT, "higher"),
     Metric("tracked", "frames tracked", *_PERCENT, "higher", (), True),
     Metric("map_size", "landmarks in the map, mean"),
-    Metric("used_per_frame", "observations used per frame"),
     Metric("moving_precision", "moving features, precision", *_PERCENT, "higher", (*_MOVING, "precision")),
     Metric("moving_recall", "moving features, recall", *_PERCENT, "higher", (*_MOVING, "recall")),
     Metric("body_coverage", "moving bodies, frames found", *_PERCENT, "higher"),
@@ -149,8 +137,14 @@ def facts(summary: Mapping[str, Any]) -> str:
     """What a run found, also where there is no truth, and whether its covariances hold, for the head of a picture."""
     found = _of_run(summary) if summary else {}
     shown = [m for m in _OF_RUN if m.key in _IN_PICTURE and found.get(m.key)]
-    words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
+    words = [f"{m.label} {_length(found[m.key], m)}".rstrip() for m in shown]
     return "; ".join([*words, *filter(None, [verdict_of_run(summary)])])
+
+
+def _length(value: float, metric: Metric) -> str:
+    """A figure with its unit; lengths and speeds below a tenth of a metre in millimetres."""
+    small = metric.unit.startswith("m") and metric.scale == 1.0 and value < 0.1
+    return f"{number(1e3 * value)} m{metric.unit}" if small else f"{metric.show(value)} {metric.unit}"
 
 
 def _of_run(summary: Mapping[str, Any]) -> dict[str, float]:
@@ -198,7 +192,6 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
         found = {key: value for key, value in found.items() if not key.startswith("loops")}
     if frames := summary.get("frames", 0):
         found["tracked"] = _measured(summary) / frames
-        found["used_per_frame"] = summary.get("observations", {}).get("used", 0) / frames
     moved = [body for body in summary.get("objects", {}).get("bodies", {}).values() if body["frames in view"]]
     if not moved:  # what is found of nothing is no figure
         return {key: value for key, value in found.items() if not key.startswith("moving_")}

@@ -29,21 +29,15 @@ LIVE = "live"
 _SIGMAS = 2.0
 _SEEN, _UNSEEN, _NEW, _PATH, _TRUTH = (40, 53, 147), (159, 168, 218), (255, 235, 59), (21, 101, 192), (120, 120, 120)
 _MEASURED = (0, 230, 118)  # in images
-_PLACE, _CLOSED, _REFUSED = (0, 137, 123), (142, 36, 170), (240, 98, 146)
-_MOVING = (255, 145, 0)
+_CLOSED, _MOVING = (142, 36, 170), (255, 145, 0)
 _MAP_EVERY = 10  # frames between two pictures of the whole map, whose covariances take their time
 
 
 class Viewer:
-    """Shows a run while it goes on, or keeps it for later; a context manager.
+    """Shows a run in a window (`LIVE`), or keeps it in an ``.rrd`` file; a context manager.
 
-    Args:
-        target: `LIVE` for a viewer window that is started, else the ``.rrd`` file to be written.
-        rig: the cameras; without them no images are shown.
-        truth: the true path, drawn where it is known.
-
-    Raises:
-        SlamError: Rerun is not installed, the viewer cannot be started, or the file not written.
+    Without `rig` no images are shown. Raises SlamError where Rerun is not installed, the window cannot be opened, or
+    the file not be written.
     """
 
     def __init__(self, target: str, rig: StereoRig | None = None, truth: Trajectory | None = None) -> None:
@@ -90,8 +84,10 @@ class Viewer:
             self.log(place, self._transform(moving.estimate.T_world_object))
             boxes = rr.Boxes3D(centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=_MOVING)
             self.log(f"{place}/box", boxes)
-        if result.keyframe:
-            self._show_places(system)
+        loops = [(loop.first, loop.second) for loop in system.atlas.loops]
+        if loops and result.keyframe:
+            ends = system.atlas.poses_in_map[np.array(loops), :3, 3]
+            self.log("/loops", rr.LineStrips3D(ends, colors=_CLOSED))
         if result.index % _MAP_EVERY == 0:
             whole = system.estimate()
             self.show_map(whole.positions, whole.covariances, np.isin(whole.ids, result.matched))
@@ -118,16 +114,6 @@ class Viewer:
             size = {"resolution": [left.width, left.height], "image_plane_distance": 0.2}
             self.log("/camera/image", rr.Pinhole(image_from_camera=left.K, **size))
         self.log("/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
-
-    def _show_places(self, system: StereoSlam) -> None:
-        """Keyframes, the path through them as loops have corrected it, and loops, closed and refused."""
-        rr, atlas = self.rr, system.atlas
-        at = atlas.poses_in_map[:, :3, 3]
-        self.log("/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
-        self.log("/places/path", rr.LineStrips3D([at[atlas.prior_count :]], colors=_PLACE))
-        closed = [(loop.first, loop.second) for loop in atlas.loops]
-        for name, pairs, colour in (("closed", closed, _CLOSED), ("refused", atlas.refused, _REFUSED)):
-            self.log(f"/places/loops_{name}", rr.LineStrips3D(at[np.array(pairs, int).reshape(-1, 2)], colors=colour))
 
     def _transform(self, T: Array) -> Any:
         return self.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])

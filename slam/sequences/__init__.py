@@ -22,6 +22,8 @@ from slam.sequences.options import RECORDED, Options, read_options
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
+_PACKED = (".zip", ".7z", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4")  # files of one or more others
+
 #: Formats on disk, in the order in which they are tried: module, the end of its functions' names, and description.
 _FORMATS = {
     "ros": ("ros", "folder", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
@@ -143,7 +145,8 @@ def _format(folder: Path, query: str, text: str) -> str | None:
         what = "file or folder" if folder.suffix else "folder"
         raise SequenceError(f"{folder}: there is no such {what}{hints.near_name(folder, text)}")
     if not folder.is_dir() and "layout" not in named:
-        hint, film = "", folder.suffix.lower() in VIDEO_SUFFIXES
+        film = folder.suffix.lower() in VIDEO_SUFFIXES
+        hint = "; unpack it first" if folder.suffix.lower() in _PACKED else ""
         if film:
             hint = f"; a video with both images side by side is {folder}?layout=sbs, two are {folder.parent}"
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}{'?left=…&right=…' * film}")

@@ -29,6 +29,7 @@ NO_NUMBERS = (ValueError, TypeError, OverflowError)
 _ZED_SIZES = {"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200), "HD": (1280, 720), "SVGA": (960, 600),
               "VGA": (672, 376)}  # fmt: skip
 _KITTI = re.compile(r"^(P|P_rect_0)0[: ]", re.MULTILINE)
+_NO_TEXT = (".npz", ".npy", ".pkl", ".mat")  # of NumPy, Python and MATLAB
 _DEEPEST = 32  # of nested entries
 _MOST = 1e9  # numbers of a calibration are smaller than this; larger ones overflow in what is made of them
 _LIMIT = 4 * 2**20  # most bytes of a file: OpenCV's sample programs keep all corners of all images in it
@@ -117,6 +118,8 @@ def projection_offset(P: Array) -> Array:
 
 def read_form(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
     """What a file holds, and whose form it is where its entries do not tell; CalibrationError where it is no rig's."""
+    if path.suffix.lower() in _NO_TEXT:
+        raise CalibrationError(f"{path}: no text: write K1, D1, K2, D2, R and T with cv2.FileStorage (docs/guide.md)")
     text = read_calibration(path).strip()
     if text.startswith("<"):
         return _read_xml(path, text), ""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from slam.errors import SequenceError
 from slam.naming import nearest
+from slam.sequences.images import IMAGE_SUFFIXES
 
 _LOOKED_AT = 500  # entries of a folder, and folders below one that is no sequence
 _LEVELS = 3  # folders above and below one that is no sequence: mav0/cam0/data, data_2d_raw/drive
@@ -34,10 +35,17 @@ def sequences_near(folder: Path, format_of: Format) -> str:
     below = sorted(str(path.relative_to(folder)) for path in _below(folder, format_of))
     if below:
         more = f", … ({len(below)})" if len(below) > _LISTED else ""
-        return f"; below it are {', '.join(below[:_LISTED])}{more}: give one of them"
+        there = (
+            f"are {', '.join(below[:_LISTED])}{more}: give one of them"
+            if len(below) > 1
+            else f"is {below[0]}: give that"
+        )
+        return f"; below it {there}"
     for parent in islice(folder.parents, _LEVELS):
         if (name := _format(parent, format_of)) is not None:
             return f"; it is a part of one: give {parent} (format {name})"
+    if any(path.suffix.lower() in IMAGE_SUFFIXES for path in _inside(folder)):
+        return f"; where each image holds both cameras: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"
     return f"; where two cameras are in it by other names: '{folder.name}?left=…&right=…'"
 
 

@@ -13,6 +13,7 @@ from slam.errors import SequenceError
 from slam.files import expanded, note_input
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
+from slam.naming import count
 from slam.sequences.base import Images
 from slam.sequences.faults import FaultLog
 from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, require_same_size
@@ -152,7 +153,7 @@ def listed(folders: list[Path], names: list[list[str]], faults: FaultLog) -> lis
         gaps = int(steps.sum()) - len(steps)
         if not found.stamped and gaps > 0 and np.median(steps) == 1:
             after = listing.names[int(np.argmax(steps > 1))]
-            line = f"{folder}: {gaps} images are missing between the first and the last (after {after})"
+            line = f"{folder}: {count(gaps, 'image')} missing between the first and the last (after {after})"
             faults.report("images", line)
         listings.append(in_order(listing, str(folder), faults))
     return listings
@@ -247,14 +248,15 @@ def _report_alone(
     head, tail = int(kept[0]), len(left) - 1 - int(kept[-1])
     alone = kept[partner[kept] < 0]
     unused = len(right) - int((partner >= 0).sum())
-    if head or tail:
-        line = f"{left.folder}: {head} images before the first pair and {tail} after the last are left out"
-        faults.report("pairs", line)
+    for ends, where in ((head, "before the first pair"), (tail, "after the last pair")):
+        if ends:
+            faults.report("pairs", f"{left.folder}: {count(ends, 'image')} {where} left out")
     if len(alone):
-        line = f"{left.folder}: {len(alone)} images have no partner in {right.folder} (first: {left.names[alone[0]]})"
-        faults.report("pairs", f"{line}; {'left out' if swap else 'given without a right image'}")
+        line = f"{left.folder}: {count(len(alone), 'image')} without a partner in {right.folder}"
+        what = "left out" if swap else "given without a right image"
+        faults.report("pairs", f"{line} (first: {left.names[alone[0]]}); {what}")
     if unused:
-        faults.report("pairs", f"{right.folder}: {unused} images have no partner in {left.folder}; left out")
+        faults.report("pairs", f"{right.folder}: {count(unused, 'image')} without a partner in {left.folder}; left out")
 
 
 def _stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:
@@ -267,13 +269,13 @@ def _stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) ->
     if 2 * len(keep) < len(numbers):
         what = f"{untimed} have no time and {unordered} one that does not increase"
         raise SequenceError(f"{path}: of {len(numbers)} images {what}")
-    for count, what in (
+    for rows, what in (
         (len(times) - int(numbers[-1]) - 1, "the last {} rows have no image"),
         (untimed, "{} images have no time; left out"),
         (unordered, "{} times stand twice or run backwards; images left out"),
     ):
-        if count > 0:
-            faults.report("stamps", f"{path}: {what.format(count)}")
+        if rows > 0:
+            faults.report("stamps", f"{path}: {what.format(rows)}")
     return keep, stamps[keep]
 
 

@@ -1,13 +1,13 @@
 from __future__ import annotations
 
-from slam.commands.display import compiling, progress
+from slam.commands.display import progress
 from slam.runtime.compile_clock import compile_clock
 
 
 def test_kernels_that_are_compiled_are_counted_within_80_columns(capsys, monkeypatch):
     """A first run was silent for minutes."""
     monkeypatch.setenv("COLUMNS", "80")
-    for shown in (progress(50, "…mera_people · smoother"), compiling()):
+    for shown in (progress(50, "…mera_people · smoother"), progress(None, "")):
         with shown:
             compile_clock.watch(23, 60)
         lines = capsys.readouterr().err.splitlines()

@@ -7,7 +7,7 @@ import pytest
 from slam.commands import compare as command
 from slam.commands.compare import compare, variants_of
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
-from slam.compare.statistics import certain_of, fewest
+from slam.compare.statistics import fewest
 from slam.compare.tables import most_tests
 from slam.compare.wording import caution
 from slam.errors import ConfigurationError
@@ -54,10 +54,10 @@ def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     """It was told by a time of a frame from another machine."""
     tried = []
 
-    def run_trial(trial):
+    def run_trial(trial, folder):
         tried.append(trial)
         times = {"outcome": outcome, "milliseconds": {"total": 100.0, "read": 60.0, "extract": 20.0}}
-        return {"result.json": json.dumps(times)}
+        (folder / "result.json").write_text(json.dumps(times))
 
     outcome = "completed"
     monkeypatch.setattr(command, "run_trial", run_trial)
@@ -108,7 +108,6 @@ def test_how_many_trials_are_enough_is_one_number():
     """It was 6 before the trials, where one test was counted, and more after them."""
     tests = most_tests(Plan(WORLDS[:1], ("ekf", "smoother", "window")))
     enough = fewest(tests)
-    assert certain_of(enough) >= tests > certain_of(enough - 1)
     assert enough == 12  # as many as there are by default
     for trials in (1, 2, 8):
         assert f"{enough} trials are enough for all figures" in caution(trials, tests)

@@ -13,10 +13,9 @@ import pytest
 
 from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Variant
 from slam.compare.report import write_report
-from slam.compare.scheduler import DaskScheduler, LocalScheduler
 from slam.compare.sweep import RUNS, SWEEP, sweep
 from slam.compare.tables import groups, write_tables
-from slam.compare.trial import failed, run_trial
+from slam.compare.trial import keep_result, run_trial
 from slam.errors import SlamError
 from slam.run.results import BY_KEY
 
@@ -30,9 +29,9 @@ def tables(folder):
     return {name: (folder / name).read_bytes() for name in TABLES}
 
 
-def swept(out, scheduler, on_done=None):
+def swept(out, workers, on_done=None):
     """The runs of the plan; their tables are written."""
-    runs = sweep(PLAN, out, scheduler, on_done)
+    runs = sweep(PLAN, out, workers, on_done)
     write_tables(groups(PLAN, runs), runs, out)
     return runs
 
@@ -41,7 +40,7 @@ def swept(out, scheduler, on_done=None):
 def done(tmp_path_factory):
     """A finished comparison, by one worker."""
     out = tmp_path_factory.mktemp("done")
-    return out, swept(out, LocalScheduler(1))
+    return out, swept(out, 1)
 
 
 @pytest.fixture
@@ -81,25 +80,28 @@ def test_a_replay_gives_all_back_ends_what_the_first_was_given(done):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_two_workers_one_killed_half_way_leave_the_same_tables(done, tmp_path):
+def test_a_killed_worker_ends_the_sweep_which_goes_on_and_leaves_the_same_tables(done, tmp_path):
     ended = []
 
     def kill_one(trial):
         ended.append(trial)
-        if len(ended) == 2:
+        if len(ended) == 1:
             os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
 
-    swept(tmp_path, LocalScheduler(2), kill_one)
-    assert len(ended) == 8
+    with pytest.raises(SlamError, match="a worker process died"):
+        swept(tmp_path, 2, kill_one)
+    assert not multiprocessing.active_children()
+    swept(tmp_path, 2)
     assert tables(tmp_path) == tables(done[0])
 
 
-@pytest.mark.filterwarnings("default")  # Dask's own
-def test_a_cluster_leaves_the_same_tables(done, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-        swept(tmp_path, DaskScheduler(cluster.scheduler_address))
-    assert tables(tmp_path) == tables(done[0])
+def test_an_interrupt_ends_the_workers(tmp_path):
+    def interrupt(trial):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        swept(tmp_path, 2, interrupt)
+    assert not multiprocessing.active_children()
 
 
 def test_what_is_done_is_not_done_again_and_what_is_not_is(done, again):
@@ -108,16 +110,15 @@ def test_what_is_done_is_not_done_again_and_what_is_not_is(done, again):
     shutil.rmtree(lost)
     (lost.parent / (lost.name + ".part")).mkdir()  # what a killed sweep may leave
     (damaged / "result.json").write_text("{half a res")
-    swept(again, LocalScheduler(1))
+    swept(again, 1)
     assert (kept / "marker").exists()
     assert tables(again) == tables(done[0])
 
 
 def test_a_failed_run_is_counted_never_dropped(again):
     trial = next(t for t in PLAN.trials_of(CLOSED_LOOP) if t.backend == "smoother")
-    for name, content in failed(trial, ValueError("no\nway")).items():
-        (again / RUNS / trial.folder / name).write_bytes(content)
-    runs = swept(again, LocalScheduler(1))
+    keep_result(trial, again / RUNS / trial.folder, ValueError("no\nway"))
+    runs = swept(again, 1)
     group = groups(PLAN, runs)[0]
     assert (group.failures("ekf"), group.failures("smoother")) == (0, 1)
     d = group.differences(BY_KEY["ate_online_m"])["smoother"]
@@ -128,9 +129,10 @@ def test_a_failed_run_is_counted_never_dropped(again):
     assert (again / "runs.csv").read_text().count("failed: ValueError: no way") == 1
 
 
-def test_bad_input_of_a_trial_is_an_outcome():
+def test_bad_input_of_a_trial_is_an_outcome(tmp_path):
     trial = next(Plan(PLAN.sequences, PLAN.backends, PLAN.variants, 1, 7, 9).trials_of(REPLAY))
-    result = json.loads(run_trial(trial, None)["result.json"])
+    run_trial(trial, tmp_path / "one")
+    result = json.loads((tmp_path / "one" / "result.json").read_text())
     assert result["outcome"].startswith("failed: SlamError")
     assert result["metrics"] == {}
 
@@ -139,9 +141,9 @@ def test_a_folder_with_other_runs_is_left_alone(again):
     settings = replace(PLAN, variants=(Variant("simulated", "simulated", ("map.max_landmarks=190",)),))
     for other in (settings, replace(PLAN, trials=PLAN.trials - 1), replace(PLAN, backends=PLAN.backends[:1])):
         with pytest.raises(SlamError, match="more or other runs"):
-            sweep(other, again, LocalScheduler(1))
+            sweep(other, again, 1)
     tree = json.loads((again / SWEEP).read_text())
     for name in ("numpy", "code"):
         (again / SWEEP).write_text(json.dumps({**tree, "versions": {**tree["versions"], name: "0.1"}}))
         with pytest.raises(SlamError, match=rf"{name} 0\.1"):
-            sweep(PLAN, again, LocalScheduler(1))
+            sweep(PLAN, again, 1)

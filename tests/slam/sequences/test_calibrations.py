@@ -114,6 +114,12 @@ def test_faulty_entries(tmp_path: Path, build: SimpleNamespace, change: dict, te
     assert str(tmp_path / "a.yml") in str(error.value)
 
 
+def test_arrays_of_numpy_are_no_calibration(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", K1=K)
+    with pytest.raises(CalibrationError, match=r"a\.npz: no text: write K1, .* with cv2\.FileStorage"):
+        slam.load_rig(tmp_path / "a.npz", size=SIZE)
+
+
 def test_a_rectified_pair_by_five_numbers_and_all_that_is_wrong_with_them(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     file.write_text("fx: 500\nfy: 501\ncx: 31.5\ncy: 23.5\nbaseline: 120.0\n")

@@ -306,7 +306,7 @@ def test_kitti_tracking_as_downloaded(tmp_path: Path, build: SimpleNamespace) ->
     for camera, first in (("image_02", 0), ("image_03", 10)):
         for i in range(6):
             build.write_image(root / camera / "0003" / f"{i:06d}.png", first + i)
-    with pytest.raises(SequenceError, match="below it are image_02/0003"):
+    with pytest.raises(SequenceError, match="below it is image_02/0003: give that"):
         open_sequence(root)
     with pytest.raises(CalibrationError, match="add calibration=FILE"):
         open_sequence(root / "image_02" / "0003")

@@ -41,21 +41,24 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
     for name in ("empty", "corridor", "text", "pair/port", "pair/starboard", "pair/run"):
         (here / name).mkdir(parents=True)
     images = [f"pair/{side}/{k}.png" for side in ("port", "starboard") for k in "01"]
-    for name in ("text/a.txt", "both.mp4", "pair/run/summary.png", *images):
+    for name in ("text/a.txt", "text/a.bag.gz", "both.mp4", "pair/run/summary.png", "sides/0.png", *images):
+        (here / name).parent.mkdir(exist_ok=True)
         (here / name).write_text("x")
     for path, words in {
         "nowhere": "nowhere: there is no such folder",
         "nowhere.bag": r"nowhere\.bag: there is no such file or folder",
         "empty": "the folder is empty",
         "text": "no sequence of a known format",
+        "text/a.bag.gz": "; unpack it first$",
+        "sides": r"where each image holds both cameras: 'sides\?layout=sbs'",
         "text/a.txt": r"a\.txt: a file where the sequence's folder should be$",
         "both.mp4": r"folder should be; a video .* is .*both\.mp4\?layout=sbs",
         "garden/left": f"{here} has no 'garden'",
         "pair": r"by other names: 'pair\?left=…&right=…'$",
         kitti / "image_0": rf"give {kitti} .format kitti",
         euroc / "mav0/cam0/data": rf"give {euroc}(/mav0)? .format euroc",
-        kitti.parent.parent: r"no sequence of a known format .*; below it are sequences.03: give one of them$",
-        raw.parent: r"below it are 2011_09_26_drive_0013_sync: give",
+        kitti.parent.parent: r"no sequence of a known format .*; below it is sequences.03: give that$",
+        raw.parent: r"below it is 2011_09_26_drive_0013_sync: give",
     }.items():
         refused(here / path, SequenceError, words)
 
@@ -240,8 +243,8 @@ def test_one_camera_ahead_of_the_other(euroc: Path, kitti: Path, build: SimpleNa
         sequence = open_sequence(folder)
         assert [f.right is not None for f in sequence] == [True] * 3
         text = "\n".join(sequence.warnings)
-        assert "2 images before the first pair and 0 after the last are left out" in text
-        assert "1 images have no partner" in text
+        assert "2 images before the first pair left out" in text
+        assert "1 image without a partner" in text
     assert np.allclose(sequence.stamps, [0.2, 0.3, 0.4])
     assert np.allclose(sequence.ground_truth.positions[:, 2], [3, 4.5, 6])
 
@@ -258,7 +261,7 @@ def test_listed_images_that_are_missing_and_stamps_that_differ_a_little(euroc: P
     text = "\n".join(sequence.warnings)
     for cam, i in (("cam0", 1), ("cam1", 3)):
         assert f"{cam}/data.csv: 1 of 6 listed images are missing (first: {stamps[i]}.png)" in text
-    assert f"1 images have no partner in {euroc / 'mav0' / 'cam1' / 'data'} (first: {stamps[3]}.png)" in text
+    assert f"1 image without a partner in {euroc / 'mav0' / 'cam1' / 'data'} (first: {stamps[3]}.png)" in text
 
 
 def test_a_long_sequence_is_opened_and_read_in_constant_memory(kitti: Path) -> None:

@@ -195,7 +195,7 @@ def test_missing_partners_and_the_tolerance(tmp_path: Path) -> None:
     path = write(tmp_path / "gap.bag", rows)
     sequence = slam.open_sequence(path)
     assert seeds(sequence) == [(0, 10), (1, None), (2, 12), (3, 13), (4, 14), (5, 15)]
-    assert any("/stereo/left/image_raw: 1 images have no partner" in line for line in sequence.warnings)
+    assert any("/stereo/left/image_raw: 1 image without a partner" in line for line in sequence.warnings)
     with pytest.raises(SequenceError, match="nearest two are 1 ms apart"):
         slam.open_sequence(f"{path}?tolerance=0.0005")
 
