@@ -57,7 +57,7 @@ class Body:
     reported: int = 0  # number of frames in which it was reported as measured
     reported_unmeasured: int = 0  # number of frames in which it was reported though it was not measured
     apart_from: int | None = None  # id of the body of which it is a part with a motion of its own; None for none
-    distinct: bool = False  # whether it has moved apart from that for certain: then they are never one again
+    distinct: frozenset[int] = frozenset()  # ids of bodies that it is known not to be a part of
     belief: BodyBelief | None = field(default=None, repr=False)  # its estimate; None where there is none yet
 
     @property
@@ -154,7 +154,7 @@ def continued(body: Body, known: Body) -> Body:
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
         proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
         reported=known.reported, reported_unmeasured=known.reported_unmeasured,
-        measured_at=known.measured_at, belief=None,
+        measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
     )  # fmt: skip
 
 

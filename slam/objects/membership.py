@@ -6,7 +6,6 @@ of the two χ² over the window, a log-likelihood ratio, decides.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -51,15 +50,9 @@ _APART = 2.0  # a group has a motion of its own that leaves so many times less �
 class MembershipTest:
     """How well tracks fit a body, a row each."""
 
-    fixed: Array  # χ² (N,) of a point fixed in the body, and
-    still: Array  # of one fixed in the world
+    gain: Array  # by how much χ² the body explains them better than the still world (N,)
     fits: BoolArray  # whether the body explains them (N,)
     count: NDArray[np.int64]  # number of frames that say so (N,)
-
-    @property
-    def gain(self) -> Array:
-        """By how much χ² the body explains them better than the still world (N,)."""
-        return self.still - self.fixed
 
 
 def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> MembershipTest:
@@ -69,7 +62,7 @@ def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Membe
     fixed, still, count = _squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
     limit = _limits(3 * dof.shape[1])[np.maximum(dof.sum(axis=1) - 3, 1)]
     fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
-    return MembershipTest(fixed, still, fits, count)
+    return MembershipTest(still - fixed, fits, count)
 
 
 @cache
@@ -238,20 +231,41 @@ def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
     return np.concatenate([np.flatnonzero(tracks.seen & (tracks.body == body.id)), near])
 
 
-def are_one(
-    body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks
-) -> bool:  # fmt: skip
-    """Whether tracks of another body, of which no more are seen, have moved with this one all the time.
+def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
+    """The body in whose extent most of these tracks lie, if their past fits its motion, too; else None.
 
-    Where they lie beside it, its motion must explain nearly all that the still world leaves unexplained.
+    Args:
+        bodies: all bodies.
+        tracks: all tracks.
+        rows: which of them.
+        own: a body made of them alone.
     """
-    inside = 2 * (_distances(replace(body, reach=np.inf), tracks, theirs, _MERGED) < _NEAR).sum() > len(theirs)
-    if not inside and math.dist(body.middle, other.middle) > body.across + other.across:
-        return False
-    v = membership_test(body, tracks, theirs)
-    if v.fixed.sum() >= (2 * EXPLAINED if inside else _PART_EXPLAINED) * v.still.sum():
-        return False
-    return distinctness(body, mine, other, theirs, tracks) < 1.0
+    for body in bodies.values():
+        near = _distances(replace(body, reach=np.inf), tracks, rows, _MERGED) < _NEAR
+        if not body.measured or 2 * near.sum() <= len(rows):
+            continue
+        alone = float(_squares(*in_body_axes(own, tracks, rows)[:2]).sum())
+        points, A, known = in_body_axes(body, tracks, rows)
+        fixed = float(_squares(points, A).sum())
+        still = float(_still(tracks, rows, known).sum())
+        by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
+        certain = _squares_with_pose_error(points, A, body)
+        apart = body.seen > PROBATION and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
+        if fixed < 2 * EXPLAINED * still and not apart:
+            return body
+    return None
+
+
+def _squares_with_pose_error(points: Array, A: Array, body: Body) -> float:
+    """χ² of fixed points, in body coordinates by slot (N, W, 3) with information (N, W, 3, 3), if the pose may be off.
+
+    In every frame the points share the displacement by the error of the body's pose, of known covariance.
+    """
+    y = _means(points, A)
+    shared = np.linalg.inv(_spread_of_place(body, y.mean(axis=0)))
+    pull = times_vectors(A, points - y[:, None]).sum(axis=0)
+    explained = (pull * np.linalg.solve(A.sum(axis=0) + shared, pull[..., None])[..., 0]).sum()
+    return float(_squares(points, A).sum() - explained)
 
 
 def _spread_of_place(body: Body, y: Array) -> Array:
@@ -284,6 +298,19 @@ def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
         if off < least:
             best, least = body, off
     return best
+
+
+def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
+    """Whether the members `rows` of another body have moved with this one all the time.
+
+    The test is much stricter than that of `body_around`: nearly all that the still world leaves unexplained must be
+    explained.
+    """
+    if not len(rows):
+        return False
+    points, A, known = in_body_axes(whole, tracks, rows)
+    still = float(_still(tracks, rows, known).sum())
+    return float(_squares(points, A).sum()) < _PART_EXPLAINED * still
 
 
 def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
