@@ -112,6 +112,8 @@ class MovingObjectDetector(ObjectDetector):
             self._follow_regions(frame)
         self._prove(frame, found.scene)
         unproven = np.isin(tracks.body, [body.id for body in self.bodies.values() if not body.proven])
+        c = self.setup.config  # of a body that was dropped: nothing is known of these until a group could be found
+        unproven |= tracks.expelled & tracks.seen & (tracks.count(np.arange(len(tracks))) < c.min_frames + c.confirm)
         suspected = np.concatenate([tracks.landmark[found.suspects], tracks.landmark[unproven]])
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(frame)
@@ -240,8 +242,10 @@ class MovingObjectDetector(ObjectDetector):
                 self._drop(body)
 
     def _drop(self, body: Body) -> None:
-        """Let a body's tracks go; they need proof to become members of another one."""
-        membership.remove_members(self.tracks, np.flatnonzero(self.tracks.body == body.id), body)
+        """Let a body's tracks go; they stay suspected for a while, and need proof to become members of another one."""
+        mine = np.flatnonzero(self.tracks.body == body.id)
+        membership.remove_members(self.tracks, mine, body)
+        self.tracks.expelled[mine] = True
         del self.bodies[body.id]
 
     def _begin_estimates(self, frame: Frame) -> None:
