@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import factorise, solve_factorised, squared_distance, trace, whitener
+from slam.kernels.linear import factorise, solve_factorised, squared_distance, whitener
 from slam.kernels.se3 import move, transform_back
 from slam.kernels.stereo import by_pose, offsets, residual
 from slam.runtime.compilation import helper, kernel
@@ -228,26 +228,3 @@ def whiteners(covariances):
     for i in range(len(covariances)):
         whitener(covariances[i], out[i])
     return out
-
-
-@kernel
-def near_pairs(limit, first, covariances, second, others):
-    """Which of some Gaussians (N, 3) are nearer to which others (M, 3) than a limit of χ² (N, M)."""
-    near = np.zeros((len(first), len(second)), np.bool_)
-    gap, C = np.empty(3), np.empty((3, 3))
-    for n in range(len(first)):
-        P = covariances[n]
-        own = trace(P)
-        for m in range(len(second)):
-            Q = others[m]
-            square = 0.0
-            for i in range(3):
-                gap[i] = first[n, i] - second[m, i]
-                square += gap[i] * gap[i]
-            # No variance is larger than the trace: most pairs are too far apart, whatever their covariances are.
-            if square < limit * (own + trace(Q)):
-                for i in range(3):
-                    for j in range(i + 1):
-                        C[i, j] = P[i, j] + Q[i, j]
-                near[n, m] = squared_distance(gap, C) < limit
-    return near

@@ -131,6 +131,8 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
     changes: dict[str, Any] = {}
     if estimate.measured:
         changes = {"seen_at": stamp, "measured_at": stamp, "seen": body.seen + 1, "missed": 0}
+    if estimate.measured and belief.since == stamp and body.belief is None:
+        body = replace(body, known=np.zeros_like(body.known))  # the estimate began anew: it knows of no earlier pose
     return body.placed(
         estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
         velocity_covariance=P, belief=belief, moved=body.moved or belief.moved,

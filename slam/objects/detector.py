@@ -20,17 +20,16 @@ from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.config import ObjectsConfig
 from slam.objects.estimates import reported
 from slam.objects.estimator import FRAMES, BodyEstimator
-from slam.objects.first_frames import FirstSights, Places, moving_landmarks
 from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.measurement import measure
 from slam.objects.merging import merge
-from slam.objects.modes import ObjectDetector
+from slam.objects.modes import ObjectDetector, Places
 from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
-from slam.objects.regions import Regions, follow_regions, proven_region
+from slam.objects.regions import Region, follow_regions
 from slam.objects.revision import CorrectRows, revise_tracks
-from slam.objects.scene import Scene, displacements
+from slam.objects.scene import Scene, displacements, moved_since
 from slam.objects.tracks import Tracks, fit_positions, fit_velocities, make_room, record
 
 _NONE: IndexArray = np.zeros(0, np.intp)
@@ -63,9 +62,9 @@ class MovingObjectDetector(ObjectDetector):
         self._stamps = np.full(window, np.nan)
         self._poses = np.tile(np.eye(4), (window, 1, 1))  # of the left camera in the window's frames
         self._number = -1
-        self._first = FirstSights.none()
+        self._first: dict[int, tuple[int, Array]] = {}  # landmarks by id: frame and place of the first sight
         self._path: RecentPoses | None = None
-        self._regions = Regions.none()
+        self._regions: list[Region] = []
 
     def revise(self, correct: CorrectRows) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
@@ -77,12 +76,17 @@ class MovingObjectDetector(ObjectDetector):
         T_world_left: Array,
     ) -> IdArray:  # fmt: skip
         """See `slam.objects.modes.ObjectDetector`."""
-        s, now = self.setup, self._number + 1
-        if not 0 < now < s.config.window:
+        s, c, now = self.setup, self.setup.config, self._number + 1
+        if not 0 < now < c.window or not len(ids):
             return NO_IDS
+        new = np.flatnonzero([id not in self._first for id in ids.tolist()])
+        self._first.update(zip(ids[new].tolist(), zip(np.maximum(now - ages[new], 0), places(ids[new]))))
+        frames, points = map(np.array, zip(*(self._first[id] for id in ids.tolist())))
         pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-        self._first = self._first.after(ids, places, np.maximum(now - ages, 0))
-        return ids[moving_landmarks(s.rig, T_world_left, self._first.of(ids), pixels, now, s.sigma, s.config)]
+        return ids[moved_since(
+            s.rig, T_world_left, points, now - frames.astype(float), pixels, s.sigma, c.doubtful, c.suspect,
+            c.min_support,
+        )]  # fmt: skip
 
     def step(
         self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,
@@ -108,6 +112,8 @@ class MovingObjectDetector(ObjectDetector):
             self._follow_regions(frame)
         self._prove(frame, found.scene)
         unproven = np.isin(tracks.body, [body.id for body in self.bodies.values() if not body.proven])
+        c = self.setup.config  # of a body that was dropped: nothing is known of these until a group could be found
+        unproven |= tracks.expelled & tracks.seen & (tracks.count(np.arange(len(tracks))) < c.min_frames + c.confirm)
         suspected = np.concatenate([tracks.landmark[found.suspects], tracks.landmark[unproven]])
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(frame)
@@ -190,14 +196,10 @@ class MovingObjectDetector(ObjectDetector):
 
     def _follow_regions(self, frame: Frame) -> None:
         """Follow the regions that may move; one that has moved for certain becomes a body."""
-        regions, members = follow_regions(self._regions, frame, self.tracks)
-        keep = np.ones(len(regions), bool)
-        for i, rows in members:
-            if proven_region(regions, i, len(rows), frame):
-                keep[i] = False
-                group = finder.region_group(frame, self.tracks, regions.state[i], regions.covariance[i], rows)
-                self._found(group, frame, far=True)
-        self._regions = regions.select(keep)
+        self._regions = follow_regions(self._regions, frame, self.tracks)
+        for region in [r for r in self._regions if r.has_moved(frame)]:
+            self._regions.remove(region)
+            self._found(finder.region_group(frame, self.tracks, region), frame, far=True)
 
     def _found(self, group: finder.MovingGroup, frame: Frame, whole: int | None = None, far: bool = False) -> None:
         """Make a body of tracks with a common twist, or continue with them one that was out of view.
@@ -240,8 +242,10 @@ class MovingObjectDetector(ObjectDetector):
                 self._drop(body)
 
     def _drop(self, body: Body) -> None:
-        """Let a body's tracks go; they need proof to become members of another one."""
-        membership.remove_members(self.tracks, np.flatnonzero(self.tracks.body == body.id), body)
+        """Let a body's tracks go; they stay suspected for a while, and need proof to become members of another one."""
+        mine = np.flatnonzero(self.tracks.body == body.id)
+        membership.remove_members(self.tracks, mine, body)
+        self.tracks.expelled[mine] = True
         del self.bodies[body.id]
 
     def _begin_estimates(self, frame: Frame) -> None:

@@ -14,6 +14,7 @@ from slam.objects import membership
 from slam.objects.bodies import Body, in_body_axes, new_body
 from slam.objects.frame import Frame
 from slam.objects.points import compact
+from slam.objects.regions import Region
 from slam.objects.scene import LAG, Scene, classify_scene, displacements, known_well
 from slam.objects.tracks import Tracks, constant_velocity, fit_velocities
 
@@ -133,9 +134,9 @@ def _with_common_twist(frame: Frame, tracks: Tracks, members: IndexArray) -> Mov
     return MovingGroup(members, centre, twist, covariance + np.diag([angular] * 3 + [linear] * 3))
 
 
-def region_group(frame: Frame, tracks: Tracks, state: Array, covariance: Array, members: IndexArray) -> MovingGroup:
-    """A followed region's tracks, with its velocity: state and covariance are those of place and velocity (6,)."""
+def region_group(frame: Frame, tracks: Tracks, region: Region) -> MovingGroup:
+    """A followed region's tracks, with its velocity."""
     P = frame.setup.models.initial_angular_velocity_sigma**2 * np.eye(6)
-    P[3:, 3:] = covariance[3:, 3:]
-    twist = np.concatenate([np.zeros(3), state[3:]])
-    return MovingGroup(members, tracks.position[members].mean(axis=0), twist, P)
+    P[3:, 3:] = region.covariance[3:, 3:]
+    twist = np.concatenate([np.zeros(3), region.state[3:]])
+    return MovingGroup(region.rows, tracks.position[region.rows].mean(axis=0), twist, P)

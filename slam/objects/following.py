@@ -14,7 +14,7 @@ from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.frame import Frame
 from slam.objects.pixel_kernels import best_of_products, continue_tracks, within_reach
-from slam.objects.regions import Regions
+from slam.objects.regions import Region
 from slam.objects.track_kernels import inverses
 from slam.objects.tracks import Tracks
 
@@ -22,7 +22,7 @@ _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 
 
-def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: Regions, frame: Frame) -> None:
+def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], frame: Frame) -> None:
     """Find each track's feature in this frame; sets rows, descriptors and misses, in place.
 
     Members of bodies take over their feature's descriptor even if `slam.objects.recovery.located` does not confirm the
@@ -130,7 +130,7 @@ class _Search:
         )  # fmt: skip
 
 
-def _carried_along(search: _Search, bodies: Mapping[int, Body], regions: Regions, taken: BoolArray) -> None:
+def _carried_along(search: _Search, bodies: Mapping[int, Body], regions: list[Region], taken: BoolArray) -> None:
     """Look for young tracks on what moves where it takes them."""
     s, tracks, dt = search.frame.setup, search.tracks, search.frame.dt
     young = _young(tracks, s.config.min_frames - 1)
@@ -141,12 +141,11 @@ def _carried_along(search: _Search, bodies: Mapping[int, Body], regions: Regions
         on = ((local > body.lower - size) & (local < body.upper + size)).all(axis=1)
         R = body.T[:3, :3]
         search.about(young[on], transform(body.T, local[on]), R @ body.covariance[3:, 3:] @ R.T, taken)
-    middles = regions.state[:, :3]
-    radius = s.radius(np.linalg.norm(middles - search.frame.eye, axis=1))
-    inside = np.linalg.norm(places - middles[:, None], axis=2) < radius[:, None]
-    for i in np.flatnonzero(inside.any(axis=1)).tolist():
-        ahead = places[inside[i]] + dt * regions.state[i, 3:]
-        search.about(young[inside[i]], ahead, dt**2 * regions.covariance[i, 3:, 3:], taken)
+    for region in regions:
+        middle = region.state[:3]
+        inside = np.linalg.norm(places - middle, axis=1) < s.radius(np.linalg.norm(middle - search.frame.eye))
+        ahead = places[inside] + dt * region.state[3:]
+        search.about(young[inside], ahead, dt**2 * region.covariance[3:, 3:], taken)
 
 
 def _young(tracks: Tracks, most: int) -> IndexArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from slam.data import Estimate, IdArray, StereoFeatures
@@ -9,8 +11,10 @@ from slam.geometry.arrays import IndexArray
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
 from slam.object_data import MotionLabels, MovingObject
-from slam.objects.first_frames import Places
 from slam.objects.revision import CorrectRows
+
+#: Gives the positions (K, 3) of landmarks in the world [m] by their ids (K,).
+Places = Callable[[IdArray], Array]
 
 
 class ObjectDetector:

@@ -7,10 +7,11 @@ import slam
 from slam.config import SystemConfig
 from slam.geometry.se3 import exp, inverse, log, transform
 from slam.objects.config import ObjectsConfig
-from slam.objects.first_frames import FirstSights, moving_landmarks
+from slam.objects.scene import moved_since
 from tests.slam.scene import RIG
 
 SIGMA = 0.3  # pixel noise [px]
+IDENTITY = np.eye(4)
 
 
 def seen(points, T_world_left, rng):
@@ -31,14 +32,21 @@ def scene(shift, near=12, count=90, seed=1):
     before = seen(points, np.eye(4), rng)
     first = RIG.triangulate(before[:, :2], before[:, [2, 1]])
     now = points + np.where(np.arange(count)[:, None] < near, shift, 0.0)
-    return FirstSights(np.arange(count), first, np.zeros(count, np.int64)), seen(now, np.eye(4), rng)
+    return first, seen(now, np.eye(4), rng)
+
+
+def moved(first, pixels, T_world_left=IDENTITY):
+    """Which of the landmarks moved in the three frames."""
+    c = ObjectsConfig()
+    frames = np.full(len(first), 3.0)
+    return moved_since(RIG, T_world_left, first, frames, pixels, SIGMA, c.doubtful, c.suspect, c.min_support)
 
 
 def test_landmarks_that_move_together_are_told_from_a_wrong_pose():
     """The pose is wrong by 5 mm and 5 mrad, which moves most of the scene by more than the group moved."""
     first, pixels = scene((0.02, 0.0, 0.0))
     wrong = exp(np.array([0.0, 0.005, 0.0, 0.005, 0.0, 0.0]))
-    moves = moving_landmarks(RIG, wrong, first, pixels, 3, SIGMA, ObjectsConfig())
+    moves = moved(first, pixels, wrong)
     assert moves[:12].sum() >= 10 and moves[12:].sum() <= 2
 
 
@@ -47,25 +55,16 @@ def test_nothing_moves_in_a_still_scene():
     moves = 0
     for seed in range(10):
         first, pixels = scene((0.0, 0.0, 0.0), seed=seed)
-        moves += moving_landmarks(RIG, np.eye(4), first, pixels, 3, SIGMA, ObjectsConfig()).sum()
+        moves += moved(first, pixels).sum()
     assert moves <= 9
 
 
 def test_landmarks_without_a_right_pixel_are_not_tested_and_few_say_nothing():
     first, pixels = scene((0.05, 0.0, 0.0))
     pixels[:6, 2] = np.nan
-    moves = moving_landmarks(RIG, np.eye(4), first, pixels, 3, SIGMA, ObjectsConfig())
+    moves = moved(first, pixels)
     assert not moves[:6].any() and moves[6:12].all()
-    some = first.of(np.arange(8))
-    assert not moving_landmarks(RIG, np.eye(4), some, pixels[:8], 3, SIGMA, ObjectsConfig()).any()
-
-
-def test_first_sights_stay_as_they_were():
-    first = FirstSights.none().after(np.array([5, 2]), lambda ids: np.outer(ids, [1.0, 0, 0]), np.array([0, 1]))
-    later = first.after(np.array([2, 3]), lambda ids: np.outer(ids, [10.0, 0, 0]), np.array([7, 4]))
-    some = later.of(np.array([3, 2, 5]))
-    assert some.points[:, 0].tolist() == [30.0, 2.0, 5.0]
-    assert some.frame.tolist() == [4, 1, 0]
+    assert not moved(first[:8], pixels[:8]).any()
 
 
 def test_first_sights_are_of_the_frame_in_which_landmarks_joined_the_map():
@@ -76,16 +75,16 @@ def test_first_sights_are_of_the_frame_in_which_landmarks_joined_the_map():
     for k in range(8):
         result = system.process_features(sequence.simulate(k).features)
         joined.update(dict.fromkeys(result.added.tolist(), k))
-    first = system.objects._first
-    assert len(first.ids) > 20 and any(first.frame > 0)
-    assert [joined[i] for i in first.ids.tolist()] == first.frame.tolist()
+    first = {id: frame for id, (frame, _) in system.objects._first.items()}
+    assert len(first) > 20 and any(frame > 0 for frame in first.values())
+    assert first == {id: joined[id] for id in first}
 
 
 def test_a_large_group_does_not_hide_single_landmarks_that_move():
     first, pixels = scene((0.05, 0.0, 0.0), near=30, count=100)
     pixels[[40, 60, 80], 0] += 8.0
     pixels[[40, 60, 80], 2] += 8.0
-    moves = moving_landmarks(RIG, np.eye(4), first, pixels, 3, SIGMA, ObjectsConfig())
+    moves = moved(first, pixels)
     assert moves[[40, 60, 80]].all() and moves[:30].sum() >= 28
 
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.geometry.kernels import near_pairs
 from slam.objects import track_kernels
 
 RNG = np.random.default_rng(5)
@@ -53,15 +52,3 @@ def test_a_displacement_is_less_certain_by_the_slide_of_a_feature_seen_from_else
         _, W, _ = track_kernels.displaced(A, p, dof, *none, np.array([0]), ages, 3, ray, centres, slide)
         P[slide] = np.linalg.inv(W[0])
     np.testing.assert_allclose(P[1e-4] - P[0.0], 1e-4 * 0.1 * 2.0**2 * np.diag([1.0, 1.0, 0.0]), atol=1e-12)
-
-
-def test_pairs_of_near_gaussians():
-    """Against χ² of all pairs."""
-    rng = np.random.default_rng(7)
-    first, second = rng.normal(0, 1, (20, 3)), rng.normal(0, 1, (30, 3))
-    P, Q = (rng.normal(0, 0.5, (n, 3, 3)) for n in (20, 30))
-    P, Q = P @ np.swapaxes(P, 1, 2), Q @ np.swapaxes(Q, 1, 2)
-    gaps = first[:, None] - second
-    squares = np.einsum("nmi,nmij,nmj->nm", gaps, np.linalg.inv(P[:, None] + Q), gaps)
-    near = near_pairs(7.8, first, P, second, Q)
-    assert (near == (squares < 7.8)).all() and near.any() and not near.all()
