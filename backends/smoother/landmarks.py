@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from backends.smoother.landmark_kernels import carried_by, information_of
+from backends.smoother.kernels import carried_by, information_of
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array, points_by_pose
@@ -89,10 +89,13 @@ class SmootherLandmarks(LandmarkRows):
     def with_variables(self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array) -> Self:
         """With more landmarks as variables, of those that a pose T (4, 4) is about to measure (M, 3); at most so many.
 
+        None where it measures more: these hold the path well enough as they come and go, at half the cost.
         These are landmarks whose smart factor is full: as variables they keep what it says of them, as its measurements
         go over. They are in front of the camera by three of their sigmas, so that Gauss-Newton steps cannot put them
         behind it. Variables that were not measured for longer than a factor spans make room, the oldest first.
         """
+        if len(rows) > most:
+            return self
         last, variable = self.pose.max(axis=1), self.begun == VARIABLE
         far = np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
         sure = SIGMAS * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < far

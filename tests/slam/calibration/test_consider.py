@@ -131,7 +131,7 @@ def test_a_result_says_what_its_error_shares_with_other_frames(backend):
         ("ekf", {}, False),
         ("window", {}, True),
         ("smoother", {"lag": None}, True),
-        ("smoother", {"lag": 5, "past": 3, "motion": 0.0}, False),
+        ("smoother", {"lag": 5, "past": 3}, False),
     ],
     ids=["ekf", "window", "smoother", "bounded smoother"],
 )
