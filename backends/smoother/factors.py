@@ -81,7 +81,7 @@ class FactorMaker:
             keys: variables of three successive poses, or of two of which the first velocity is unknown.
             dt: times between the last three (2,) [s]; the first does not count where there are two.
         """
-        n, before, last = len(keys), *dt.tolist()
+        n, before, last = len(keys), float(dt[0]), float(dt[1])
 
         def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
             r, J = motion_error(np.array([values.atPose3(key).matrix() for key in keys]), before, last)

@@ -72,11 +72,15 @@ def test_errors_fit_the_covariances_over_seeds():
     assert 1.5 < np.mean(squared) < 9  # 6 expected; the path is smoother than the motion model expects
 
 
-def test_far_landmarks_that_soon_leave_are_not_believed_too_much():
-    """What hung at another pose, and landmarks first seen there, shared an error: 1.9 m off, 13 sigma, in 50 frames."""
+@pytest.mark.parametrize(("seen_at_once", "most"), [(100, 0.3), (15, 1.5)])
+def test_far_landmarks_that_soon_leave_are_not_believed_too_much(seen_at_once, most):
+    """Of 100 in a frame: what hung at another pose, and landmarks first seen there, shared an error: 1.9 m, 13 sigma.
+
+    Of 15: as variables far ones are linearised where they are not linear: 3.8 m, 18 sigma.
+    """
     poses = path(150, DT, np.array([0.0, 0.0, 8.0]), np.zeros(3))
     models = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0)
-    data, known = scene(poses, points=1500, limit=100), set()
+    data, known = scene(poses, points=1500, limit=seen_at_once), set()
     backend = SmootherBackend(RIG, models)
     for k, (stamp, truth, seen) in enumerate(data):
         assert step(backend, stamp, seen, known).status is UpdateStatus.OK or not k, "also with far points alone"
@@ -85,7 +89,7 @@ def test_far_landmarks_that_soon_leave_are_not_believed_too_much():
         known.difference_update(gone)
         last = backend.estimate(landmarks=False)
         off = np.linalg.norm(last.T_world_left[:3, 3] - truth[:3, 3])
-        assert off < 3 * np.sqrt(np.trace(last.covariance[3:, 3:])) and off < 0.3, k
+        assert off < 3 * np.sqrt(np.trace(last.covariance[3:, 3:])) and off < most, k
 
 
 def test_a_frame_that_saw_new_landmarks_alone_is_a_pose():
@@ -177,7 +181,7 @@ def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it(
     """A camera sways before the same few points: its error does not grow with every lag."""
     sway = np.cos(np.arange(150) / 12)
     poses = se3.pose(np.tile(np.eye(3), (150, 1, 1)), (sway - 1)[:, None] * np.array([0.4, 0.0, 0.2]))
-    data, models = scene(poses, points=8, limit=8), replace(MODELS, pixel_sigma=3.0)
+    data, models = scene(poses, points=8, limit=8), replace(MODELS, pixel_sigma=1.0)
     kept, anew = (SmootherBackend(RIG, models, landmarks=n) for n in (20, 0))
     for backend in (kept, anew):
         run(backend, data)
