@@ -107,8 +107,9 @@ class SmootherBackend:
         """See `slam.interfaces.Backend.add`."""
         s = self._started("add")
         if len(observations):
-            self.state = self._steps.added(s, observations.ids.copy(), self._steps.stereo.measure(observations))
-            self.path.follow(self.state)
+            s = self._steps.added(s, observations.ids.copy(), self._steps.stereo.measure(observations))
+            self.path.follow(s)
+            self.state = s
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What its measurements said about the poses is kept."""
