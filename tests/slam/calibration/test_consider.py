@@ -17,8 +17,8 @@ from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-#: By which share of an error's effect each may be off: the smoother's pose and landmarks are followed one by one, by the
-#: gains of each frame, where its graph solves for all of the lag together.
+#: By which share of an error's effect each may be off: the smoother's pose and landmarks are followed one by one, by
+#: the gains of each frame, where its graph solves for all of the lag together.
 BACKENDS = {"ekf": 0.05, "iekf": 0.05, "smoother": 0.25, "window": 0.05}
 NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
 CONFIG = SystemConfig(
