@@ -71,7 +71,7 @@ class BatchBackend:
         self.rig = rig
         self.models = models
         self.config = from_options(BatchConfig, "batch", options)
-        self._smoother = SmootherBackend(rig, models, motion=0.0, lag=None)
+        self._smoother = SmootherBackend(rig, models, lag=None)
         self._solution: _BatchSolution | None = None
 
     def predict(self, stamp: float) -> Prediction:

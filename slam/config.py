@@ -44,8 +44,8 @@ FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
     ("driving", "surf"): {"upright": True, "min_depth": 1.0},
 }
 
-#: Options of back ends that depend on the kind of motion. A vehicle's frames are a metre apart: each is worth a pose.
-BACKENDS: dict[tuple[str, str | None], dict[str, Any]] = {("driving", "smoother"): {"motion": 0.0}}
+#: Options of back ends that depend on the kind of motion: there are none.
+BACKENDS: dict[tuple[str, str | None], dict[str, Any]] = {}
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,10 @@ class SmootherBackend:
     """gtsam's incremental fixed-lag smoother over smart stereo factors.
 
     In every frame the newest pose is found from the landmarks as they stand, with the motion model as a prior
-    (`slam.window.pose_only`). Frames from which the landmarks have moved enough in the image become poses of the factor
-    graph: their measurements go into the smart factors, from which gtsam eliminates the landmarks, and the last poses
-    are estimated together. Other frames hang at the last pose of the graph. A landmark stands where its last
-    measurements put it, given the poses; some that are measured for longer than the lag are variables. Covariances are
-    gtsam's marginals.
+    (`slam.window.pose_only`), and becomes a pose of the factor graph: its measurements go into the smart factors, from
+    which gtsam eliminates the landmarks, and the last poses are estimated together. Frames that saw nothing hang at the
+    last pose of the graph. A landmark stands where its last measurements put it, given the poses; where few are in view
+    those that are measured for longer than the lag are variables. Covariances are gtsam's marginals.
 
     Args:
         rig: the cameras, rectified.
@@ -108,7 +107,9 @@ class SmootherBackend:
         """See `slam.interfaces.Backend.add`."""
         s = self._started("add")
         if len(observations):
-            self.state = self._steps.added(s, observations.ids.copy(), self._steps.stereo.measure(observations))
+            s = self._steps.added(s, observations.ids.copy(), self._steps.stereo.measure(observations))
+            self.path.follow(s)
+            self.state = s
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What its measurements said about the poses is kept."""

@@ -10,7 +10,8 @@ import gtsam
 import gtsam_unstable
 import numpy as np
 
-from slam.geometry.se3 import Array, nearest_rotation, so3_left_jacobian, so3_log
+from backends.smoother.kernels import motion_error
+from slam.geometry.se3 import Array, nearest_rotation
 from slam.models import EstimatorModels
 from slam.window.motion import velocity_sigmas
 from slam.window.stereo import RectifiedStereo
@@ -38,28 +39,6 @@ def _parameters(mode: gtsam.LinearizationMode) -> gtsam.SmartProjectionParams:
     parameters = gtsam.SmartProjectionParams()
     parameters.setLinearizationMode(mode)
     return parameters
-
-
-def velocity_change(poses: Array, dt: Array) -> tuple[Array, Array]:
-    """Velocity [ω, v] (6,) between the last two poses, less that before if there are three; with Jacobians (K, 6, 6).
-
-    ω is a body rate, v is in world axes.
-
-    Args:
-        poses: (K, 4, 4).
-        dt: times between the last three (2,) [s].
-    """
-    r, J = np.zeros(6), np.zeros((len(poses), 6, 6))
-    for i, sign in ((-1, 1.0), (-2, -1.0))[: len(poses) - 1]:
-        T0, T1, scale = poses[i - 1], poses[i], sign / dt[i]
-        turn = so3_log(T0[:3, :3].T @ T1[:3, :3])
-        by_later = np.linalg.inv(so3_left_jacobian(-turn))
-        r += scale * np.concatenate([turn, T1[:3, 3] - T0[:3, 3]])
-        J[i - 1, :3, :3] -= scale * by_later.T
-        J[i - 1, 3:, 3:] -= scale * T0[:3, :3]
-        J[i, :3, :3] += scale * by_later
-        J[i, 3:, 3:] += scale * T1[:3, :3]
-    return r, J
 
 
 class FactorMaker:
@@ -102,15 +81,16 @@ class FactorMaker:
             keys: variables of three successive poses, or of two of which the first velocity is unknown.
             dt: times between the last three (2,) [s]; the first does not count where there are two.
         """
+        n, before, last = len(keys), float(dt[0]), float(dt[1])
 
         def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
-            r, J = velocity_change(np.array([values.atPose3(key).matrix() for key in keys]), dt)
+            r, J = motion_error(np.array([values.atPose3(key).matrix() for key in keys]), before, last)
             if jacobians is not None:
-                for i, by_pose in enumerate(J):
-                    jacobians[i] = by_pose
+                for i in range(n):
+                    jacobians[i] = J[:, 6 * (i + 3 - n) : 6 * (i + 4 - n)]
             return r
 
-        sigmas = velocity_sigmas(self._models, float(dt[1]), len(keys) == 2)
+        sigmas = velocity_sigmas(self._models, last, n == 2)
         return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), keys, error)
 
     def point(self, z: Sequence[float]) -> gtsam.StereoPoint2:

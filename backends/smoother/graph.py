@@ -234,7 +234,7 @@ class Graph:
         self._kind = False, 0
 
     def followed(self, s: SmootherState) -> tuple[Solved, str]:
-        """The solution for a state with one pose more than the last one; and why the graph was built anew, if it was.
+        """The solution for a state with more poses than the last one; and why the graph was built anew, if it was.
 
         After a failure there are no landmarks among its variables.
 
@@ -242,10 +242,10 @@ class Graph:
             SolverError: gtsam fails with the new graph as well.
         """
         why = ""
-        if self._number == s.number - 1 >= s.begun and self._kind == _kind(s):
+        if s.begun <= self._number < s.number and self._kind == _kind(s):
             number, self._number = self._number, -1  # until it is done: an interrupted call leaves a graph unknown
             try:
-                return self._stepped(s, number), ""
+                return self._update(s, range(number + 1, s.number + 1), self.oldest(s), GraphProblem()), ""
             except FAILURES as error:
                 why, self.rebuilds = _line(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
@@ -260,7 +260,7 @@ class Graph:
             SolverError: gtsam fails.
         """
         self.restart()
-        oldest = self.oldest(s)
+        oldest, self._careful = self.oldest(s), max(self._careful, s.number + 1)
         try:
             self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
             prior, self._base = held(s, oldest)
@@ -274,9 +274,6 @@ class Graph:
         """Number of the oldest pose in the graph, where the newest one is that of the state, or has another number."""
         least = max(s.begun, s.first)
         return least if self._lag is None else max(least, (s.number if newest is None else newest) - self._lag)
-
-    def _stepped(self, s: SmootherState, number: int) -> Solved:
-        return self._update(s, range(number + 1, s.number + 1), self.oldest(s), GraphProblem())
 
     def _update(
         self, s: SmootherState, numbers: Iterable[int], first: int, problem: GraphProblem, again: int = 0

@@ -7,8 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from backends.smoother.landmark_kernels import carried_by, information_of
-from slam.chi_square import SIGMAS
+from backends.smoother.kernels import carried_by, information_of
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array, points_by_pose
 from slam.table import LandmarkRows
@@ -16,6 +15,9 @@ from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
 VARIABLE = -(10**9)  #: in place of the number of the pose with which a smart factor begins: a variable of the graph
+#: Least distance of a landmark that becomes a variable, in its standard deviations. A variable is linearised in space,
+#: and so off by one such part of its deviation, to the same side for all: of 20 together by a seventh of theirs.
+_LINEAR = 30.0
 _GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
 _DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
 _BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
@@ -89,13 +91,17 @@ class SmootherLandmarks(LandmarkRows):
     def with_variables(self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array) -> Self:
         """With more landmarks as variables, of those that a pose T (4, 4) is about to measure (M, 3); at most so many.
 
+        None where it measures more: these hold the path well enough as they come and go, at half the cost.
         These are landmarks whose smart factor is full: as variables they keep what it says of them, as its measurements
-        go over. They are in front of the camera by three of their sigmas, so that Gauss-Newton steps cannot put them
-        behind it. Variables that were not measured for longer than a factor spans make room, the oldest first.
+        go over. They are close enough to be linear in their position: far ones made a path metres off, unnoticed, and
+        Gauss-Newton steps might put them behind the camera. Variables that were not measured for longer than a factor
+        spans make room, the oldest first.
         """
+        if len(rows) > most:
+            return self
         last, variable = self.pose.max(axis=1), self.begun == VARIABLE
         far = np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
-        sure = SIGMAS * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < far
+        sure = _LINEAR * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < far
         full = ~variable[rows] & (self.begun[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
         new = rows[full & sure & np.isfinite(z[:, 2])]
         away = np.flatnonzero(variable & (last < pose - track))

@@ -44,6 +44,7 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
         now = s.poses[s.of(first) :]
     if not s.anchored:
         now = s.poses[-1] @ inverse(now[-1]) @ now
+        now[-1] = s.poses[-1]
     D = now[0] @ inverse(s.poses[s.of(first)])
     moved = np.concatenate([D @ s.poses[: s.of(first)], now])
     marks = s.landmarks
@@ -51,7 +52,8 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     position = np.where(away[:, None], transform(D, marks.position), marks.position)
     marks = replace(marks, position=position, mean=np.where(away[:, None], position, marks.mean))
     last = s.last.copy()
-    last[1] = moved[-1] @ inverse(s.poses[-1]) @ s.last[1]
+    if s.anchored:
+        last[1] = moved[-1] @ inverse(s.poses[-1]) @ s.last[1]
     before = s.poses[-1] if s.inside is False or len(moved) < 2 else s.poses[-2]
     after = moved[-1] if s.inside is False or len(moved) < 2 else moved[-2]
     last[0] = after @ inverse(before) @ s.last[0]

@@ -131,8 +131,6 @@ class Steps(RectifiedMeasurement):
         x = log(inverse(one.predicted) @ found.T)
         nis = float(squared_distances(pose_only.residuals(one, found.T)[0], one.noise).sum() + x @ one.information @ x)
         by_rig = np.linalg.solve(one.information + G.T @ G, one.information @ s.by_rig[6:] + G.T @ F)
-        if not (s.inside or self._is_chosen(s, found.T, seen)):
-            return _hung(s, found.T, G.T @ G, by_rig), nis, ""
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
         marks.by_rig[seen] = landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
@@ -145,29 +143,12 @@ class Steps(RectifiedMeasurement):
                 last=np.stack([s.last[0], found.T]), landmarks=marks, by_rig=np.concatenate([s.by_rig[:6], by_rig]),
             )  # fmt: skip
             return self.settled(after, graph.rebuilt(after)), nis, ""
-        after = _hung(s, found.T, G.T @ G, by_rig)
-        after = replace(
-            after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, s.tie),
-            spread=np.concatenate([s.spread, after.covariance[None]]), inside=True, landmarks=marks,
-        )  # fmt: skip
+        after = replace(_joined(_smoothed(s, found.T, G.T @ G, by_rig), sight), landmarks=marks)
         solved, why = graph.followed(after)
         after = self.settled(after, solved)
         drift = _drift(solved.covariance, after.poses[-2], after.poses[-1])
         marks = after.landmarks.without_variables(number) if why else after.landmarks
         return replace(after, landmarks=marks.left_behind(seen, after.poses[-1], drift)), nis, why
-
-    def _is_chosen(self, s: SmootherState, T: Array, seen: IndexArray) -> bool:
-        """Whether the newest frame, at T (4, 4), becomes a pose of the graph: see `SmootherConfig`."""
-        if self.config.motion == 0:
-            return True
-        again = np.isin(s.landmarks.serial[seen], s.sights[-1].serials)
-        if again.mean() < self.config.overlap:
-            return True
-        points = s.landmarks.position[seen[again]]
-        here, there = (transform(inverse(pose), points) for pose in (T, s.poses[-1]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            moved = np.linalg.norm(here[:, :2] / here[:, 2:] - there[:, :2] / there[:, 2:], axis=1)
-        return bool(np.nanmedian(moved) >= self.config.motion)
 
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest frame is a pose of it."""
@@ -197,12 +178,10 @@ class Steps(RectifiedMeasurement):
             MeasurementError: one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
-        marks = _seen_from_newest(s, ids, *self.first_sight(ids, z))
-        if s.inside:
-            nothing = np.zeros_like(marks.information)
-            new = np.arange(len(ids))
-            marks = replace(marks, information=nothing).measured(new, z, s.number, self.track)
-            s = replace(s, sights=(*s.sights[:-1], s.sights[-1].joined(Sight.of(marks, new, z))))
+        s = s if s.inside else _entered(s)
+        marks, new = _seen_from_newest(s, ids, *self.first_sight(ids, z)), np.arange(len(ids))
+        marks = replace(marks, information=np.zeros_like(marks.information)).measured(new, z, s.number, self.track)
+        s = replace(s, sights=(*s.sights[:-1], s.sights[-1].joined(Sight.of(marks, new, z))))
         return _with(s, marks)
 
     def inserted(self, s: SmootherState, ids: IdArray, positions: Array, covariances: Array) -> SmootherState:
@@ -253,10 +232,10 @@ def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> Smoot
     )  # fmt: skip
 
 
-def _hung(s: SmootherState, T: Array, information: Array, by_rig: Array) -> SmootherState:
-    """With the newest frame at T (4, 4), by measurements with an information (6, 6), but as no pose of the graph.
+def _smoothed(s: SmootherState, T: Array, information: Array, by_rig: Array) -> SmootherState:
+    """With the newest frame at T (4, 4), by measurements with an information (6, 6), and the frame before it likewise.
 
-    Its derivatives by errors of the rig are `by_rig` (6, m).
+    The newest one's derivatives by errors of the rig are `by_rig` (6, m).
     """
     own = np.linalg.inv(information + np.linalg.inv(s.own))
     gain = s.pair[:6, 6:] @ np.linalg.inv(s.own)
@@ -267,6 +246,22 @@ def _hung(s: SmootherState, T: Array, information: Array, by_rig: Array) -> Smoo
     before = s.last[0] @ exp(gain @ log(inverse(s.last[1]) @ T))
     both = np.concatenate([s.by_rig[:6] + gain @ (by_rig - s.by_rig[6:]), by_rig])
     return replace(s, last=np.stack([before, T]), pair=0.5 * (P + P.T), by_rig=both)
+
+
+def _joined(s: SmootherState, sight: Sight) -> SmootherState:
+    """With the newest frame as a pose of the graph, from which this was measured."""
+    return replace(
+        s, poses=np.concatenate([s.poses, s.last[1:]]), sights=(*s.sights, sight), ties=(*s.ties, s.tie),
+        spread=np.concatenate([s.spread, s.covariance[None]]), inside=True,
+    )  # fmt: skip
+
+
+def _entered(s: SmootherState) -> SmootherState:
+    """With the newest frame as a pose of the graph where it is predicted; the graph has it from the next update on."""
+    pair = np.zeros((12, 12))
+    pair[:6, :6] = relative_covariance(np.roll(s.pair, 6, (0, 1)), s.last[1], s.last[0])
+    marks = s.landmarks.left_behind(np.zeros(0, np.intp), s.last[1], s.own)
+    return replace(_joined(s, Sight.none()), pair=pair, landmarks=marks, measured=True)
 
 
 def _drift(P: Array, before: Array, newest: Array) -> Array:
@@ -285,8 +280,8 @@ def _seen_from_newest(
 ) -> SmootherLandmarks:
     """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes.
 
-    Errors of the rig move them there by `by_rig` (M, 3, m). From a frame that is no pose of the graph they are as
-    uncertain as it is itself, given the newest pose of the graph.
+    Errors of the rig move them there by `by_rig` (M, 3, m). From a frame that saw nothing else they are as uncertain as
+    it is itself, given the newest pose of the graph.
     """
     T = s.last[1]
     if not s.inside:

@@ -23,8 +23,7 @@ def test_the_pose_and_its_covariance_are_the_filters(name):
     data = scene(poses, points=60, sigma=sigma, limit=20)
     estimates = []
     for each in ("ekf", name):
-        options = {"motion": 0.0} if each == "smoother" else {}  # all its frames are estimated with all measurements
-        backend = backends.create(each, RIG, models=models, **options)
+        backend = backends.create(each, RIG, models=models)
         run(backend, data)
         estimates.append(backend.estimate())
     filtered, other = estimates
@@ -45,7 +44,7 @@ def test_the_smoother_gives_what_least_squares_does_where_velocities_are_well_kn
     estimates = []
     for name, options in (
         ("batch", {}),
-        ("smoother", {"motion": 0.0, "track": 1000, "lag": None}),
+        ("smoother", {"track": 1000, "lag": None}),
     ):  # it leaves nothing out
         backend = backends.create(name, RIG, models=models, **options)
         run(backend, data)

@@ -48,7 +48,7 @@ def test_without_noise_smoother_and_batch_are_the_truth(world):
 def test_the_smoother_is_nearly_as_good_as_the_optimum():
     sequence = slam.open_sequence("synthetic:desk?frames=40&outliers=0")
     recording = true_recording(sequence, config=MapConfig(target_in_view=40))
-    whole = {"lag": None, "motion": 0.0, "track": 60}  # it leaves nothing out
+    whole = {"lag": None, "track": 60}  # it leaves nothing out
     errors = []
     for make, options in ((BatchBackend, {}), (SmootherBackend, whole), (SmootherBackend, {})):
         backend = make(recording.rig, recording.models, **options)
@@ -86,7 +86,7 @@ def test_covariances_that_gtsam_cannot_give_are_the_smoothers(monkeypatch, error
             raise error
 
     data = drive()
-    backend, smoother = BatchBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, motion=0.0, lag=None)
+    backend, smoother = BatchBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, lag=None)
     run(backend, data)
     run(smoother, data)
     monkeypatch.setattr(gtsam, "Marginals", Broken)

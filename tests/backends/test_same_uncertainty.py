@@ -19,7 +19,7 @@ OTHERS = [name for name in backends.names() if name != "ekf"]
 
 
 def made(name: str, rig: StereoRig):
-    return backends.create(name, rig, models=MODELS, **({"motion": 0.0} if name == "smoother" else {}))
+    return backends.create(name, rig, models=MODELS)
 
 
 def deviations(backend) -> np.ndarray:

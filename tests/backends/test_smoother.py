@@ -48,7 +48,7 @@ def tracked(data, **options):
     return backend
 
 
-OPTIONS = [{}, {"motion": 0.0}, {"motion": 0.1}, {"track": 3}, {"lag": None}, {"lag": 4, "past": 0}]
+OPTIONS = [{}, {"track": 3}, {"lag": None}, {"lag": 4, "past": 0}]
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
@@ -62,14 +62,6 @@ def test_the_path_and_its_covariance_with_all_options(options):
     assert off @ np.linalg.solve(last.covariance, off) < 25  # χ²₆ exceeds that once in 3000 times
 
 
-def test_fewer_frames_become_poses_where_less_moves():
-    data = drive(30)
-    numbers = [tracked(data, motion=motion, overlap=0.5).state.number + 1 for motion in (0.0, 0.01, 0.04)]
-    assert numbers[0] == 30 and numbers[0] > numbers[1] > numbers[2] > 2, numbers
-    still = scene(np.tile(np.eye(4), (30, 1, 1)))
-    assert tracked(still).state.number == 0
-
-
 def test_errors_fit_the_covariances_over_seeds():
     squared = []
     poses = path(40, DT, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.03, 0.0]))
@@ -80,12 +72,44 @@ def test_errors_fit_the_covariances_over_seeds():
     assert 1.5 < np.mean(squared) < 9  # 6 expected; the path is smoother than the motion model expects
 
 
+@pytest.mark.parametrize(("seen_at_once", "most"), [(100, 0.3), (15, 1.5)])
+def test_far_landmarks_that_soon_leave_are_not_believed_too_much(seen_at_once, most):
+    """Of 100 in a frame: what hung at another pose, and landmarks first seen there, shared an error: 1.9 m, 13 sigma.
+
+    Of 15: as variables far ones are linearised where they are not linear: 3.8 m, 18 sigma.
+    """
+    poses = path(150, DT, np.array([0.0, 0.0, 8.0]), np.zeros(3))
+    models = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0)
+    data, known = scene(poses, points=1500, limit=seen_at_once), set()
+    backend = SmootherBackend(RIG, models)
+    for k, (stamp, truth, seen) in enumerate(data):
+        assert step(backend, stamp, seen, known).status is UpdateStatus.OK or not k, "also with far points alone"
+        gone = sorted(known - set(seen.ids.tolist()))
+        backend.remove(gone)
+        known.difference_update(gone)
+        last = backend.estimate(landmarks=False)
+        off = np.linalg.norm(last.T_world_left[:3, 3] - truth[:3, 3])
+        assert off < 3 * np.sqrt(np.trace(last.covariance[3:, 3:])) and off < most, k
+
+
+def test_a_frame_that_saw_new_landmarks_alone_is_a_pose():
+    data, backend, known = drive(12, points=200), SmootherBackend(RIG, MODELS), set()
+    for k, (stamp, _, seen) in enumerate(data):
+        if k == 6:
+            backend.remove(sorted(known))
+            known.clear()
+        step(backend, stamp, seen, known)
+    assert backend.state.number == 11 and backend.rebuilds == 0
+    off = se3.log(se3.inverse(data.poses[-1]) @ backend.estimate(landmarks=False).T_world_left)
+    assert off @ np.linalg.solve(backend.estimate(landmarks=False).covariance, off) < 25
+
+
 def test_landmarks_that_were_found_together_do_not_all_begin_anew_together():
     """That would leave but the motion model between two poses, and the newest one 2.8 times as uncertain."""
     data = drive(22, points=150)
     ours, best = (
-        SmootherBackend(RIG, MODELS, motion=0.0, landmarks=0),
-        SmootherBackend(RIG, MODELS, motion=0.0, lag=None, track=1000),
+        SmootherBackend(RIG, MODELS, landmarks=0),
+        SmootherBackend(RIG, MODELS, lag=None, track=1000),
     )
     deviations = []
     for backend in (ours, best):
@@ -116,7 +140,7 @@ def test_what_removed_landmarks_have_told_stays_known():
 @pytest.mark.slow
 def test_the_lag_bounds_what_is_kept_and_not_what_is_known():
     data = drive(120, points=600)
-    full, lagged = (tracked(data, motion=0.0, **options) for options in ({"lag": None}, {"lag": 8, "past": 10}))
+    full, lagged = (tracked(data, **options) for options in ({"lag": None}, {"lag": 8, "past": 10}))
     assert full.state.first == 0 and full.revises_path
     assert lagged.state.first > 60 and not lagged.revises_path
     assert sum(map(len, lagged.state.sights)) < 0.4 * sum(map(len, full.state.sights))
@@ -158,8 +182,8 @@ def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it(
     """A camera sways before the same few points: its error does not grow with every lag."""
     sway = np.cos(np.arange(150) / 12)
     poses = se3.pose(np.tile(np.eye(3), (150, 1, 1)), (sway - 1)[:, None] * np.array([0.4, 0.0, 0.2]))
-    data, models = scene(poses, points=8, limit=8), replace(MODELS, pixel_sigma=3.0)
-    kept, anew = (SmootherBackend(RIG, models, motion=0.0, landmarks=n) for n in (20, 0))
+    data, models = scene(poses, points=8, limit=8), replace(MODELS, pixel_sigma=1.0)
+    kept, anew = (SmootherBackend(RIG, models, landmarks=n) for n in (20, 0))
     for backend in (kept, anew):
         run(backend, data)
     deviations = [np.sqrt(np.trace(b.estimate(landmarks=False).covariance[3:, 3:])) for b in (kept, anew)]
@@ -174,10 +198,9 @@ def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it(
 # --- the last poses together ---
 
 
-@pytest.mark.parametrize("motion", [0.0, 0.1])
-def test_the_last_poses_have_a_joint_covariance(motion):
+def test_the_last_poses_have_a_joint_covariance():
     data = drive(30)
-    backend = tracked(data, motion=motion)
+    backend = tracked(data)
     for ahead in (False, True):
         if ahead:
             backend.predict(3.0)
@@ -203,7 +226,7 @@ def off_by(seen: Observations, offset: float) -> Observations:
 @pytest.mark.parametrize("options", [{}, {"lag": None}, {"lag": 10}], ids=str)
 def test_right_pixels_are_mended_afterwards(options):
     data = drive(24, points=200)
-    right, mended, spoilt = (SmootherBackend(RIG, MODELS, motion=0.0, **options) for _ in range(3))
+    right, mended, spoilt = (SmootherBackend(RIG, MODELS, **options) for _ in range(3))
     known: list[set[int]] = [set(), set(), set()]
     for k, (stamp, _, seen) in enumerate(data):
         if k == 14:
@@ -245,7 +268,7 @@ def test_a_revision_that_changes_nothing_leaves_the_covariances():
 
 def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
     data = drive(60, points=400)
-    backend = tracked(data, lag=6, past=0, motion=0.0)
+    backend = tracked(data, lag=6, past=0)
     before, first = backend.trajectory().poses, backend.state.first
     backend.revise(lambda z: z + np.array([0.0, 0.0, 1.0]))
     after = backend.trajectory().poses
@@ -256,7 +279,7 @@ def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
 
 
 def test_whether_the_whole_path_follows_is_told_with_the_present_frame():
-    backend, known = SmootherBackend(RIG, MODELS, lag=6, past=6, motion=0.0), set()
+    backend, known = SmootherBackend(RIG, MODELS, lag=6, past=6), set()
     answers = []
     for k, (stamp, _, seen) in enumerate(drive(40, points=300)):
         step(backend, stamp, seen, known)
@@ -285,7 +308,7 @@ def test_the_motion_model_does_not_pull_at_the_path_as_a_whole():
 
 def test_three_successive_poses_are_tied_again_after_a_frame_that_saw_nothing():
     """After one such frame the velocity counted as what it once was, for all of the run."""
-    data, backend, known = drive(12), SmootherBackend(RIG, MODELS, motion=0.0), set()
+    data, backend, known = drive(12), SmootherBackend(RIG, MODELS), set()
     for k, (stamp, _, seen) in enumerate(data):
         step(backend, stamp, seen if k != 4 else Observations.empty(), known)
     tied = [tie is not None and tie.times is not None for tie in backend.state.ties]

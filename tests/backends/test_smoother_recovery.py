@@ -76,10 +76,10 @@ def break_solver(monkeypatch):
 @pytest.mark.parametrize("method", ["update", "calculateEstimate", "getISAM2"])
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 def test_one_failure_costs_nothing(break_solver, method, error):
-    data, untouched = drive(), SmootherBackend(RIG, MODELS, motion=0.0)
+    data, untouched = drive(), SmootherBackend(RIG, MODELS)
     run(untouched, data)
     break_solver(method, [11], error)
-    backend = SmootherBackend(RIG, MODELS, motion=0.0)
+    backend = SmootherBackend(RIG, MODELS)
     reports = run(backend, data)
     assert backend.rebuilds == 1
     assert all(r.status is UpdateStatus.OK for r in reports[1:]), "the measurements were used after the rebuild"

@@ -1,4 +1,4 @@
-"""Compiled loops of `backends.smoother.landmarks`: over landmarks and the poses that measured them."""
+"""Compiled loops of the smoother: over landmarks and the poses that measured them, and over three poses in motion."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from slam.kernels.linear import multiply
 from slam.kernels.se3 import transform_back
 from slam.kernels.stereo import by_point, residual
+from slam.kernels.velocities import velocity_change
 from slam.runtime.compilation import kernel
 
 
@@ -87,3 +88,15 @@ def carried_by(known, poses, frames, points, rows, information, older, covarianc
                         out[m, i, 6 * w + j] += D[i, h] * poses[w, h, j]
                         out[m, i, 6 * w + 3 + j] += C[i, h] * poses[w, h, j]
     return out
+
+
+@kernel
+def motion_error(poses, before, dt):
+    """Change of velocity (6,) over the last of some poses (K, 4, 4), and derivatives (6, 18) by the last three.
+
+    See `slam.kernels.velocities.velocity_change`. The last interval is `dt` [s], the one before it `before`; of two
+    poses the change is the velocity itself, and the first six columns are zero.
+    """
+    r, J, last = np.empty(6), np.empty((6, 18)), len(poses) - 1
+    velocity_change(poses, last - 2, last - 1, last, before, dt, r, J)
+    return r, J
