@@ -7,27 +7,33 @@ import numpy as np
 from slam.runtime.compilation import helper, kernel, vector_helper
 
 
-@kernel
-def pairs_in_boxes(centres, reach, x, y, rows, places):
-    """Pairs of boxes and of points inside them, by ascending box; returns how many there are.
+@helper
+def first_column(uv, order, low):
+    """First place in the `order` (N,) of columns whose pixel `uv` (N, 2) is not left of `low`."""
+    place, end = 0, len(order)
+    while place < end:
+        middle = (place + end) // 2
+        if uv[order[middle], 0] < low:
+            place = middle + 1
+        else:
+            end = middle
+    return place
 
-    Boxes have centres and half sizes `reach` (M, 2); the points x, y (N,) ascend in x. Pairs are written into `rows` of
-    boxes and `places` of points as far as there is room.
+
+@kernel
+def pairs_in_boxes(centres, reach, uv, order, rows, found):
+    """Pairs of boxes and of pixels inside them, by ascending box; returns how many there are.
+
+    Boxes have centres and half sizes `reach` (M, 2); `order` is that of the columns of the pixels `uv` (N, 2). Pairs
+    are written into `rows` of boxes and those `found` as far as there is room.
     """
     count = 0
     for row in range(len(centres)):
-        low, high = centres[row, 0] - reach[row, 0], centres[row, 0] + reach[row, 0]
-        place, last = 0, len(x)
-        while place < last:
-            middle = (place + last) // 2
-            if x[middle] < low:
-                place = middle + 1
-            else:
-                last = middle
-        while place < len(x) and x[place] <= high:
-            if abs(y[place] - centres[row, 1]) <= reach[row, 1]:
+        place, high = first_column(uv, order, centres[row, 0] - reach[row, 0]), centres[row, 0] + reach[row, 0]
+        while place < len(order) and uv[order[place], 0] <= high:
+            if abs(uv[order[place], 1] - centres[row, 1]) <= reach[row, 1]:
                 if count < len(rows):
-                    rows[count], places[count] = row, place
+                    rows[count], found[count] = row, order[place]
                 count += 1
             place += 1
     return count
@@ -93,27 +99,14 @@ def product(a, b):
 
 @kernel
 def follow(
-    pixels,
-    innovation,
-    bounds,
-    sizes,
-    limits,
-    ratio,
-    looks,
-    signs,
-    rows,
-    uv,
-    feature_looks,
-    feature_signs,
-    order,
-    pairs,
+    pixels, innovation, least, most, sizes, limits, ratio, looks, signs, uv, feature_looks, feature_signs, order, pairs
 ):
     """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
 
-    Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows; their half axes
-    are `sizes` (L,) times standard deviations within `bounds`, or [px] of squares if these are zero. In each window,
-    descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs` at `rows` (M,); the features are
-    at `uv`, those that count in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
+    Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows: their half axes
+    are `sizes` (L,) times standard deviations from `least` (M,) to `most`, or [px] of squares if `most` is zero. In
+    each window, descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs`; the features are at
+    `uv`, in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
     """
     levels, last = len(sizes), sizes[len(sizes) - 1]
     count, room = 0, 4 * len(pixels) + 64
@@ -122,27 +115,21 @@ def follow(
         x, y = pixels[row, 0], pixels[row, 1]
         if not (np.isfinite(x) and np.isfinite(y)):
             continue
-        if bounds[1] > 0:
-            shape = ellipse(innovation[row], bounds[0] ** 2, bounds[1] ** 2)
+        if most > 0:
+            shape = ellipse(innovation[row], least[row] ** 2, most**2)
             uu, cross, vv = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
             reach_u, reach_v = last * shape[3], last * shape[4]
         else:
             uu = cross = vv = np.float32(0.0)
             reach_u = reach_v = last
-        place, end = 0, len(order)
-        while place < end:
-            middle = (place + end) // 2
-            if uv[order[middle], 0] < x - reach_u:
-                place = middle + 1
-            else:
-                end = middle
+        place = first_column(uv, order, x - reach_u)
         while place < len(order) and uv[order[place], 0] <= x + reach_u:
             feature = order[place]
             place += 1
-            if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[rows[row]]:
+            if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[row]:
                 continue
             du, dv = np.float32(uv[feature, 0] - x), np.float32(uv[feature, 1] - y)
-            if bounds[1] > 0:
+            if most > 0:
                 off, power = np.float64(uu * du * du + np.float32(2.0) * cross * du * dv + vv * dv * dv), 2
             else:
                 off, power = np.float64(max(abs(du), abs(dv))), 1
@@ -164,7 +151,7 @@ def follow(
         for p in range(count):
             allowed[p] = level[p] <= number and not done[a[p]] and not taken[b[p]]
             if allowed[p] and level[p] == number:  # in a larger window, of tracks that are not found yet alone
-                likeness = product(looks[rows[a[p]]], feature_looks[b[p]])
+                likeness = product(looks[a[p]], feature_looks[b[p]])
                 distance[p] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
         best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[number], ratio, good)
         for p in range(count):
@@ -185,13 +172,7 @@ def nearest(points, order, places, radius, looks, place_looks, alike):
     matched, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
     for n in range(len(points)):
         x, y, best, least = points[n, 0], points[n, 1], -1, radius * radius
-        place, end = 0, len(order)
-        while place < end:
-            middle = (place + end) // 2
-            if places[order[middle], 0] < x - radius:
-                place = middle + 1
-            else:
-                end = middle
+        place = first_column(places, order, x - radius)
         while place < len(order) and places[order[place], 0] <= x + radius:
             m = order[place]
             gap = (places[m, 0] - x) ** 2 + (places[m, 1] - y) ** 2
