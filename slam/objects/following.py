@@ -13,7 +13,7 @@ from slam.objects.bodies import Body
 from slam.objects.frame import Frame
 from slam.objects.pixel_kernels import within_reach
 from slam.objects.regions import Regions
-from slam.objects.track_kernels import inverses
+from slam.objects.track_kernels import inverses, predicted_pixels
 from slam.objects.tracks import Tracks
 from slam.tracks import follow as features_of_tracks
 
@@ -42,13 +42,17 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: Regions, frame: 
     lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
     taken = np.zeros(len(frame.features), bool)
     _continue_landmarks(tracks, landmark, taken)
-    _look(tracks, frame, alive[~lost], taken)
+    expected = alive[~lost & (tracks.row[alive] < 0)]
+    _look(tracks, frame, expected, tracks.position[expected], tracks.covariance[expected], taken)
     held = tracks.row[tracks.seen & (tracks.body >= 0)]
     _carried_along(tracks, bodies, regions, frame, taken)
     _far(tracks, frame, taken)
     unclaimed = alive[lost]
     if len(unclaimed):
-        _look(tracks, frame, unclaimed, np.zeros(len(taken), bool))
+        _look(
+            tracks, frame, unclaimed, tracks.position[unclaimed], tracks.covariance[unclaimed],
+            np.zeros(len(taken), bool),
+        )  # fmt: skip
         tracks.row[unclaimed[np.isin(tracks.row[unclaimed], held)]] = -1
     seen = np.flatnonzero(tracks.seen)
     tracks.missed += 1
@@ -83,49 +87,34 @@ def _continue_landmarks(tracks: Tracks, landmark: IdArray, taken: BoolArray) -> 
         _enter(tracks, named[found], row[found], taken)
 
 
-def _look(
-    tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray, places: Array | None = None,
-    more: Array | float = 0.0,
-) -> None:  # fmt: skip
-    """Look for those of some tracks that have no feature yet, in windows about where they are expected.
+def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covariances: Array, taken: BoolArray) -> None:
+    """Look for tracks (M,) in windows about places (M, 3) in the world that have covariances (M, 3, 3).
 
-    Features that are `taken` (N,) are not found; those that are found are entered there.
-
-    Args:
-        tracks: all tracks.
-        frame: the present one.
-        rows: of the tracks (M,).
-        taken: see above.
-        places: where they are expected (M, 3) in the world; None for their positions.
-        more: what is added to their covariances (3, 3).
+    Features that are `taken` (N,) are not found; those that are found are entered there. A track may be looked for at
+    several places: the first at which it is found counts.
     """
-    missing = tracks.row[rows] < 0
-    places = tracks.position[rows[missing]] if places is None else places[missing]
-    rows, s, T = rows[missing], frame.setup, frame.T_world_left
     if not len(rows):
         return
-    c, f = s.config, frame.features
-    local = (places - T[:3, 3]) @ T[:3, :3]
-    z, J = s.rig.project_stereo(local)
-    J = J @ T[:3, :3].T
-    S = J @ (tracks.covariance[rows] + more) @ np.swapaxes(J, 1, 2) + s.sigma**2 * np.eye(3)
+    s, c, f, T = frame.setup, frame.setup.config, frame.features, frame.T_world_left
+    z, S = predicted_pixels(s.rig.rectified_parameters, T, places, covariances, s.sigma)
     least = np.where(tracks.doubtful[rows], 0.5 * c.search_limit, c.search_radius)
     windows = features_of_tracks.Windows((SIGMAS,), (c.d_match,), c.ratio, c.search_limit, least)
     looks = tracks.descriptors[rows], tracks.laplacian[rows]
     found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows)
     m, row = found.tracks, found.features
     # A right pixel off by more says that this is another point, or a false stereo match.
-    allowance = _UNEVEN * c.max_speed * frame.dt * s.rig.left.fu / np.maximum(local[m, 2], 1e-3)
-    allowance *= np.where(tracks.count(rows[m]) < c.min_frames, 1.0 / _UNEVEN, 1.0)
-    off = np.abs(f.uv_right[row, 0] - z[m, 2]) > _RIGHT_SIGMAS * np.sqrt(S[m, 2, 2]) + allowance  # NaN compares false
-    good = ~(taken[row] | off)
+    depth = np.maximum((places[m] - T[:3, 3]) @ T[:3, 2], 1e-3)
+    uneven = np.where(tracks.count(rows[m]) < c.min_frames, 1.0, _UNEVEN)
+    allowance = _RIGHT_SIGMAS * np.sqrt(S[m, 2, 2]) + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth
+    good = ~(taken[row] | (np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance))  # NaN compares false
     _enter(tracks, rows[m[good]], row[good], taken)
 
 
 def _enter(tracks: Tracks, rows: IndexArray, features: IndexArray, taken: BoolArray) -> None:
-    """Note which features (M,) were found for tracks (M,); of tracks that look alike to the bit, the first has it."""
-    features, first = np.unique(features, return_index=True)
-    tracks.row[rows[first]] = features
+    """Note features (M,) found for tracks (M,): a track's first; of tracks alike to the bit, the first has it."""
+    _, first = np.unique(rows, return_index=True)
+    features, of_feature = np.unique(features[first], return_index=True)
+    tracks.row[rows[first[of_feature]]] = features
     taken[features] = True
 
 
@@ -136,18 +125,21 @@ def _carried_along(
     s, dt = frame.setup, frame.dt
     young = _young(tracks, s.config.min_frames - 1)
     places = tracks.position[young]
+    found = [(young[:0], places[:0], tracks.covariance[:0])]
     for body in bodies.values():
         size = s.config.margin * body.across
         local = transform(inverse(body.T_before), places)
-        on = ((local > body.lower - size) & (local < body.upper + size)).all(axis=1)
+        on = np.flatnonzero(((local > body.lower - size) & (local < body.upper + size)).all(axis=1))
         R = body.T[:3, :3]
-        _look(tracks, frame, young[on], taken, transform(body.T, local[on]), R @ body.covariance[3:, 3:] @ R.T)
+        more = R @ body.covariance[3:, 3:] @ R.T
+        found.append((young[on], transform(body.T, local[on]), tracks.covariance[young[on]] + more))
     middles = regions.state[:, :3]
     radius = s.radius(np.linalg.norm(middles - frame.eye, axis=1))
     inside = np.linalg.norm(places - middles[:, None], axis=2) < radius[:, None]
-    for i in np.flatnonzero(inside.any(axis=1)).tolist():
-        ahead = places[inside[i]] + dt * regions.state[i, 3:]
-        _look(tracks, frame, young[inside[i]], taken, ahead, dt**2 * regions.covariance[i, 3:, 3:])
+    i, on = np.nonzero(inside)
+    ahead, more = places[on] + dt * regions.state[i, 3:], dt**2 * regions.covariance[i, 3:, 3:]
+    found.append((young[on], ahead, tracks.covariance[young[on]] + more))
+    _look(tracks, frame, *map(np.concatenate, zip(*found)), taken)
 
 
 def _young(tracks: Tracks, most: int) -> IndexArray:

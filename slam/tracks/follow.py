@@ -78,22 +78,16 @@ def match_everywhere(
     allowed: BoolArray | None = None,
 ) -> Matches:  # fmt: skip
     """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image, or in pairs `allowed` (M, N)."""
-    none = np.zeros(0, np.intp)
-    if not len(descriptors) or not len(features):
-        return Matches(none, none)
     from slam.tracks.follow_kernels import mutual_best
 
-    limit = d_match / ratio  # farther features affect neither best nor ratio
-    near = descriptors @ features.descriptors.T > np.float32(1 - 0.5 * limit * limit)
-    near &= laplacian[:, None] == features.laplacian[None, :]
-    if allowed is not None:
-        near &= allowed
-    rows, columns = np.nonzero(near)
-    product = np.einsum("pd,pd->p", descriptors.take(rows, axis=0), features.descriptors.take(columns, axis=0))
-    distance = np.sqrt(np.maximum(2 - 2 * product, 0))
-    best, size = np.empty(len(rows), bool), (len(descriptors), len(features))
-    mutual_best(rows, columns, distance, size, np.float32(d_match), np.float32(ratio), best)
-    return Matches(rows[best], columns[best])
+    best = np.empty(len(descriptors), np.intp)
+    allowed = np.ones((0, 0), bool) if allowed is None else np.ascontiguousarray(allowed)
+    mutual_best(
+        descriptors @ features.descriptors.T, allowed, laplacian, features.laplacian, np.float32(d_match),
+        np.float32(ratio), best,
+    )  # fmt: skip
+    rows = np.flatnonzero(best >= 0)
+    return Matches(rows, best[rows])
 
 
 def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

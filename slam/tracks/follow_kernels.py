@@ -41,7 +41,11 @@ def pairs_in_boxes(centres, reach, uv, order, rows, found):
 
 @helper
 def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, good):
-    """`mutual_best` of the first `count` pairs into `good`, for kernels."""
+    """Mark in `good` which of the first `count` pairs of rows and columns belong together.
+
+    A row's nearest column must be nearer than `d_match`, and than `ratio` times its second; among the rows that have
+    the same one, the nearest gets it. There are `size` rows and columns; pairs that are not `allowed` do not count.
+    """
     nearest, second = np.empty(size[0], np.float32), np.empty(size[0], np.float32)
     of_column, most = np.empty(size[1], np.float32), np.float32(np.inf)
     for row in range(size[0]):  # slices and fills take a second to compile
@@ -55,24 +59,46 @@ def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, go
                 second[row], nearest[row] = nearest[row], d
             elif d < second[row]:  # also one that is as near as the first
                 second[row] = d
-            if d < of_column[column]:
-                of_column[column] = d
     for p in range(count):
-        row, d = rows[p], distance[p]
-        mutual = allowed[p] and d == nearest[row] and d <= of_column[columns[p]]
-        good[p] = mutual and d < d_match and d < ratio * second[row]
+        row, column, d = rows[p], columns[p], distance[p]
+        good[p] = allowed[p] and d == nearest[row] and d < d_match and d < ratio * second[row]
+        if good[p] and d < of_column[column]:  # a row that would not take it has no claim to a column
+            of_column[column] = d
+    for p in range(count):
+        good[p] = good[p] and distance[p] <= of_column[columns[p]]
 
 
 @kernel
-def mutual_best(rows, columns, distance, size, d_match, ratio, good):
-    """Mark in `good` which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than others.
+def mutual_best(products, allowed, signs, feature_signs, d_match, ratio, best):
+    """Features (N,) into `best` that are each other's nearest with a track, −1 for none.
 
-    Pairs are of rows and columns, of which there are `size`, and have a distance. It must be less than `ratio` times
-    that of the row's second.
+    Given are the inner products of descriptors, tracks by features (N, M), which pairs are `allowed` (N, M; all where
+    that is empty), and both signs of the Laplacian. A match must be nearer than `d_match`, and than `ratio` times the
+    second.
     """
-    for p in range(len(good)):
-        good[p] = True
-    best_pairs(rows, columns, distance, good, len(good), size, d_match, ratio, good)
+    tracks, features = products.shape
+    nearest, second = np.empty(tracks, np.float32), np.empty(tracks, np.float32)
+    of_column, most = np.empty(features, np.float32), np.float32(np.inf)
+    for m in range(features):
+        of_column[m] = most
+    limit = d_match / ratio  # farther features affect neither best nor ratio
+    least = np.float32(1.0) - np.float32(0.5) * limit * limit
+    for n in range(tracks):
+        best[n], nearest[n], second[n] = -1, most, most
+        for m in range(features):
+            if products[n, m] <= least or signs[n] != feature_signs[m] or (allowed.size > 0 and not allowed[n, m]):
+                continue
+            d = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * products[n, m], np.float32(0.0)))
+            if d < nearest[n]:
+                best[n], second[n], nearest[n] = m, nearest[n], d
+            elif d < second[n]:
+                second[n] = d
+            if d < of_column[m]:
+                of_column[m] = d
+    for n in range(tracks):
+        d = nearest[n]
+        if best[n] >= 0 and not (d < d_match and d < ratio * second[n] and d <= of_column[best[n]]):
+            best[n] = -1
 
 
 @helper
