@@ -128,7 +128,7 @@ class Mapper:
             return step
         return self._add_monocular(backend, step, np.flatnonzero(free & ~features.has_stereo))
 
-    def _add_monocular(self, backend: MapBackend, step: Step, rows: IndexArray) -> Step:
+    def _add_monocular(self, backend: Backend, step: Step, rows: IndexArray) -> Step:
         """Turn features `rows` without a stereo match into landmarks once two views give depth (paper B, 2.2)."""
         landmarks, features, matches = step.landmarks, step.features, step.matches
         T, sigma = step.estimate.T_world_left, self._localizer.pixel_sigma
@@ -145,7 +145,7 @@ class Mapper:
         best = front[np.sort(np.argsort(-features.response[rows[found[front]]], kind="stable")[:wanted])]
         step, count = replace(self._with_new(step, rows[found[best]]), views=views), len(step.added)
         if len(best):
-            backend.place(step.added.ids[count:], depths.local[best], depths.covariances[best])
+            backend.place(step.added.ids[count:], depths.local[best], depths.covariances[best])  # type: ignore[attr-defined]
         return step
 
     def _with_new(self, step: Step, rows: IndexArray) -> Step:

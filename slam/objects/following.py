@@ -137,9 +137,10 @@ def _carried_along(
     radius = s.radius(np.linalg.norm(middles - frame.eye, axis=1))
     inside = np.linalg.norm(places - middles[:, None], axis=2) < radius[:, None]
     i, on = np.nonzero(inside)
-    ahead, more = places[on] + dt * regions.state[i, 3:], dt**2 * regions.covariance[i, 3:, 3:]
-    found.append((young[on], ahead, tracks.covariance[young[on]] + more))
-    _look(tracks, frame, *map(np.concatenate, zip(*found)), taken)
+    P = tracks.covariance[young[on]] + dt**2 * regions.covariance[i, 3:, 3:]
+    found.append((young[on], places[on] + dt * regions.state[i, 3:], P))
+    rows, ahead, covariances = (np.concatenate(column) for column in zip(*found))
+    _look(tracks, frame, rows, ahead, covariances, taken)
 
 
 def _young(tracks: Tracks, most: int) -> IndexArray:
