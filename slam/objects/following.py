@@ -59,7 +59,8 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: Regions, frame: 
     tracks.missed[seen] = 0
     named = seen[landmark[tracks.row[seen]] >= 0]
     tracks.landmark[named] = landmark[tracks.row[named]]
-    seen = seen[~np.isin(seen, unclaimed)]
+    if len(unclaimed):
+        seen = seen[~np.isin(seen, unclaimed)]
     tracks.descriptors[seen] = frame.features.descriptors[tracks.row[seen]]
 
 
@@ -78,13 +79,11 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
 
 def _continue_landmarks(tracks: Tracks, landmark: IdArray, taken: BoolArray) -> None:
     """The features of landmarks (N,) that have a track, which are then `taken`."""
-    rows = np.flatnonzero(landmark >= 0)
-    rows = rows[np.argsort(landmark[rows], kind="stable")]
-    named = np.flatnonzero(tracks.landmark >= 0)
-    if len(rows) and len(named):
-        row = rows[np.searchsorted(landmark[rows], tracks.landmark[named]).clip(max=len(rows) - 1)]
-        found = landmark[row] == tracks.landmark[named]
-        _enter(tracks, named[found], row[found], taken)
+    row_of = np.full(landmark.max(initial=-1) + 2, -1)  # by id, and at the end that of none
+    row_of[landmark] = np.where(landmark < 0, -1, np.arange(len(landmark)))
+    row = row_of[np.minimum(tracks.landmark, len(row_of) - 1)]
+    found = np.flatnonzero(row >= 0)
+    _enter(tracks, found, row[found], taken)
 
 
 def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covariances: Array, taken: BoolArray) -> None:

@@ -50,3 +50,15 @@ def test_a_body_takes_points_along_that_are_too_young_for_a_velocity():
     (young,) = tracks.begin(np.array([10]), features, np.array([4]), transform(before, points[4:]))
     follow(tracks, {1: replace(body, T_before=before)}, Regions.none(), frame_of(features, 1.0), NO_LANDMARK)
     assert tracks.row[young] == 4
+
+
+def test_a_feature_that_was_matched_to_a_landmark_continues_its_track_wherever_it_was_expected():
+    _, tracks, features, truth = scene(4, np.zeros(6), np.random.default_rng(3))
+    free = tracks.begin(np.arange(10, 14), features, np.arange(4), transform(truth, POINTS))
+    tracks.landmark[free] = [7, 3, 12, -1]
+    tracks.body[:] = -1
+    landmark = np.array([3, 7, -1, 20])  # the first two change places; 12 was not matched, 20 has no track yet
+    follow(tracks, {}, Regions.none(), frame_of(features, 25.0), landmark)
+    assert tracks.row[free[:2]].tolist() == [1, 0]
+    assert tracks.landmark[tracks.row == 3].tolist() == [20]
+    assert np.unique(tracks.row[tracks.seen]).size == tracks.seen.sum()
