@@ -104,7 +104,8 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covaria
     # A right pixel off by more says that this is another point, or a false stereo match.
     depth = np.maximum((places[m] - T[:3, 3]) @ T[:3, 2], 1e-3)
     uneven = np.where(tracks.count(rows[m]) < c.min_frames, 1.0, _UNEVEN)
-    allowance = _RIGHT_SIGMAS * np.sqrt(S[m, 2, 2]) + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth
+    deviation = np.sqrt(np.maximum(S[m, 2, 2], s.sigma**2))  # rounding may leave a covariance that is not definite
+    allowance = _RIGHT_SIGMAS * deviation + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth
     good = ~(taken[row] | (np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance))  # NaN compares false
     _enter(tracks, rows[m[good]], row[good], taken)
 
