@@ -34,6 +34,7 @@ from slam.mapping.atlas.loop_closer import Found, LoopCloser
 from slam.mapping.known_landmarks import definite
 from slam.mapping.map_io import SavedMap
 from slam.mapping.mapper import Mapper
+from slam.mapping.monocular import FirstViews
 from slam.mapping.step import Step
 from slam.rig_error import CommonError
 from slam.tracks.localizer import Localizer, nowhere
@@ -66,6 +67,7 @@ class State:
     checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
     # in which the camera has not been found yet; None without one, or once it is found
     prior_map: SavedMap | None = None
+    views: FirstViews | None = None  # features without depth that are followed until two views give it
     past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
     restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
 
@@ -77,8 +79,9 @@ class State:
         """The state after one more frame."""
         located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
         return replace(
-            self, landmarks=step.landmarks, atlas=step.atlas, index=step.index, stamp=step.features.stamp,
-            tracking=step.tracking, standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
+            self, landmarks=step.landmarks, views=step.views, atlas=step.atlas, index=step.index,
+            stamp=step.features.stamp, tracking=step.tracking,
+            standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, mapped=self.mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
             measured_at=step.features.stamp if located else self.measured_at,

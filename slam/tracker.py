@@ -99,7 +99,7 @@ class Tracker:
             corrected = _shifted_as(corrected, features, aligned)
         step = Step(
             index, aligned, replace(corrected, images=None), prediction, landmarks, matches, standing, tracking,
-            state.atlas,
+            state.atlas, state.views,
         )  # fmt: skip
         suspects = self._suspects(state, step)
         moving = isin(matches.ids, suspects)

@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "calibration": {"data", "geometry", "kernels", "runtime"},
     "mapping": {"tracks", "window", "data", "geometry", "runtime"},
     "objects": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
-    "papers": {"objects", "data", "geometry", "runtime"},
+    "papers": {"objects", "tracks", "data", "geometry", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},
     "evaluation": {"data", "geometry"},

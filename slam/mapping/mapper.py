@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.data import BoolArray, IdArray
+from slam.data import BoolArray, IdArray, IndexArray
 from slam.errors import ConfigurationError
 from slam.geometry.arrays import isin
 from slam.geometry.pnp import MINIMAL_POINTS
@@ -16,7 +16,7 @@ from slam.mapping.atlas.loop_closer import Found
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.known_landmarks import in_front
-from slam.mapping.monocular import MonocularDepth, frame_covariance, unclaimed
+from slam.mapping.monocular import depths_by_motion, frame_covariance, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
 from slam.third_party import checked
@@ -43,11 +43,8 @@ class Mapper:
         self.config = config
         self.next_id = 0
         self._localizer = localizer
-        self._monocular: MonocularDepth | None = None
         if config.monocular and not isinstance(backend, MapBackend):
             raise ConfigurationError("map.monocular: this back end cannot place landmarks")
-        if config.monocular is not False and isinstance(backend, MapBackend):
-            self._monocular = self._new_monocular()
 
     def update(self, backend: Backend, step: Step) -> Step:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
@@ -60,12 +57,12 @@ class Mapper:
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
         known = known_features(view, landmarks, step.features, self.config)
         erased, landmarks = landmarks.ids[bad], landmarks.select(~bad)
-        landmarks, added = self._add(backend, landmarks, step, known)
-        surplus = surplus_landmarks(landmarks, self.config)
-        erased, landmarks = np.concatenate([erased, landmarks.ids[surplus]]), landmarks.select(~surplus)
+        step = self._add(backend, replace(step, landmarks=landmarks), known)
+        surplus = surplus_landmarks(step.landmarks, self.config)
+        erased = np.concatenate([erased, step.landmarks.ids[surplus]])
         if len(erased):  # once a frame: it costs a filter a copy of its covariance
             backend.remove(erased)
-        return replace(step, landmarks=landmarks, added=added, erased=erased)
+        return replace(step, landmarks=step.landmarks.select(~surplus), erased=erased)
 
     def insert(self, backend: Backend, landmarks: LandmarkTable, place: Found) -> LandmarkTable:
         """Add landmarks of an old place to the map, as from a saved map; those already in it are unchanged."""
@@ -82,17 +79,12 @@ class Mapper:
 
         The back end is as that step left it, the rows are those before it; those that stay are returned.
         """
-        if self._monocular is not None:
-            self._monocular = self._new_monocular()
         known = backend.estimate().ids
         kept = np.zeros(0, np.int64) if landmarks is None else landmarks.ids
         strangers = np.setdiff1d(known, kept)
         if len(strangers):
             backend.remove(strangers)
         return None if landmarks is None else landmarks.select(np.isin(kept, known))
-
-    def _new_monocular(self) -> MonocularDepth:
-        return MonocularDepth(self.rig, self._localizer.pixel_sigma, self.config.max_depth_error)
 
     def _view(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapView:
         """The map as the camera sees it."""
@@ -116,58 +108,51 @@ class Mapper:
             step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.suspects
         )
 
-    def _add(
-        self, backend: Backend, landmarks: LandmarkTable, step: Step, known: BoolArray
-    ) -> tuple[LandmarkTable, LandmarkMatches]:
+    def _add(self, backend: Backend, step: Step, known: BoolArray) -> Step:
         """Turn features that are no landmarks yet into landmarks, unless the pose is unknown.
 
         Features that move, or whose motion label is undecided, are left out.
         """
+        landmarks, features, matches = step.landmarks, step.features, step.matches
         if len(landmarks) >= MINIMAL_POINTS and not step.tracking.may_add(self.config.restart_after):
-            return landmarks, LandmarkMatches.nothing()
-        features, matches = step.features, step.matches
+            return step
         free = ~known
         free[matches.rows] = free[step.labels.moving] = free[step.labels.undecided] = False
         occupied = features.uv_left[matches.rows]
         rows = new_landmarks(features, free, occupied, self.rig, self._localizer.pixel_sigma, self.config)
-        added = LandmarkMatches(self._new_ids(len(rows)), rows)
-        if len(added):
-            backend.add(added.observations(features))
-            landmarks = landmarks.with_new(step.index, added.ids, features, rows, step.estimate.T_world_left[:3, 3])
-        if self._monocular is not None and (self.config.monocular or not features.has_stereo.any()):
-            return self._add_monocular(self._monocular, backend, landmarks, step, added, free)
-        return landmarks, added
+        step = self._with_new(step, rows)
+        if len(rows):
+            backend.add(step.added.observations(features))
+        wanted = self.config.monocular or (self.config.monocular is None and not features.has_stereo.any())
+        if not (wanted and isinstance(backend, MapBackend) and len(matches) >= MINIMAL_POINTS):
+            return step
+        return self._add_monocular(backend, step, np.flatnonzero(free & ~features.has_stereo))
 
-    def _add_monocular(
-        self,
-        monocular: MonocularDepth,
-        backend: Backend,
-        landmarks: LandmarkTable,
-        step: Step,
-        added: LandmarkMatches,
-        free: BoolArray,
-    ) -> tuple[LandmarkTable, LandmarkMatches]:
-        """Turn features without a stereo match into landmarks once two views give their depth (paper B, 2.2)."""
-        features, matches = step.features, step.matches
-        if len(matches) < MINIMAL_POINTS:
-            return landmarks, added
-        T = step.estimate.T_world_left
+    def _add_monocular(self, backend: Backend, step: Step, rows: IndexArray) -> Step:
+        """Turn features `rows` without a stereo match into landmarks once two views give depth (paper B, 2.2)."""
+        landmarks, features, matches = step.landmarks, step.features, step.matches
+        T, sigma = step.estimate.T_world_left, self._localizer.pixel_sigma
         view = self._view(backend, landmarks, step)
-        rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
+        rows = unclaimed(view, landmarks, features, rows)
         there = isin(matches.ids, landmarks.ids)
         local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
-        P = frame_covariance(self.rig, local, stereo, self._localizer.pixel_sigma)
-        rows, local, covariances = monocular.step(features, rows, T, P, step.index)
-        front = in_front(local)
-        rows, local, covariances = rows[front], local[front], covariances[front]
-        wanted = max(self.config.target_in_view - len(matches) - len(added), 0)
-        best = np.sort(np.argsort(-features.response[rows], kind="stable")[:wanted])
-        if not len(best):
-            return landmarks, added
-        ids = self._new_ids(len(best))
-        backend.place(ids, local[best], covariances[best])  # type: ignore[attr-defined]
-        landmarks = landmarks.with_new(step.index, ids, features, rows[best], T[:3, 3])
-        return landmarks, added.joined(LandmarkMatches(ids, rows[best]))
+        P = frame_covariance(self.rig, local, stereo, sigma)
+        views, found, depths = depths_by_motion(
+            self.rig, step.views, features.select(rows), T, P, step.index, sigma, self.config.max_depth_error
+        )
+        front = np.flatnonzero(in_front(depths.local))
+        wanted = max(self.config.target_in_view - len(matches) - len(step.added), 0)
+        best = front[np.sort(np.argsort(-features.response[rows[found[front]]], kind="stable")[:wanted])]
+        step, count = replace(self._with_new(step, rows[found[best]]), views=views), len(step.added)
+        if len(best):
+            backend.place(step.added.ids[count:], depths.local[best], depths.covariances[best])  # type: ignore[attr-defined]
+        return step
+
+    def _with_new(self, step: Step, rows: IndexArray) -> Step:
+        """A step whose features `rows` (M,) are landmarks, with ids that were never used."""
+        ids = self._new_ids(len(rows))
+        landmarks = step.landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
+        return replace(step, landmarks=landmarks, added=step.added.joined(LandmarkMatches(ids, rows)))
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

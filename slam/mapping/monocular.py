@@ -14,7 +14,7 @@ A point that moves along its epipolar line gets a wrong depth: a single moving c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, points_by_pose
-from slam.tracks.follow import match_in_boxes, pairs_in_boxes
+from slam.table import Table
+from slam.tracks.follow import Matches, Windows, follow, pairs_in_boxes
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView
 
@@ -37,7 +38,7 @@ _DIFFERENCES = np.repeat([1e-2, 1e-5], [4, 6])  # numerics: steps of numerical d
 
 
 @dataclass(frozen=True, eq=False)
-class Depths:
+class Depths(Table):
     """Points triangulated from two views, in the camera's coordinates at the second one (N rows)."""
 
     local: Array  # positions (N, 3) [m]; NaN where the rays do not meet in front of both cameras
@@ -131,82 +132,67 @@ def unclaimed(view: MapView, landmarks: LandmarkTable, features: StereoFeatures,
     return np.delete(rows, which[gap < _D_MATCH])
 
 
-#: Columns of first views of features that are being tracked, a row each: "uv_first" and "uv_last" (N, 2), "T_first"
-#: and "T_last" (N, 4, 4), "covariance" (N, 6, 6) of the former, "frame" (N,), "descriptors" (N, D), "laplacian" (N,).
-_Views = dict[str, NDArray]
+@dataclass(frozen=True, eq=False)
+class FirstViews(Table):
+    """Features without depth that are followed until two views give it, a row each."""
+
+    uv_first: Array  # left pixels (N, 2) at first sight
+    T_first: Array  # T_world_left (N, 4, 4) then
+    covariance: Array  # of that pose (N, 6, 6) by its own frame, see `frame_covariance`
+    frame: NDArray[np.int64]  # its number (N,)
+    uv_last: Array  # left pixels (N, 2) when last seen
+    T_last: Array  # T_world_left (N, 4, 4) then
+    descriptors: NDArray[np.float32]  # as last seen (N, D)
+    laplacian: NDArray[np.int8]  # signs of the Laplacian (N,)
 
 
-class MonocularDepth:
-    """Tracks features without depth until two views give it.
+def depths_by_motion(
+    rig: StereoRig, views: FirstViews | None, features: StereoFeatures, T_world_left: Array, covariance: Array,
+    frame: int, sigma: float, depth_error: float,
+) -> tuple[FirstViews, NDArray[np.intp], Depths]:  # fmt: skip
+    """Follow features without depth into a frame.
 
     Args:
         rig: the cameras.
+        views: the features followed so far; None for none.
+        features: of the frame, without depth, that could become landmarks (K rows).
+        T_world_left: pose (4, 4) after the update.
+        covariance: of the pose by this frame (6, 6), see `frame_covariance`.
+        frame: the frame's number.
         sigma: pixel noise [px].
         depth_error: largest relative standard deviation of a new landmark's depth.
+
+    Returns:
+        the features that are followed on, the rows of `features` (N,) whose depth has become known, and these depths.
     """
-
-    def __init__(self, rig: StereoRig, sigma: float, depth_error: float) -> None:
-        self._rig = rig
-        self._sigma = sigma
-        self._depth_error = depth_error
-        self._views: _Views = {}
-
-    def step(
-        self, features: StereoFeatures, rows: NDArray[np.intp], T_world_left: Array, covariance: Array, frame: int
-    ) -> tuple[NDArray[np.intp], Array, Array]:
-        """Take in a frame.
-
-        Args:
-            features: of the frame.
-            rows: features without depth that could become landmarks (K,).
-            T_world_left: pose (4, 4) after the update.
-            covariance: of the pose by this frame, see `frame_covariance`.
-            frame: the frame's number.
-
-        Returns:
-            rows of the features whose depth has become known (N,), their positions (N, 3) [m] in the camera's
-            coordinates, and covariances (N, 3, 3) [m²].
-        """
-        views = self._views or _first_views(features, rows[:0], T_world_left, covariance, frame)
-        row, view = self._followed(views, features, rows, T_world_left)
-        seen = _select(views, view)
-        motion = adjoint(inverse(T_world_left) @ seen["T_first"])
-        P = covariance + motion @ seen["covariance"] @ np.swapaxes(motion, 1, 2)
-        T_first_now, uv = inverse(seen["T_first"]) @ T_world_left, features.uv_left[row]
-        depths = two_view_depth(self._rig, seen["uv_first"], uv, T_first_now, P, self._sigma)
-        good = depths.good(self._depth_error)
-        again = ~good & (depths.misfit < _MISFIT)
-        now = _first_views(features, row, T_world_left, covariance, frame)
-        kept = _select({**seen, **{name: now[name] for name in ("uv_last", "T_last", "descriptors")}}, again)
-        lost = {name: np.delete(column, view, axis=0) for name, column in views.items()}
-        fresh = _first_views(features, np.setdiff1d(rows, row[good | again]), T_world_left, covariance, frame)
-        every = {name: np.concatenate([kept[name], lost[name], fresh[name]]) for name in views}
-        self._views = _select(every, np.flatnonzero(every["frame"] > frame - _KEPT)[-_VIEWS:])
-        return row[good], depths.local[good], depths.covariances[good]
-
-    def _followed(
-        self, views: _Views, features: StereoFeatures, rows: NDArray[np.intp], T: Array
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Matches of features and kept views: rows of features and rows of views, each at most once."""
-        turn = np.swapaxes(views["T_last"][:, :3, :3], 1, 2) @ T[:3, :3]
-        expected = self._rig.left.project((_rays(self._rig, views["uv_last"])[:, None, :] @ turn)[:, 0])
-        # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
-        looks = views["descriptors"], views["laplacian"]
-        found = match_in_boxes(expected, 2 * _RADIUS, *looks, features, rows, _D_MATCH, _RATIO)
-        gap = np.abs(features.uv_left[found.features] - expected[found.landmarks])
-        found = found.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))
-        return found.features, found.landmarks
+    n, uv = len(features), features.uv_left
+    T, P = np.tile(T_world_left, (n, 1, 1)), np.tile(covariance, (n, 1, 1))
+    now = FirstViews(uv, T, P, np.full(n, frame), uv, T, features.descriptors, features.laplacian)
+    views = now.select(slice(0)) if views is None else views
+    found = _followed(rig, views, features, T_world_left)
+    first, seen = views.select(found.tracks), now.select(found.features)
+    motion = adjoint(inverse(T_world_left) @ first.T_first)
+    P = covariance + motion @ first.covariance @ np.swapaxes(motion, 1, 2)
+    depths = two_view_depth(rig, first.uv_first, seen.uv_last, inverse(first.T_first) @ T_world_left, P, sigma)
+    good = depths.good(depth_error)
+    again = ~good & (depths.misfit < _MISFIT)
+    kept = replace(first, uv_last=seen.uv_last, T_last=seen.T_last, descriptors=seen.descriptors).select(again)
+    lost = views.select(np.delete(np.arange(len(views)), found.tracks))
+    fresh = now.select(np.delete(np.arange(n), found.features[good | again]))
+    every = kept.joined(lost).joined(fresh)
+    return (
+        every.select(np.flatnonzero(every.frame > frame - _KEPT)[-_VIEWS:]),
+        found.features[good],
+        depths.select(good),
+    )
 
 
-def _first_views(features: StereoFeatures, rows: NDArray, T: Array, covariance: Array, frame: int) -> _Views:
-    """Views of the features `rows` (N,) in a frame that has just been seen from a pose (4, 4)."""
-    n, uv = len(rows), features.uv_left[rows]
-    poses = np.tile(T, (n, 1, 1))
-    return {
-        "uv_first": uv, "uv_last": uv, "T_first": poses, "T_last": poses, "covariance": np.tile(covariance, (n, 1, 1)),
-        "frame": np.full(n, frame), "descriptors": features.descriptors[rows], "laplacian": features.laplacian[rows],
-    }  # fmt: skip
-
-
-def _select(views: _Views, rows: NDArray) -> _Views:
-    return {name: column[rows] for name, column in views.items()}
+def _followed(rig: StereoRig, views: FirstViews, features: StereoFeatures, T_world_left: Array) -> Matches:
+    """Features that continue views, where the camera's rotation takes them."""
+    turn = np.swapaxes(views.T_last[:, :3, :3], 1, 2) @ T_world_left[:3, :3]
+    expected = rig.left.project((_rays(rig, views.uv_last)[:, None, :] @ turn)[:, 0])
+    # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
+    windows, square = Windows((2 * _RADIUS,), (_D_MATCH,), _RATIO), np.zeros((len(expected), 2, 2))
+    found = follow(expected, square, views.descriptors, views.laplacian, features, windows)
+    gap = np.abs(features.uv_left[found.features] - expected[found.tracks])
+    return found.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))

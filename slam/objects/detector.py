@@ -96,9 +96,8 @@ class MovingObjectDetector(ObjectDetector):
         frame = self._begin(backend, features, estimate, landmark)
         tracks = self.tracks
         self._advance_bodies(frame)
-        follow(tracks, self.bodies, self._regions, frame)
+        follow(tracks, self.bodies, self._regions, frame, landmark)
         self._measure(frame)
-        tracks.assign_landmarks(landmark)
         tracks.still[:] = tracks.seen & among(max(len(features), 1), still)[tracks.row]
         self._fit(frame)
         self._change_members(frame)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,17 +25,17 @@ class Setup:
     config: ObjectsConfig
     estimators: EstimatorModels
 
-    @property
+    @cached_property
     def sigma(self) -> float:
         """Pixel noise [px]."""
         return self.estimators.pixel_sigma
 
-    @property
+    @cached_property
     def models(self) -> ObjectModels:
         """How bodies are assumed to move."""
         return self.estimators.objects
 
-    @property
+    @cached_property
     def slide(self) -> float:
         """Variance of a feature's direction with the angle from which it is seen [rad² / rad]."""
         return (self.models.drift / self.rig.left.fu) ** 2
@@ -60,32 +61,32 @@ class Frame:
     poses: Array  # T_world_left (W, 4, 4) in them
     cameras: RecentPoses  # the camera's last poses, with their joint covariance
 
-    @property
+    @cached_property
     def slot(self) -> int:
         """The frame's place in the window."""
         return self.number % len(self.stamps)
 
-    @property
+    @cached_property
     def ages(self) -> IndexArray:
         """Of the window's slots (W,), in frames."""
         return np.asarray((self.slot - np.arange(len(self.stamps))) % len(self.stamps))
 
-    @property
+    @cached_property
     def times(self) -> Array:
         """Of the window's slots less the present (W,) [s], zero where there is none yet."""
         return np.where(np.isnan(self.stamps), 0.0, self.stamps - self.features.stamp)
 
-    @property
+    @cached_property
     def dt(self) -> float:
         """Time since the previous frame [s]."""
         return float(-self.times[self.slot - 1])
 
-    @property
+    @cached_property
     def T_world_left(self) -> Array:
         """The camera's pose (4, 4)."""
         return np.asarray(self.poses[self.slot])
 
-    @property
+    @cached_property
     def eye(self) -> Array:
         """The camera's place (3,) in the world [m]."""
         return np.asarray(self.poses[self.slot, :3, 3])

@@ -15,10 +15,10 @@ from slam.objects.belief import BodyBelief
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.estimator import BodyEstimator
-from slam.objects.following import match_far
 from slam.objects.frame import Frame
 from slam.objects.points import MIN_POINTS
 from slam.objects.tracks import AGREES, Tracks
+from slam.tracks.follow import match_everywhere
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # cost: poses tried for a body that is found again
@@ -144,8 +144,9 @@ def _by_descriptors(
     allowed = np.broadcast_to(near, (len(mine), len(free)))
     lost = body.apart_from is None and not _is_expected(body)
     d_match, ratio = (config.d_match, config.ratio) if lost else (config.wide_d_match, config.wide_ratio)
-    rows, columns = match_far(tracks.descriptors[mine], tracks.laplacian[mine], features, free, allowed, d_match, ratio)
-    return mine[rows], columns
+    looks = tracks.descriptors[mine], tracks.laplacian[mine]
+    found = match_everywhere(*looks, features.select(free), d_match, ratio, allowed)
+    return mine[found.tracks], free[found.features]
 
 
 def _reach(body: Body, stamp: float, config: ObjectsConfig) -> float:

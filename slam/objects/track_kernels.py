@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.linear import column_times, invert_symmetric, multiply, row_times, square, trace, turn, turn_back
+from slam.kernels.se3 import transform_back
+from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import helper, kernel
 
 _RIDGE = 1e-9  # numerics: share of the trace, for information over a whole window, and
@@ -37,6 +39,26 @@ def inverses(M, share, least):
     for n in range(len(M)):
         invert_symmetric(M[n], share * trace(M[n]) + least, out[n])
     return out
+
+
+@kernel
+def predicted_pixels(camera, T_world_left, points, P, sigma):
+    """Pixels (uL, vL, uR) (N, 3) at which a camera sees points (N, 3) that have covariances P (N, 3, 3), in the world.
+
+    And the covariances (N, 3, 3) of the innovations of pixels with noise `sigma`. Behind the camera, pixels are NaN.
+    """
+    z, S = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+    local, J, G = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for n in range(len(points)):
+        transform_back(T_world_left, points[n], local)
+        residual(camera, local, np.zeros(3), z[n], J)
+        for k in range(3):
+            z[n, k] = -z[n, k]
+            by_point(J[k], T_world_left, G[k])
+        turn(G, P[n], S[n])
+        for k in range(3):
+            S[n, k, k] += sigma * sigma
+    return z, S
 
 
 # ---------------------------------------------------------------------------------------------- windows of tracks

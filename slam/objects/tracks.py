@@ -99,19 +99,6 @@ class Tracks:
         self.forget_past(new)
         return new
 
-    def assign_landmarks(self, landmark: IdArray) -> None:
-        """Note which landmark each feature of the frame was matched to (N,), −1 for none; one track a landmark."""
-        seen = np.flatnonzero(self.seen)
-        known = seen[landmark[self.row[seen]] >= 0]
-        ids = landmark[self.row[known]]
-        if len(ids):
-            ordered = np.sort(ids)
-            named = np.flatnonzero(self.landmark >= 0)
-            place = np.searchsorted(ordered, self.landmark[named])
-            again = ordered[np.minimum(place, len(ids) - 1)] == self.landmark[named]
-            self.landmark[named[again]] = -1
-            self.landmark[known] = ids
-
     def give_up(self, rows: NDArray[np.intp]) -> None:
         """Make rows unused."""
         self.ids[rows] = self.row[rows] = self.body[rows] = self.landmark[rows] = -1

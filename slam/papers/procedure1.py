@@ -25,8 +25,8 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
-from slam.objects.following import match_far
 from slam.objects.modes import ObjectDetector
+from slam.tracks.follow import match_everywhere
 
 _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # guard: of its numbers
@@ -255,8 +255,9 @@ class Procedure1Detector(ObjectDetector):
                 f"{features.descriptors.shape[1]}"
             )
         free = np.flatnonzero(features.has_stereo)
-        allowed = np.ones((len(d.points), len(free)), bool)
-        known, rows = match_far(d.descriptors, d.laplacian, features, free, allowed, c.wide_d_match, c.wide_ratio)
+        limits = c.wide_d_match, c.wide_ratio
+        found = match_everywhere(d.descriptors, d.laplacian, features.select(free), *limits)
+        known, rows = found.tracks, free[found.features]
         local = self.rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         points = transform(estimate.T_world_left, local)
         self.motion = detect(features, (known, rows), points, d, c.least_side, c.least_sine)

@@ -22,87 +22,72 @@ Descriptors = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Matches(Table):
-    """Pairs of a landmark and a feature."""
+    """Pairs of a track and the feature that continues it."""
 
-    landmarks: NDArray[np.intp]  # rows of the landmarks (K,)
+    tracks: NDArray[np.intp]  # rows of the tracks (K,)
     features: NDArray[np.intp]  # rows of the features (K,)
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Search windows about expected pixels, the smallest first, and how alike descriptors must be in each."""
+
+    sizes: tuple[float, ...]  # half sizes (L,): standard deviations of the innovation; of squares [px]
+    d_match: tuple[float, ...]  # largest descriptor distance in each (L,)
+    ratio: float  # largest ratio of the best to the second best distance
+    most: float = 0.0  # half axes of the smallest ellipse are bounded by this [px]; 0 for squares
+    least: float | Array = 0.0  # and from below by this, or by one number for each track (M,)
+
+    @classmethod
+    def of(cls, c: AssociationConfig) -> Windows:
+        """The windows of landmarks."""
+        if c.windows == "fixed":
+            return cls(c.window_sizes, c.d_match, c.ratio)
+        return cls(c.window_sigmas, c.d_match, c.ratio, c.window_max, c.window_min)
 
 
 def follow(
     pixels: Array, innovation: Array, descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures,
-    config: AssociationConfig, rows: NDArray[np.intp] | None = None,
+    windows: Windows,
 ) -> Matches:  # fmt: skip
-    """Match tracks to features inside size-variable windows around where the tracks are expected.
+    """Match tracks to features inside windows around where the tracks are expected.
 
     Args:
         pixels: where they are expected (M, 2); tracks whose pixels are not finite are not matched.
         innovation: covariances of these pixels' innovations (M, 2, 2) [px²], of which the windows are ellipses.
-        descriptors: of the tracks (M, D), or of a longer list of which they are `rows`.
-        laplacian: signs of the Laplacian, likewise.
+        descriptors: of the tracks (M, D).
+        laplacian: signs of their Laplacians (M,).
         features: of the frame.
-        config: the windows, and the largest descriptor distance in each.
-        rows: the tracks' rows (M,) in `descriptors`, which the matches name; None if these are the tracks'.
+        windows: where to look, and what is a match.
     """
-    square = config.windows == "fixed"
-    sizes = np.array(config.window_sizes if square else config.window_sigmas)
-    bounds = (0.0, 0.0) if square else (config.window_min / sizes[0], config.window_max / sizes[0])
-    rows = np.arange(len(pixels)) if rows is None else rows
-    every = np.arange(len(features))
-    return _followed(
-        pixels, innovation, bounds, sizes, config.d_match, config.ratio, descriptors, laplacian, rows, features, every
-    )
-
-
-def match_in_boxes(
-    centres: Array, reach: float, descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures,
-    rows: NDArray[np.intp], d_match: float, ratio: float,
-) -> Matches:  # fmt: skip
-    """`follow` tracks into square boxes of half size `reach` [px], to features `rows` (K,) of a frame only."""
-    sizes, none, every = np.array([reach]), np.zeros((len(centres), 2, 2)), np.arange(len(centres))
-    looks = descriptors, laplacian, every
-    return _followed(centres, none, (0.0, 0.0), sizes, (d_match,), ratio, *looks, features, rows)
-
-
-def _followed(
-    pixels: Array, innovation: Array, bounds: tuple[float, float], sizes: Array, d_match: tuple[float, ...],
-    ratio: float, descriptors: Descriptors, laplacian: NDArray[np.int8], rows: NDArray[np.intp],
-    features: StereoFeatures, among: NDArray[np.intp],
-) -> Matches:  # fmt: skip
-    """The kernel's answer as pairs; features `among` (K,) may be matched."""
     from slam.tracks import follow_kernels
 
-    order = among[np.argsort(features.uv_left[among, 0], kind="stable")]
-    limits = np.array(d_match, np.float32)
-    pairs = np.empty((2, len(pixels)), np.intp)
+    sizes, pairs = np.array(windows.sizes), np.empty((2, len(pixels)), np.intp)
+    least = np.broadcast_to(windows.least, len(pixels)) / sizes[0]
     count = follow_kernels.follow(
-        np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), bounds, sizes, limits, np.float32(ratio),
-        np.ascontiguousarray(descriptors), laplacian, rows, np.ascontiguousarray(features.uv_left),
-        features.descriptors, features.laplacian, order, pairs,
+        np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), least, windows.most / sizes[0], sizes,
+        np.array(windows.d_match, np.float32), np.float32(windows.ratio), np.ascontiguousarray(descriptors), laplacian,
+        np.ascontiguousarray(features.uv_left), features.descriptors, features.laplacian,
+        np.argsort(features.uv_left[:, 0], kind="stable"), pairs,
     )  # fmt: skip
-    return Matches(rows[pairs[0, :count]], pairs[1, :count])
+    return Matches(pairs[0, :count], pairs[1, :count])
 
 
 def match_everywhere(
-    descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures, config: AssociationConfig
-) -> Matches:
-    """Recognise landmarks (M, D) by descriptor alone, wherever they lie in the image."""
-    none = np.zeros(0, np.intp)
-    if not len(descriptors) or not len(features):
-        return Matches(none, none)
+    descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures, d_match: float, ratio: float,
+    allowed: BoolArray | None = None,
+) -> Matches:  # fmt: skip
+    """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image, or in pairs `allowed` (M, N)."""
     from slam.tracks.follow_kernels import mutual_best
 
-    limit = config.wide_d_match / config.wide_ratio  # farther features affect neither best nor ratio
-    near = descriptors @ features.descriptors.T > np.float32(1 - 0.5 * limit * limit)
-    near &= laplacian[:, None] == features.laplacian[None, :]
-    rows, columns = np.nonzero(near)
-    product = np.einsum("pd,pd->p", descriptors.take(rows, axis=0), features.descriptors.take(columns, axis=0))
-    distance = np.sqrt(np.maximum(2 - 2 * product, 0))
-    best = np.empty(len(rows), bool)
+    best = np.empty(len(descriptors), np.intp)
+    allowed = np.ones((0, 0), bool) if allowed is None else np.ascontiguousarray(allowed)
     mutual_best(
-        rows, columns, distance, (len(descriptors), len(features)), np.float32(config.wide_d_match),
-        np.float32(config.wide_ratio), best,
+        descriptors @ features.descriptors.T, allowed, laplacian, features.laplacian, np.float32(d_match),
+        np.float32(ratio), best,
     )  # fmt: skip
-    return Matches(rows[best], columns[best])
+    rows = np.flatnonzero(best >= 0)
+    return Matches(rows, best[rows])
 
 
 def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -113,14 +98,13 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
     from slam.tracks import follow_kernels
 
     order = np.argsort(uv[:, 0], kind="stable")
-    x, y = uv[:, 0].take(order), uv[:, 1].take(order)
-    boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach)
-    rows, places = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
-    count = follow_kernels.pairs_in_boxes(*boxes, x, y, rows, places)
+    boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach), np.ascontiguousarray(uv), order
+    rows, found = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
+    count = follow_kernels.pairs_in_boxes(*boxes, rows, found)
     if count > len(rows):
-        rows, places = np.empty((2, count), np.intp)
-        follow_kernels.pairs_in_boxes(*boxes, x, y, rows, places)
-    return rows[:count], order.take(places[:count])
+        rows, found = np.empty((2, count), np.intp)
+        follow_kernels.pairs_in_boxes(*boxes, rows, found)
+    return rows[:count], found[:count]
 
 
 def crowded(uv: Array, neighbours: Array, radius: float) -> BoolArray:

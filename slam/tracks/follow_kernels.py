@@ -7,27 +7,33 @@ import numpy as np
 from slam.runtime.compilation import helper, kernel, vector_helper
 
 
-@kernel
-def pairs_in_boxes(centres, reach, x, y, rows, places):
-    """Pairs of boxes and of points inside them, by ascending box; returns how many there are.
+@helper
+def first_column(uv, order, low):
+    """First place in the `order` (N,) of columns whose pixel `uv` (N, 2) is not left of `low`."""
+    place, end = 0, len(order)
+    while place < end:
+        middle = (place + end) // 2
+        if uv[order[middle], 0] < low:
+            place = middle + 1
+        else:
+            end = middle
+    return place
 
-    Boxes have centres and half sizes `reach` (M, 2); the points x, y (N,) ascend in x. Pairs are written into `rows` of
-    boxes and `places` of points as far as there is room.
+
+@kernel
+def pairs_in_boxes(centres, reach, uv, order, rows, found):
+    """Pairs of boxes and of pixels inside them, by ascending box; returns how many there are.
+
+    Boxes have centres and half sizes `reach` (M, 2); `order` is that of the columns of the pixels `uv` (N, 2). Pairs
+    are written into `rows` of boxes and those `found` as far as there is room.
     """
     count = 0
     for row in range(len(centres)):
-        low, high = centres[row, 0] - reach[row, 0], centres[row, 0] + reach[row, 0]
-        place, last = 0, len(x)
-        while place < last:
-            middle = (place + last) // 2
-            if x[middle] < low:
-                place = middle + 1
-            else:
-                last = middle
-        while place < len(x) and x[place] <= high:
-            if abs(y[place] - centres[row, 1]) <= reach[row, 1]:
+        place, high = first_column(uv, order, centres[row, 0] - reach[row, 0]), centres[row, 0] + reach[row, 0]
+        while place < len(order) and uv[order[place], 0] <= high:
+            if abs(uv[order[place], 1] - centres[row, 1]) <= reach[row, 1]:
                 if count < len(rows):
-                    rows[count], places[count] = row, place
+                    rows[count], found[count] = row, order[place]
                 count += 1
             place += 1
     return count
@@ -35,7 +41,11 @@ def pairs_in_boxes(centres, reach, x, y, rows, places):
 
 @helper
 def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, good):
-    """`mutual_best` of the first `count` pairs into `good`, for kernels."""
+    """Mark in `good` which of the first `count` pairs of rows and columns belong together.
+
+    A row's nearest column must be nearer than `d_match`, and than `ratio` times its second; among the rows that have
+    the same one, the nearest gets it. There are `size` rows and columns; pairs that are not `allowed` do not count.
+    """
     nearest, second = np.empty(size[0], np.float32), np.empty(size[0], np.float32)
     of_column, most = np.empty(size[1], np.float32), np.float32(np.inf)
     for row in range(size[0]):  # slices and fills take a second to compile
@@ -49,24 +59,46 @@ def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, go
                 second[row], nearest[row] = nearest[row], d
             elif d < second[row]:  # also one that is as near as the first
                 second[row] = d
-            if d < of_column[column]:
-                of_column[column] = d
     for p in range(count):
-        row, d = rows[p], distance[p]
-        mutual = allowed[p] and d == nearest[row] and d <= of_column[columns[p]]
-        good[p] = mutual and d < d_match and d < ratio * second[row]
+        row, column, d = rows[p], columns[p], distance[p]
+        good[p] = allowed[p] and d == nearest[row] and d < d_match and d < ratio * second[row]
+        if good[p] and d < of_column[column]:  # a row that would not take it has no claim to a column
+            of_column[column] = d
+    for p in range(count):
+        good[p] = good[p] and distance[p] <= of_column[columns[p]]
 
 
 @kernel
-def mutual_best(rows, columns, distance, size, d_match, ratio, good):
-    """Mark in `good` which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than others.
+def mutual_best(products, allowed, signs, feature_signs, d_match, ratio, best):
+    """Features (N,) into `best` that are each other's nearest with a track, −1 for none.
 
-    Pairs are of rows and columns, of which there are `size`, and have a distance. It must be less than `ratio` times
-    that of the row's second.
+    Given are the inner products of descriptors, tracks by features (N, M), which pairs are `allowed` (N, M; all where
+    that is empty), and both signs of the Laplacian. A match must be nearer than `d_match`, and than `ratio` times the
+    second.
     """
-    for p in range(len(good)):
-        good[p] = True
-    best_pairs(rows, columns, distance, good, len(good), size, d_match, ratio, good)
+    tracks, features = products.shape
+    nearest, second = np.empty(tracks, np.float32), np.empty(tracks, np.float32)
+    of_column, most = np.empty(features, np.float32), np.float32(np.inf)
+    for m in range(features):
+        of_column[m] = most
+    limit = d_match / ratio  # farther features affect neither best nor ratio
+    least = np.float32(1.0) - np.float32(0.5) * limit * limit
+    for n in range(tracks):
+        best[n], nearest[n], second[n] = -1, most, most
+        for m in range(features):
+            if products[n, m] <= least or signs[n] != feature_signs[m] or (allowed.size > 0 and not allowed[n, m]):
+                continue
+            d = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * products[n, m], np.float32(0.0)))
+            if d < nearest[n]:
+                best[n], second[n], nearest[n] = m, nearest[n], d
+            elif d < second[n]:
+                second[n] = d
+            if d < of_column[m]:
+                of_column[m] = d
+    for n in range(tracks):
+        d = nearest[n]
+        if best[n] >= 0 and not (d < d_match and d < ratio * second[n] and d <= of_column[best[n]]):
+            best[n] = -1
 
 
 @helper
@@ -93,27 +125,14 @@ def product(a, b):
 
 @kernel
 def follow(
-    pixels,
-    innovation,
-    bounds,
-    sizes,
-    limits,
-    ratio,
-    looks,
-    signs,
-    rows,
-    uv,
-    feature_looks,
-    feature_signs,
-    order,
-    pairs,
+    pixels, innovation, least, most, sizes, limits, ratio, looks, signs, uv, feature_looks, feature_signs, order, pairs
 ):
     """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
 
-    Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows; their half axes
-    are `sizes` (L,) times standard deviations within `bounds`, or [px] of squares if these are zero. In each window,
-    descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs` at `rows` (M,); the features are
-    at `uv`, those that count in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
+    Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows: their half axes
+    are `sizes` (L,) times standard deviations from `least` (M,) to `most`, or [px] of squares if `most` is zero. In
+    each window, descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs`; the features are at
+    `uv`, in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
     """
     levels, last = len(sizes), sizes[len(sizes) - 1]
     count, room = 0, 4 * len(pixels) + 64
@@ -122,27 +141,21 @@ def follow(
         x, y = pixels[row, 0], pixels[row, 1]
         if not (np.isfinite(x) and np.isfinite(y)):
             continue
-        if bounds[1] > 0:
-            shape = ellipse(innovation[row], bounds[0] ** 2, bounds[1] ** 2)
+        if most > 0:
+            shape = ellipse(innovation[row], least[row] ** 2, most**2)
             uu, cross, vv = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
             reach_u, reach_v = last * shape[3], last * shape[4]
         else:
             uu = cross = vv = np.float32(0.0)
             reach_u = reach_v = last
-        place, end = 0, len(order)
-        while place < end:
-            middle = (place + end) // 2
-            if uv[order[middle], 0] < x - reach_u:
-                place = middle + 1
-            else:
-                end = middle
+        place = first_column(uv, order, x - reach_u)
         while place < len(order) and uv[order[place], 0] <= x + reach_u:
             feature = order[place]
             place += 1
-            if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[rows[row]]:
+            if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[row]:
                 continue
             du, dv = np.float32(uv[feature, 0] - x), np.float32(uv[feature, 1] - y)
-            if bounds[1] > 0:
+            if most > 0:
                 off, power = np.float64(uu * du * du + np.float32(2.0) * cross * du * dv + vv * dv * dv), 2
             else:
                 off, power = np.float64(max(abs(du), abs(dv))), 1
@@ -164,7 +177,7 @@ def follow(
         for p in range(count):
             allowed[p] = level[p] <= number and not done[a[p]] and not taken[b[p]]
             if allowed[p] and level[p] == number:  # in a larger window, of tracks that are not found yet alone
-                likeness = product(looks[rows[a[p]]], feature_looks[b[p]])
+                likeness = product(looks[a[p]], feature_looks[b[p]])
                 distance[p] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
         best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[number], ratio, good)
         for p in range(count):
@@ -185,13 +198,7 @@ def nearest(points, order, places, radius, looks, place_looks, alike):
     matched, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
     for n in range(len(points)):
         x, y, best, least = points[n, 0], points[n, 1], -1, radius * radius
-        place, end = 0, len(order)
-        while place < end:
-            middle = (place + end) // 2
-            if places[order[middle], 0] < x - radius:
-                place = middle + 1
-            else:
-                end = middle
+        place = first_column(places, order, x - radius)
         while place < len(order) and places[order[place], 0] <= x + radius:
             m = order[place]
             gap = (places[m, 0] - x) ** 2 + (places[m, 1] - y) ** 2

@@ -18,7 +18,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
-from slam.tracks.follow import Matches, follow, match_everywhere
+from slam.tracks.follow import Matches, Windows, follow, match_everywhere
 from slam.tracks.standing import Standing
 from slam.tracks.state import NO_POSE, PoseHypotheses, TrackingState
 from slam.tracks.table import LandmarkTable
@@ -210,7 +210,8 @@ class Search:
         tight = median_deviation(p) <= c.tight_window
         least = 0.0
         if consensus.inliers.sum() < c.minimum_consistent:
-            matches_wide = match_everywhere(self.landmarks.descriptors, self.landmarks.laplacian, self.features, c)
+            looks = self.landmarks.descriptors, self.landmarks.laplacian
+            matches_wide = match_everywhere(*looks, self.features, c.wide_d_match, c.wide_ratio)
             wide = self._consensus(matches_wide, p.T_world_left, wide=True)
             if wide.inliers.sum() >= c.minimum_consistent:
                 matches, consensus, tight = matches_wide, wide, False
@@ -252,8 +253,9 @@ class Search:
 
     def _in_windows(self, uv: Array, innovation: Array, rows: NDArray[np.intp]) -> Matches:
         """Matches of the landmarks at `rows` (M,), in windows around their pixels (M, 2)."""
-        looks = self.landmarks.descriptors, self.landmarks.laplacian
-        return follow(uv, innovation, *looks, self.features, self.config, rows)
+        looks = self.landmarks.descriptors[rows], self.landmarks.laplacian[rows]
+        found = follow(uv, innovation, *looks, self.features, Windows.of(self.config))
+        return Matches(rows[found.tracks], found.features)
 
     def _around(self, T_world_left: Array) -> tuple[Matches, int]:
         """Matches in small windows around a pose, and the number of landmarks searched for."""
@@ -271,7 +273,7 @@ class Search:
         measured = measurement_rows(self.features.uv_left[rows], self.features.uv_right[rows])
         threshold, hypotheses = c.consistency_sigmas * self.localizer.pixel_sigma, c.hypotheses
         return find_consensus(
-            self.localizer.rig, self.positions[matches.landmarks], measured, guess, threshold,
+            self.localizer.rig, self.positions[matches.tracks], measured, guess, threshold,
             c.wide_hypotheses if wide else hypotheses, self.seed,
         )  # fmt: skip
 
@@ -280,8 +282,8 @@ class Search:
         matches = matches.select(consensus.inliers)
         if not len(matches):
             return LandmarkMatches.nothing()
-        matches = matches.select(np.argsort(matches.landmarks, kind="stable"))
-        return LandmarkMatches(self.landmarks.ids[matches.landmarks], matches.features, consensus.T_world_left)
+        matches = matches.select(np.argsort(matches.tracks, kind="stable"))
+        return LandmarkMatches(self.landmarks.ids[matches.tracks], matches.features, consensus.T_world_left)
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:

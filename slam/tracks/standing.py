@@ -141,10 +141,6 @@ class Standing:
         """The same features, of a camera that does not stand."""
         return replace(self, frames=0)
 
-    def witnessed(self, features: StereoFeatures) -> StereoFeatures:
-        """Those of the features that stay."""
-        return features.select(self.witnesses)
-
 
 def _moved_share(
     rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array

@@ -207,7 +207,8 @@ class LoopCloser:
     ) -> NDArray[np.intp]:
         """The keyframes with most matches by descriptor, if there are enough of them, best first."""
         seen, config = [atlas.keyframes[k] for k in likely.tolist()], self._localizer.config
-        found = [match_everywhere(k.descriptors.astype(np.float32), k.laplacian, features, config) for k in seen]
+        limits = config.wide_d_match, config.wide_ratio
+        found = [match_everywhere(k.descriptors.astype(np.float32), k.laplacian, features, *limits) for k in seen]
         number = np.array([len(matches) for matches in found], int)
         order = np.argsort(-number, kind="stable")[:_VERIFIED]
         return likely[order[number[order] >= max(enough, self._config.inliers)]]

@@ -9,10 +9,11 @@ from slam.data import Prediction, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.tracks.config import AssociationConfig
-from slam.tracks.follow import follow, match_everywhere, match_in_boxes
+from slam.tracks.follow import Windows, follow, match_everywhere
 from tests.slam.scene import RIG, Cloud
 
 CONFIG = AssociationConfig()
+WIDE = CONFIG.wide_d_match, CONFIG.wide_ratio
 
 
 def predicted(cloud, T, offset=(0.0, 0.0), sigma=2.0):
@@ -26,7 +27,7 @@ def predicted(cloud, T, offset=(0.0, 0.0), sigma=2.0):
 def found(cloud, prediction, features, config=CONFIG):
     ids = prediction.ids
     expected = prediction.uv_left, prediction.innovation
-    return follow(*expected, cloud.descriptors[ids], cloud.laplacian[ids], features, config)
+    return follow(*expected, cloud.descriptors[ids], cloud.laplacian[ids], features, Windows.of(config))
 
 
 def test_every_landmark_finds_its_own_feature():
@@ -35,7 +36,7 @@ def test_every_landmark_finds_its_own_feature():
     prediction = predicted(cloud, np.eye(4))
     matches = found(cloud, prediction, features)
     assert len(matches) == len(ids)
-    np.testing.assert_array_equal(prediction.ids[matches.landmarks], ids[matches.features])
+    np.testing.assert_array_equal(prediction.ids[matches.tracks], ids[matches.features])
 
 
 def test_fixed_windows_do_not_care_for_the_covariance():
@@ -62,20 +63,42 @@ def test_windows_are_the_innovations_ellipses(sigma):
     )
     one, none = np.ones(1), np.full((1, 2), np.nan)
     features = [StereoFeatures(0.0, uv[None], none, one, one, one, sign, look) for uv in offset]
-    inside = np.array([len(follow(np.zeros((1, 2)), P[None], look, sign, f, config)) for P, f in zip(S, features)])
+    inside = np.array(
+        [len(follow(np.zeros((1, 2)), P[None], look, sign, f, Windows.of(config))) for P, f in zip(S, features)]
+    )
     clear = np.abs(np.sqrt(squared) - 5.0) > 1e-3  # float32 at the very edge
     assert 30 < inside.sum() < 270
     np.testing.assert_array_equal(inside[clear], (squared <= 25.0)[clear])
 
 
-def test_boxes_take_some_features_and_tracks_that_are_expected_somewhere():
+def test_boxes_take_tracks_that_are_expected_somewhere():
     cloud = Cloud()
     features, ids = cloud.features(np.eye(4), 0.0)
     pixels, looks = features.uv_left + 2.0, (cloud.descriptors[ids], cloud.laplacian[ids], features)
     pixels[0] = np.nan
-    matches = match_in_boxes(pixels, 3.0, *looks, np.arange(10), 0.4, 0.8)
-    assert matches.landmarks.tolist() == matches.features.tolist() == list(range(1, 10))
-    assert not len(match_in_boxes(pixels, 1.0, *looks, np.arange(10), 0.4, 0.8))
+    innovation = np.zeros((len(ids), 2, 2))
+    matches = follow(pixels, innovation, *looks, Windows((3.0,), (0.4,), 0.8))
+    assert matches.tracks.tolist() == matches.features.tolist() == list(range(1, len(ids)))
+    assert not len(follow(pixels, innovation, *looks, Windows((1.0,), (0.4,), 0.8)))
+
+
+def test_each_track_may_have_a_least_window_of_its_own():
+    cloud = Cloud()
+    features, ids = cloud.features(np.eye(4), 0.0)
+    least = np.where(np.arange(len(ids)) % 2, 5.0, 2.0)
+    looks, S = (cloud.descriptors[ids], cloud.laplacian[ids], features), np.tile(1e-6 * np.eye(2), (len(ids), 1, 1))
+    pixels = features.uv_left + np.array([0.0, 3.0])
+    matches = follow(pixels, S, *looks, Windows((3.0,), (0.4,), 0.8, 20.0, least))
+    assert matches.tracks.tolist() == list(range(1, len(ids), 2))
+
+
+def test_everywhere_keeps_to_the_pairs_that_are_allowed():
+    cloud = Cloud()
+    features, ids = cloud.features(np.eye(4), 0.0)
+    allowed = np.ones((len(ids), len(ids)), bool)
+    allowed[3] = False
+    matches = match_everywhere(cloud.descriptors[ids], cloud.laplacian[ids], features, *WIDE, allowed)
+    assert matches.tracks.tolist() == np.delete(np.arange(len(ids)), 3).tolist()
 
 
 def test_larger_window_asks_for_a_better_descriptor():
@@ -104,7 +127,7 @@ def test_no_greedy_theft():
     features, ids = cloud.features(np.eye(4), 0.0)
     only_second = _select(features, np.flatnonzero(ids == 1))
     matches = found(cloud, predicted(cloud, np.eye(4)), only_second)
-    assert matches.landmarks.tolist() == [1]
+    assert matches.tracks.tolist() == [1]
 
 
 def test_tracks_that_look_alike_to_the_bit_share_a_feature():
@@ -112,8 +135,8 @@ def test_tracks_that_look_alike_to_the_bit_share_a_feature():
     one = np.ones(1)
     feature = StereoFeatures(0.0, np.zeros((1, 2)), np.full((1, 2), np.nan), one, one, one, sign, look)
     many = np.zeros((500, 2)), np.tile(np.eye(2), (500, 1, 1)), look.repeat(500, axis=0), sign.repeat(500)
-    matches = follow(*many, feature, CONFIG)
-    assert matches.landmarks.tolist() == list(range(500)) and not matches.features.any()
+    matches = follow(*many, feature, Windows.of(CONFIG))
+    assert matches.tracks.tolist() == list(range(500)) and not matches.features.any()
 
 
 def test_ambiguous_features_are_left_alone():
@@ -133,18 +156,18 @@ def test_laplacian_signs_must_agree():
 def test_everywhere_needs_no_prediction():
     cloud = Cloud()
     features, ids = cloud.features(se3.exp(np.array([0, 0.2, 0, 0.5, 0, 0.3])), 0.0)
-    matches = match_everywhere(cloud.descriptors, cloud.laplacian, features, CONFIG)
+    matches = match_everywhere(cloud.descriptors, cloud.laplacian, features, *WIDE)
     assert len(matches) == len(ids)
-    np.testing.assert_array_equal(matches.landmarks, ids[matches.features])
+    np.testing.assert_array_equal(matches.tracks, ids[matches.features])
 
 
 def test_nothing_to_match():
     cloud = Cloud()
     nothing = StereoFeatures.empty(0.0, 32)
     assert len(found(cloud, predicted(cloud, np.eye(4)), nothing)) == 0
-    assert len(match_everywhere(cloud.descriptors, cloud.laplacian, nothing, CONFIG)) == 0
+    assert len(match_everywhere(cloud.descriptors, cloud.laplacian, nothing, *WIDE)) == 0
     features, _ = cloud.features(np.eye(4), 0.0)
-    assert len(match_everywhere(cloud.descriptors[:0], cloud.laplacian[:0], features, CONFIG)) == 0
+    assert len(match_everywhere(cloud.descriptors[:0], cloud.laplacian[:0], features, *WIDE)) == 0
 
 
 @pytest.mark.parametrize(

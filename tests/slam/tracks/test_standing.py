@@ -88,7 +88,7 @@ def test_a_rest_lasts_while_something_hides_all_that_stays_for_some_frames():
     body, frames = replace(standing, witnesses=np.flatnonzero(scene.body)), []
     for k in range(12):
         moved = scene.seen(8 + k, np.eye(4), np.array([0.3 * (k + 1), 0.0, 0.0]))
-        standing = standing.after(RIG, SIGMA, body.witnessed(moved))
+        standing = standing.after(RIG, SIGMA, moved.select(body.witnesses))
         frames.append(standing.stands)
     assert all(frames[:5])
     assert not frames[-1]
