@@ -196,7 +196,7 @@ FAULTS = (
     ),
     # calibration
     Fault(
-        "the baseline's forward part moves rows the wrong way", "slam/calibration/model_kernels.py",
+        "the baseline's forward part moves rows the wrong way", "slam/calibration/kernels.py",
         "vertical_by_pose = -1 - y * y, right * y, right, d, -d * y",
         "vertical_by_pose = -1 - y * y, right * y, right, d, d * y",
         "tests/slam/calibration",
