@@ -56,7 +56,8 @@ class FollowedErrors:
         _, sizes, rows = np.linalg.svd(field.reshape(-1, field.shape[2]), full_matrices=False)
         V = rows[sizes > 1e-9 * sizes[0]].T  # 1e-9: numerics, rounding
         products = _products(np.column_stack([points[:, :2], points[:, 0] - points[:, 2]]) / self._focal)
-        self._V, self._by_baseline = V[:-1], BASELINE * V[-1]
+        # As a copy has it: of another order in memory, products would be rounded differently.
+        self._V, self._by_baseline = np.ascontiguousarray(V[:-1]), BASELINE * V[-1]
         self._coefficients = np.linalg.lstsq(products.T, (field @ V).reshape(len(points), -1), rcond=None)[0]
 
     def of(self, parameters: Array) -> Array:
