@@ -13,7 +13,7 @@ _RANGES = {"systematic": (1e-4, 1e4), "minimum_parallax": (1e-4, 1e4)}  # [px]
 
 @dataclass(frozen=True)
 class SelfCalibrationConfig:
-    """Settings of the self-calibration. The prior of the calibration's errors is in `slam.calibration.prior`.
+    """Settings of the self-calibration. The prior of the calibration's errors is in `slam.calibration.posterior`.
 
     Attributes:
         enabled: False leaves all measurements unchanged.

@@ -7,15 +7,31 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.correction import Revision, RigCorrection
 from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence, row_evidence
-from slam.calibration.joint import joint_calibration
-from slam.calibration.model import RigModel
-from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
-from slam.calibration.posterior import RigPosterior, residual_likelihoods, solve
-from slam.calibration.prior import FOCALS, along, factory_prior, prior_information, resumed_prior, systematic_variance
-from slam.calibration.saved import SavedCalibration, rig_numbers
-from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
+from slam.calibration.model import Revision, RigCorrection, RigModel
+from slam.calibration.pairs import (
+    NO_MATCHES,
+    Pair,
+    Rows,
+    View,
+    match,
+    noise_variances,
+    pair_evidence,
+    pair_of,
+    parallax,
+)
+from slam.calibration.posterior import (
+    FOCALS,
+    RigPosterior,
+    along,
+    factory_prior,
+    prior_information,
+    residual_likelihoods,
+    resumed_prior,
+    solve,
+    systematic_variance,
+)
+from slam.calibration.saved import SavedCalibration, joint_calibration, rig_numbers
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
@@ -60,7 +76,9 @@ class SelfCalibration:
             self._own_prior = resumed_prior(self.model, mean, covariance + np.diag(self._systematic))
             start = self._own_prior.covariances.mean(axis=0)
         self._own = RigPosterior(self._prior.mean, start)  # of the errors in this recording, without residual fields
-        self._by_fields = np.zeros_like(start)  # covariance (n, n) of its mean by unknown residual fields
+        # covariance (n, n) of its mean by what its evidence has in common: a systematic error, unknown residual fields
+        self._by_bias = np.zeros_like(start)
+        self._before = np.diag(start)  # variances (n,) without evidence
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
@@ -85,7 +103,7 @@ class SelfCalibration:
     @property
     def covariance(self) -> Array:
         """Of the present posterior (n, n)."""
-        return self._own.covariance + self._by_fields + np.diag(self._systematic)
+        return self._own.covariance + self._by_bias
 
     @property
     def posterior(self) -> RigPosterior:
@@ -251,8 +269,10 @@ class SelfCalibration:
         assert found is not None
         # The correction is to explain this recording, so it may take up what the residual fields do here.
         self._own = solve(self._own_prior, moved, found.whole)
+        # What is still from the prior has no bias of this recording: each parameter's weight of the evidence.
+        weight = np.clip(1 - np.diag(self._own.covariance) / self._before, 0.0, 1.0)
         effect = self._own.covariance @ found.whole.cross
-        self._by_fields = found.fields * effect @ effect.T
+        self._by_bias = np.diag(weight**2 * self._systematic) + found.fields * effect @ effect.T
 
 
 def _mean_variance(changes: Array, covariance: Array) -> float:

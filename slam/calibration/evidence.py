@@ -8,10 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from slam.calibration.model import RESIDUAL, RigModel
-from slam.calibration.prior import RESIDUAL_SCALES, field_variance
 from slam.chi_square import chi_square_limit
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array
+
+#: Possible scales of a rig's residual fields, see `field_variance`, equally probable a priori: from none to a pixel at
+#: 1000 px. Rows tell which it is, so the range matters only where it is too narrow.
+RESIDUAL_SCALES = np.geomspace(0.05, 5.0, 10)
 
 _PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts for
 
@@ -52,14 +55,9 @@ class RecordingEvidence(NamedTuple):
     scales: Array  # log-likelihoods (K,) of the scales of the residual fields by its rows
 
     @property
-    def residual(self) -> float:
-        """Scale of the residual fields."""
-        return residual_scale(self.scales)
-
-    @property
     def fields(self) -> float:
         """Variance of each coefficient of the residual fields [focal lengths²]."""
-        return field_variance(self.residual)
+        return field_variance(residual_scale(self.scales))
 
 
 class RigEvidence(NamedTuple):
@@ -100,6 +98,12 @@ class RigEvidence(NamedTuple):
         ):
             raise ValueError("its evidence is none")
         return cls(plain, apart, scales)
+
+
+def field_variance(scale: float = 1.0) -> float:
+    """Variance of each coefficient of the residual fields [focal lengths²], at their scale."""
+    # 2e-4: root mean square over the image at a scale of 1 [focal lengths]: a fifth of a pixel at 1000 px
+    return (scale * 2e-4) ** 2 / len(RESIDUAL)
 
 
 def residual_scale(logs: Array) -> float:

@@ -7,10 +7,12 @@ ideal rig would have measured.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
@@ -88,7 +90,7 @@ class RigModel:
 
     def shift_with_vertical(self, points: Array, parameters: Array) -> Array:
         """Change (N, 4) [px] as of `shift`, then of the vertical disparity: ``vertical(points) @ parameters``."""
-        from slam.calibration.model_kernels import shift
+        from slam.calibration.kernels import shift
 
         both = np.concatenate([parameters, self._gauge @ parameters])
         return np.asarray(shift(np.ascontiguousarray(points, float), self.focal, both))
@@ -133,7 +135,7 @@ class RigModel:
 
     def _polynomials(self, x: Array, y: Array) -> Array:
         """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
-        from slam.calibration.model_kernels import polynomials
+        from slam.calibration.kernels import polynomials
 
         # 1.1: polynomials are held constant beyond the image, this many half widths from its centre
         at = (np.stack([x, y]) - self._centre[:, None]) / self._half[:, None]
@@ -148,6 +150,50 @@ def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
 
 def _field(points: Array, focal: float) -> Array:
     """Change (N, 4, n + 3) [px] of points (N, 3) [px] and their vertical disparities by parameters and a turn."""
-    from slam.calibration.model_kernels import field
+    from slam.calibration.kernels import field
 
     return np.asarray(field(np.ascontiguousarray(points, float), focal))
+
+
+@dataclass(frozen=True, eq=False)
+class RigCorrection:
+    """Maps measured pixels to those of an ideal rig."""
+
+    model: RigModel  # the parameters' meaning
+    parameters: Array  # their values (n,)
+
+    def rows(self, z: Array) -> Array:
+        """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]; uR NaN stays NaN."""
+        points = self.model.points(z)
+        return self.model.rows(points + self.model.shift(points, self.parameters))
+
+    def undone(self, z: Array) -> Array:
+        """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
+        corrected = points = self.model.points(z)
+        for _ in range(4):  # 4: fixed-point iterations that undo a correction; each reduces the error some 30 times
+            points = corrected - self.model.shift(points, self.parameters)
+        return self.model.rows(points)
+
+    def features(self, features: StereoFeatures) -> StereoFeatures:
+        """Features with both pixels corrected."""
+        uv_left, uv_right = self.pixels(features.uv_left, features.uv_right)
+        return replace(features, uv_left=uv_left, uv_right=uv_right)
+
+    def pixels(self, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
+        """Corrected rectified pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
+        points = self.model.points(np.column_stack([uv_left, uv_right[:, 0]]))
+        change = self.model.shift_with_vertical(points, self.parameters)
+        z = self.model.rows(points + change[:, :3])
+        return z[:, :2], np.column_stack([z[:, 2], z[:, 1] + uv_right[:, 1] - uv_left[:, 1] + change[:, 3]])
+
+
+@dataclass(frozen=True, eq=False)
+class Revision:
+    """A change of the correction during a run, for measurements that have the earlier correction."""
+
+    before: RigCorrection  # the corrections
+    after: RigCorrection
+
+    def rows(self, z: Array) -> Array:
+        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected again."""
+        return self.after.rows(self.before.undone(z))

@@ -28,7 +28,7 @@ def revise_tracks(
         poses: T_world_left (W, 4, 4) in the frames of the window's slots.
         slot: of the newest frame.
         rig: the cameras.
-        correct: corrects rectified rows (uL, vL, uR) (N, 3) [px] again, as of `slam.calibration.correction.Revision`.
+        correct: corrects rectified rows (uL, vL, uR) (N, 3) [px] again, as of `slam.calibration.model.Revision`.
     """
     rows, slots = np.nonzero(tracks.dof)
     points = tracks.anchor[rows] + tracks.p[rows, slots]

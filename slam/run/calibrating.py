@@ -13,9 +13,8 @@ import numpy as np
 from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
 from slam.calibration.evidence import RecordingEvidence
-from slam.calibration.joint import agreement, agreement_in_words, joint_calibration
-from slam.calibration.prior import factory_prior
-from slam.calibration.saved import rig_difference, rig_numbers
+from slam.calibration.posterior import factory_prior
+from slam.calibration.saved import agreement, agreement_in_words, joint_calibration, rig_difference, rig_numbers
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slam.calibration.correction import Revision
+from slam.calibration.model import Revision
 from slam.checks import FARTHEST_PIXEL, LATEST_STAMP, MOST_ID
 from slam.data import FrameResult, IdArray, Observations
 from slam.errors import MeasurementError

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from slam.archives import array, json_text, unpack
-from slam.calibration.correction import Revision, RigCorrection
-from slam.calibration.model import RigModel
+from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.data import Observations
 from slam.errors import SequenceError, SlamError
 from slam.files import read_bytes, whole_file

@@ -42,7 +42,7 @@ OXTS_NOISE = TruthNoise(rotation=float(np.radians(0.03)), translation=0.02, moun
 _OXTS_TIME = 0.01 / np.sqrt(12)
 
 _COUNT = re.compile(r"\d{1,18}", re.ASCII)  # the name of a record
-_EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
+_EARTH_RADIUS, _ECCENTRICITY = 6378137.0, 0.0818191908426  # of the earth's ellipsoid (WGS 84): equatorial [m]
 _OXTS = "latitude, longitude, altitude, roll, pitch, yaw"
 _PAIRS = (("0", "1"), ("2", "3"))  # grey first, colour where there is no grey
 
@@ -245,13 +245,18 @@ def read_oxts(folder: Path, origin: int | None, frame_stamps: dict[int, float], 
 def imu_poses(records: Array) -> Array:
     """Poses (N, 4, 4) of records (N, 6): latitude, longitude [deg], altitude [m], roll, pitch, yaw [rad].
 
-    World axes are east, north, up, its origin the first position. The Mercator projection is scaled by the cosine of
-    the first latitude, so that lengths near it are metres; ``R = Rz(yaw) Ry(pitch) Rx(roll)``.
+    World axes are east, north, up, its origin the first position. The Mercator projection is scaled along each axis by
+    the ellipsoid's radius at the first latitude, so that lengths near it are metres: KITTI's development kit takes the
+    earth for a sphere of the equator's radius, so that in Karlsruhe its ways along a parallel are 0.19 % too short, and
+    those along a meridian 0.10 % too long. ``R = Rz(yaw) Ry(pitch) Rx(roll)``.
     """
     latitude, longitude, altitude, roll, pitch, yaw = records.T
-    scale = _EARTH_RADIUS * np.cos(np.radians(latitude[0]))
-    east = scale * np.radians(longitude)
-    north = scale * np.log(np.tan(np.radians(90 + latitude) / 2))
+    flat = 1 - (_ECCENTRICITY * np.sin(np.radians(latitude[0]))) ** 2
+    across = _EARTH_RADIUS / np.sqrt(flat)  # radius of curvature along the parallel
+    along = across * (1 - _ECCENTRICITY**2) / flat  # and along the meridian
+    shrunk = np.cos(np.radians(latitude[0]))
+    east = across * shrunk * np.radians(longitude)
+    north = along * shrunk * np.log(np.tan(np.radians(90 + latitude) / 2))
     position = np.stack([east, north, altitude], axis=1)
     return pose(about(yaw, 2) @ about(pitch, 1) @ about(roll, 0), position - position[0])
 

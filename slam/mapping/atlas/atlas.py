@@ -18,10 +18,9 @@ from scipy.linalg import block_diag
 from slam.data import Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.chain import Chain, between_keyframes
 from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.mapping.atlas.places import PlaceIndex
-from slam.mapping.atlas.pose_graph import PoseGraph
+from slam.mapping.atlas.pose_graph import Chain, PoseGraph, between_keyframes
 from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
 

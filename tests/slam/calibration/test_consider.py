@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.calibration import RigModel, RigPosterior, SelfCalibrationConfig
-from slam.calibration.followed import BASELINE, FollowedErrors
+from slam.calibration.consider import BASELINE, FollowedErrors
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import inverse, log

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.calibration import RigCorrection, RigModel, RigPosterior, SelfCalibration, SelfCalibrationConfig
-from slam.calibration.prior import prior_information
+from slam.calibration.posterior import prior_information
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry import se3

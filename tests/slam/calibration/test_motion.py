@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.calibration import RigModel
-from slam.calibration.motion import Pair, fit_motion, move, noise_variances, pair_evidence
-from slam.calibration.prior import prior_information
-from slam.calibration.views import View, match, pair_of
+from slam.calibration.pairs import Pair, View, fit_motion, match, move, noise_variances, pair_evidence, pair_of
+from slam.calibration.posterior import prior_information
 from slam.geometry import se3
 from tests.slam.calibration.drives import CAR, Street, parameters
 from tests.slam.numeric import jacobian

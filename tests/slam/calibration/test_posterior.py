@@ -5,8 +5,7 @@ import pytest
 
 from slam.calibration.evidence import Accumulator, Evidence, residual_scale, row_evidence
 from slam.calibration.model import RigModel
-from slam.calibration.posterior import residual_likelihoods, solve
-from slam.calibration.prior import Prior, factory_prior
+from slam.calibration.posterior import Prior, factory_prior, residual_likelihoods, solve
 from tests.slam.calibration.drives import CAR, parameters, residual_fields
 
 NONE = np.zeros(1)

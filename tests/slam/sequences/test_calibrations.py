@@ -356,7 +356,7 @@ def test_a_calibration_for_other_images_is_said_before_what_fails(two_folders: P
 
 
 def test_the_errors_of_a_rig_are_no_rig(tmp_path: Path) -> None:
-    (tmp_path / "calibration.json").write_text('{"rig": {}, "residual_scale": 1, "parameters": []}')
+    (tmp_path / "calibration.json").write_text('{"rig": {}, "parameters": [], "evidence": null}')
     with pytest.raises(CalibrationError, match=r"errors of a rig, .* not a rig: see --calibration"):
         slam.load_rig(tmp_path)
 

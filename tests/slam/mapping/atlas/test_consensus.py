@@ -10,11 +10,10 @@ import pytest
 from slam.geometry.se3 import Array, exp, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.atlas.pose_graph import PoseGraph, _Normal
+from slam.mapping.atlas.pose_graph import Chain, PoseGraph, _Normal
 from slam.rig_error import CommonError
 
 LAP, DEPTH = 60, 2.0

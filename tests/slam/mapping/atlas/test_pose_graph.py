@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from slam.geometry.se3 import exp, inverse, log
-from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.closing import disagreement, is_informative
 from slam.mapping.atlas.keyframes import Loop
-from slam.mapping.atlas.pose_graph import PoseGraph
+from slam.mapping.atlas.pose_graph import Chain, PoseGraph
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.calibration import RigModel
-from slam.calibration.correction import Revision, RigCorrection
+from slam.calibration.model import Revision, RigCorrection
 from slam.data import StereoFeatures
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
