@@ -24,7 +24,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.runtime.blas import one_blas_thread
+from slam.runtime.threads import one_blas_thread
 from slam.window.motion import LONGEST, is_first
 from slam.window.stereo import Field, RectifiedStereo
 

@@ -22,7 +22,7 @@ from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.registry import ONLINE
-from slam.run.recorded import Recording
+from slam.run.recording import Recording
 from slam.worlds import open_world
 from slam.worlds.sequence import WorldSequence
 

@@ -27,7 +27,7 @@ from slam.compare.statistics import difference
 from slam.compare.sweep import sweep
 from slam.compare.wording import shown_p
 from slam.run.results import BY_KEY
-from slam.runtime.cores import available_cores
+from slam.runtime.threads import available_cores
 
 WORLDS = ("synthetic:aisle?frames={}", "synthetic:desk?frames={}")
 VARIANTS = tuple(Variant(f"{d}-D", "surf", (f"frontend.descriptor={d}",)) for d in (64, 16))

@@ -9,9 +9,9 @@ import numpy as np
 
 from slam.data import IdArray, Observations
 from slam.mapping.config import MapConfig
-from slam.mapping.selection import new_landmarks
+from slam.mapping.management import new_landmarks
 from slam.models import EstimatorModels, models_for
-from slam.run.recorded import RecordedFrame, Recording
+from slam.run.recording import RecordedFrame, Recording
 from slam.worlds.observe import SimulatedFeatures
 from slam.worlds.sequence import WorldSequence
 

@@ -22,7 +22,7 @@ from slam.compare.sweep import Run, sweep
 from slam.registry import ONLINE
 from slam.run.plots import plot
 from slam.run.run_data import RunData
-from slam.runtime.cores import available_cores
+from slam.runtime.threads import available_cores
 
 HEADER = ("back end", "frames tracked", "ATE online [mm]", "ATE final [mm]", "path [m]", "landmark error, median [mm]",
           "landmarks in the map, mean", "NEES / 6")  # fmt: skip

@@ -29,11 +29,9 @@ from slam.objects.config import ObjectsConfig
 from slam.objects.detector import MovingObjectDetector
 from slam.objects.modes import ObjectDetector
 from slam.papers.procedure1 import Procedure1Detector
-from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
-from slam.runtime.one_thread import OneThread
-from slam.runtime.prefetch import prefetch
 from slam.runtime.stages import Stages
+from slam.runtime.threads import OneThread, one_blas_thread, prefetch
 from slam.session import Elsewhere, Session, State
 from slam.third_party import named_failures
 from slam.tracker import Tracker, frame_result

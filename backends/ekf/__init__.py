@@ -11,7 +11,6 @@ In the papers' order:
 - `filter`: the back end.
 """
 
-from backends.ekf.config import EkfConfig
-from backends.ekf.filter import EkfBackend
+from backends.ekf.filter import EkfBackend, EkfConfig
 
 __all__ = ["EkfBackend", "EkfConfig"]

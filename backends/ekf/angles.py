@@ -18,8 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.geometry.euler import angles, body_rate_matrix, rotation
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, angles, body_rate_matrix, rotation
 
 #: Camera axes (right, down, forward) in an angles' world chosen for it: forward is x, right is y, down is z.
 CANONICAL = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.data import IdArray, IndexArray
+from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array, hat
-from slam.table import LandmarkRows
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update

@@ -12,8 +12,7 @@ import numpy as np
 from backends.ekf.angles import LIMIT, anchor, attitude, pose_jacobian, reanchor
 from backends.ekf.covariance import CAMERA, POSE
 from slam.geometry import se3
-from slam.geometry.euler import angles, body_rate_matrix, rotation
-from slam.geometry.se3 import Array, hat
+from slam.geometry.se3 import Array, angles, body_rate_matrix, hat, rotation
 from slam.models import ANYWHERE, EstimatorModels
 
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]

@@ -22,7 +22,7 @@ from backends.ekf.solve import Gated, Posterior, UnsolvableError, Update, gate, 
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
-from slam.window.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
 
 #: The pose (4, 4) on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]

@@ -1,16 +1,111 @@
-"""The right-invariant EKF as a form of the filter that `backends.ekf` runs: another camera, another error."""
+"""The right-invariant EKF as a form of the filter that `backends.ekf` runs: another camera, another error.
+
+The state ``χ = (R, p, v, p_1, …, p_N)`` is an element of SE_{2+N}(3) (Barrau and Bonnabel, 2015; Zhang, Wu, Song, Huang
+and Dissanayake, 2017): attitude, position and velocity of the camera, and the landmarks, all in the world. Beside it
+stands the body's rate ω. The error of a right-invariant filter is a displacement of the world, ``χ = exp(ξ) χ̂``:
+
+    R = Exp(ξ_R) R̂,   p = p̂ + ξ_R × p̂ + ξ_p,   v = v̂ + ξ_R × v̂ + ξ_v,   p_i = p̂_i + ξ_R × p̂_i + ξ_i,   ω = ω̂ + ξ_ω
+
+to first order. In these coordinates the transition and all measurements have derivatives that do not depend on where
+the estimate is in the world, and a displacement of camera and map together, which nothing measures, is the same error
+``ξ_R = δ, ξ_p = ξ_i = t, ξ_v = ξ_ω = 0`` whatever the estimate is. No sequence of linearisations can inform on it.
+
+The covariance is kept in the state's own coordinates here: ``[δp, θ, δv, δω]`` with ``R = Exp(θ) R̂``, and the
+landmarks' inverse depths, in which a far point's error is Gaussian. They are a linear map of ξ, which depends on the
+estimate: ``ξ = T(χ̂) [δp, θ, …]``. So that what is kept is ``T(χ̂)⁻¹ P_ξ T(χ̂)⁻ᵀ`` at any time, with the invariant
+filter's P_ξ, an update that moves the estimate from χ̂ to χ̂⁺ multiplies by ``T(χ̂⁺)⁻¹ T(χ̂)``: that is the transport of
+`backends.ekf.state.FilterState.corrected`. The transition needs none, as it is exact in these coordinates.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
+from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.filter import EkfBackend, Form
 from backends.ekf.landmarks import InverseDepth
-from backends.iekf.camera import InvariantCamera
+from backends.ekf.motion import Motion, after_gap, motion_noise, prior
 from slam.bounds import from_options, require_positive
+from slam.geometry import se3
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, hat
 from slam.models import EstimatorModels
+
+
+@dataclass(frozen=True, eq=False)
+class InvariantCamera:
+    """Pose and velocities, with the error [δp, θ, δv, δω] (12,); see the module, and `backends.ekf.motion.Camera`."""
+
+    pose: Array  # T_world_left (4, 4)
+    v: Array  # velocity (3,) in the world [m/s]
+    rate: Array  # the body's rate ω (3,) [rad/s]
+    transports = True
+
+    @classmethod
+    def first(cls, models: EstimatorModels) -> tuple[InvariantCamera, Array]:
+        """Before the first prediction, with its covariance."""
+        return cls(models.initial_pose, np.zeros(3), np.zeros(3)), prior(models)
+
+    def by_error(self) -> Array:
+        """See `Camera`: ``[R̂ᵀ θ, R̂ᵀ δp]``."""
+        J = np.zeros((POSE, POSE))
+        J[:3, 3:] = J[3:, :3] = self.pose[:3, :3].T
+        return J
+
+    def world(self) -> Array:
+        """See `Camera`: ``ξ_p = δp + p̂ × θ``."""
+        W = np.eye(POSE)
+        W[:3, 3:] = hat(self.pose[:3, 3])
+        return W
+
+    def moved(self, error: Array) -> InvariantCamera:
+        """See `Camera`."""
+        T = se3.pose(se3.so3_exp(error[3:6]) @ self.pose[:3, :3], self.pose[:3, 3] + error[:3])
+        return replace(self, pose=T, v=self.v + error[6:9], rate=self.rate + error[9:])
+
+    def at(self, T: Array) -> InvariantCamera:
+        """See `Camera`."""
+        return replace(self, pose=T)
+
+    def seen_from(self, other: InvariantCamera) -> Array:
+        """See `Camera`."""
+        turn = se3.so3_log(self.pose[:3, :3] @ other.pose[:3, :3].T)
+        shift = self.pose[:3, 3] - other.pose[:3, 3]
+        return np.concatenate([shift, turn, self.v - other.v, self.rate - other.rate])
+
+    def transport(self, to: InvariantCamera) -> Array:
+        """See `Camera`: ``T(χ̂⁺)⁻¹ T(χ̂)``."""
+        J = np.eye(CAMERA)
+        J[:3, 3:6], J[6:9, 3:6] = hat(self.pose[:3, 3] - to.pose[:3, 3]), hat(self.v - to.v)
+        return J
+
+    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
+        """See `Camera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
+        gap = after_gap(models, P, dt)
+        if gap is not None:  # it may be turned anyhow: it stays, independent of the map
+            still = replace(self, v=np.zeros(3), rate=np.zeros(3))
+            return Motion(still, np.zeros((CAMERA, CAMERA)), gap)
+        R, turn = self.pose[:3, :3], self.rate * dt
+        T = se3.pose(R @ se3.so3_exp(turn), self.pose[:3, 3] + dt * self.v)
+        A, G = np.eye(CAMERA), np.eye(CAMERA)
+        G[3:6, 3:6] = R @ se3.so3_left_jacobian(turn)
+        A[:3, 6:9], A[3:6, 9:] = dt * np.eye(3), dt * G[3:6, 3:6]
+        return Motion(replace(self, pose=T), A, G @ motion_noise(models, dt) @ G.T)
+
+    def at_rest(self) -> Motion:
+        """See `Camera`."""
+        still = replace(self, v=np.zeros(3), rate=np.zeros(3))
+        return Motion(still, np.diag(np.repeat([1.0, 0.0], POSE)))
+
+    def settled(self) -> Motion:
+        """See `Camera`: nothing is singular; a rotation is made orthonormal again."""
+        R = self.pose[:3, :3]
+        if np.abs(R @ R.T - np.eye(3)).max() <= 1e-12:
+            return Motion(self)
+        return Motion(replace(self, pose=se3.pose(se3.nearest_rotation(R), self.pose[:3, 3])))
 
 
 @dataclass(frozen=True)
@@ -36,7 +131,7 @@ def IekfBackend(rig: StereoRig, models: EstimatorModels = EstimatorModels(), **o
 
     Gate, update, iteration, recovery, and the landmarks that leave the dense state are those of `backends.ekf`; what is
     its own is the motion on SO(3) instead of Euler angles, and the invariant error, for which no covariance has to be
-    transported (`backends.iekf.camera` says why). A landmark that leaves the dense state takes its error in the world
+    transported (`backends.iekf.filter` says why). A landmark that leaves the dense state takes its error in the world
     as it is with it, and comes back to the invariant one.
 
     Args:

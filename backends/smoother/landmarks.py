@@ -9,8 +9,8 @@ import numpy as np
 
 from backends.smoother.kernels import carried_by, information_of
 from slam.data import BoolArray, IdArray, IndexArray
+from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array, points_by_pose
-from slam.table import LandmarkRows
 from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance

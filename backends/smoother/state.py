@@ -9,8 +9,8 @@ import numpy as np
 
 from backends.smoother.landmarks import SmootherLandmarks
 from slam.data import IdArray, IndexArray
+from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array, adjoint, inverse
-from slam.table import Table
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ from backends.smoother.state import Known, Sight, SmootherState, Tie
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
 from slam.window import motion, pose_only
-from slam.window.agreement import MIN_CONSENSUS
-from slam.window.gating import squared_distances
+from slam.window.gating import MIN_CONSENSUS, squared_distances
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 

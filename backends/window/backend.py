@@ -21,7 +21,7 @@ from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
-from slam.runtime.blas import one_blas_thread
+from slam.runtime.threads import one_blas_thread
 from slam.window.stereo import TOO_LATE, Field
 
 

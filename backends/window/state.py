@@ -8,8 +8,8 @@ import numpy as np
 
 from backends.window.past import Past
 from slam.data import BoolArray, IdArray, IndexArray
+from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array
-from slam.table import LandmarkRows
 from slam.window.problem import Places, RelativePrior, Rows
 from slam.window.stereo import relative_covariance
 

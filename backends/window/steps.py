@@ -15,7 +15,7 @@ from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window import chart_kernels, motion, pose_only
-from slam.window.agreement import MIN_CONSENSUS
+from slam.window.gating import MIN_CONSENSUS
 from slam.window.problem import Places, RelativePrior, Rows, Window
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.solver import CLOSE, Solution, solve

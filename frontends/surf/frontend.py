@@ -12,8 +12,7 @@ from frontends.surf.config import SurfConfig
 from frontends.surf.correlation import align, cut_patches, patch_windows
 from frontends.surf.epipolar import HalfImage, half_image, search_rows
 from frontends.surf.images import Picture, following_white, grey
-from frontends.surf.keypoints import Keypoints
-from frontends.surf.selection import adapted_threshold, spread
+from frontends.surf.keypoints import Keypoints, adapted_threshold, spread
 from frontends.surf.surf import Surf
 from slam.bounds import from_options
 from slam.data import ImagePair, Patches, StereoFeatures, StereoFrame

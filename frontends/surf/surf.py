@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
 from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussian_weights
-from frontends.surf.detector import detect_octave
-from frontends.surf.filters import layer_sizes, make_filters
+from frontends.surf.detector import detect_octave, layer_sizes, make_filters
 from frontends.surf.images import Picture, float_integral_image, integral_image
 from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
 from frontends.surf.localisation import first_of_each, localise

@@ -341,7 +341,7 @@ def warm_up_command(quiet: _Quiet = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
     from slam.commands.display import progress
     from slam.run.warm_up import compile_kernels, warm_up
-    from slam.runtime.compile_clock import compile_clock
+    from slam.runtime.compilation import compile_clock
 
     with progress(None, "", quiet):
         compile_kernels(ONLINE[-1])

@@ -16,7 +16,7 @@ from slam.compare.wording import caution
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.files import read_object
-from slam.runtime.cores import available_cores
+from slam.runtime.threads import available_cores
 from slam.sequences.faults import said_before
 from slam.settings import require_settable
 

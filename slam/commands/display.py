@@ -18,7 +18,7 @@ from rich.table import Table
 from slam.data import FrameResult
 from slam.errors import SlamError
 from slam.run.results import rows, verdict_of_run
-from slam.runtime.compile_clock import compile_clock, working_time
+from slam.runtime.compilation import compile_clock, working_time
 
 if TYPE_CHECKING:
     from slam.compare.tables import Group

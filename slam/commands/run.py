@@ -23,7 +23,7 @@ from slam.run.drawing import FramePictures
 from slam.run.options import RunOptions, parse_frames
 from slam.run.outcome import nothing_tracked
 from slam.run.plots import leave_picture
-from slam.run.recorded import Recording
+from slam.run.recording import Recording
 from slam.run.repeat import changed_versions, load, versions
 from slam.run.runner import Watch
 from slam.run.viewer import Viewer

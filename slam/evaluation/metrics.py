@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.errors import TrajectoryError
-from slam.geometry.alignment import align
 from slam.geometry.se3 import Array, inverse, log, pose, rotation_angle, so3_exp, so3_log
 from slam.geometry.stamps import pair
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, align
 
 #: Lengths of KITTI's segments [m].
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)

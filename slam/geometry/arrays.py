@@ -1,14 +1,19 @@
-"""Names of the array types that signatures use, and what NumPy takes long to begin where there are few numbers.
+"""Arrays: names of their types, tables with a row for each of the same things, and rows looked up by ids.
 
 Shapes and units are in the docstrings.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from slam.errors import MeasurementError
 
 #: Real numbers; computed in float64.
 Array = NDArray[np.floating[Any]]
@@ -47,3 +52,56 @@ def median(values: Array) -> float:
     """The median of some numbers: ``np.median``, which takes longer to begin than these need."""
     ordered = np.sort(values, axis=None)
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Arrays with as many rows each; those that derive from it name them as their fields."""
+
+    @property
+    def columns(self) -> list[Any]:
+        """All arrays."""
+        return [getattr(self, name) for name in self.__dataclass_fields__]
+
+    def __len__(self) -> int:
+        return len(getattr(self, next(iter(self.__dataclass_fields__))))
+
+    def select(self, rows: Any) -> Self:
+        """Some of the rows: a mask, indices, or a slice."""
+        return type(self)(*(column[rows] for column in self.columns))
+
+    def joined(self, other: Self) -> Self:
+        """These rows, then others."""
+        return type(self)(*(np.concatenate(pair) for pair in zip(self.columns, other.columns)))
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkRows(Table):
+    """A row for each landmark of a map."""
+
+    ids: IdArray  # (N,), negative for one that is in the map no more
+
+    @cached_property
+    def order(self) -> IndexArray:
+        """Rows of the landmarks in the map, by ascending id."""
+        rows = np.argsort(self.ids, kind="stable")
+        return np.asarray(rows[np.searchsorted(self.ids[rows], 0) :])
+
+    def rows_of(self, ids: IdArray | Sequence[int]) -> IndexArray:
+        """Rows (M,) of landmarks.
+
+        Raises:
+            MeasurementError: one is not in the map.
+        """
+        ids, present = np.asarray(ids, np.int64), self.ids[self.order]
+        at = np.searchsorted(present, ids).clip(0, max(len(present) - 1, 0))
+        bad = present[at] != ids if len(present) else np.ones(len(ids), bool)
+        if bad.any():
+            raise MeasurementError(f"landmark {ids[bad][0]} is not in the map")
+        return self.order[at]
+
+    def require_new(self, ids: IdArray) -> None:
+        """Raise MeasurementError where a landmark is in the map already."""
+        taken = np.isin(ids, self.ids)
+        if taken.any():
+            raise MeasurementError(f"landmark {ids[taken][0]} is in the map already")

@@ -14,9 +14,8 @@ from slam.input.features import documented, outside_masks
 from slam.input.warnings import InputWarnings, shows_something
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
-from slam.runtime.blas import one_blas_thread
-from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
+from slam.runtime.threads import OneThread, one_blas_thread
 from slam.third_party import named_failures
 
 #: Largest row difference of left and right features that is assumed of a front end that does not give its own [px].

@@ -7,8 +7,8 @@ import numpy as np
 from slam.checks import FARTHEST_POSITION
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
+from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import LEAST_VARIANCE, Array
-from slam.table import LandmarkRows
 
 _NEAREST = 1e-3  # guard: least depth [m] of a landmark that a camera sees
 _LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having

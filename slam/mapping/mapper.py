@@ -14,10 +14,16 @@ from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend, MapBackend
 from slam.mapping.atlas.loop_closer import Found
 from slam.mapping.config import MapConfig
-from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
 from slam.mapping.known_landmarks import in_front
+from slam.mapping.management import (
+    bad_landmarks,
+    crowded_landmarks,
+    doubled_landmarks,
+    known_features,
+    new_landmarks,
+    surplus_landmarks,
+)
 from slam.mapping.monocular import depths_by_motion, frame_covariance, unclaimed
-from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
 from slam.third_party import checked
 from slam.tracks.localizer import LandmarkMatches, Localizer

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
+from slam.geometry.arrays import Table
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, points_by_pose
-from slam.table import Table
 from slam.tracks.follow import Matches, Windows, follow, pairs_in_boxes
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
 from slam.models import ObjectModels
-from slam.objects.belief import BodyBelief
-from slam.objects.existence import EVEN, when_measured, when_missed
+from slam.objects.belief import EVEN, BodyBelief, when_measured, when_missed
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
@@ -52,7 +51,7 @@ class Body:
     moved: bool = False  # whether it has by its estimate, too, see `slam.objects.estimator`: only then it is reported
     alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
     age: int = 0  # number of frames since it was found
-    existence: float = EVEN  # probability that it exists, see `slam.objects.existence`
+    existence: float = EVEN  # probability that it exists, see `slam.objects.belief`
     measured_at: float = float("nan")  # when the estimate last used them [s]
     reported: int = 0  # number of frames in which it was reported as measured
     reported_unmeasured: int = 0  # number of frames in which it was reported though it was not measured
@@ -174,7 +173,7 @@ def hidden(bodies: Iterable[Body], eye: Array, points: Array) -> BoolArray:
 
 
 def with_evidence(body: Body, gain: float) -> Body:
-    """The body after what this frame says of its existence; see `slam.objects.existence`."""
+    """The body after what this frame says of its existence; see `slam.objects.belief`."""
     if body.measured:
         return replace(body, existence=when_measured(body.existence, gain))
     return replace(body, existence=when_missed(body.existence, body.seen, body.age))

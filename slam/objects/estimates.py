@@ -8,10 +8,9 @@ import numpy as np
 
 from slam.geometry.se3 import Array, inverse
 from slam.object_data import MovingObject, ObjectEstimate
-from slam.objects.belief import BodyBelief
+from slam.objects.belief import EVEN, BodyBelief
 from slam.objects.bodies import CUT, Body, outermost
 from slam.objects.config import ObjectsConfig
-from slam.objects.existence import EVEN
 from slam.objects.tracks import Tracks
 
 

@@ -33,7 +33,7 @@ from slam.objects.points import (
     with_shape,
 )
 from slam.window import chart_kernels, pose_only
-from slam.window.agreement import INFLATION
+from slam.window.gating import INFLATION
 from slam.window.problem import Places, Rows
 from slam.window.solver import Solution, linearised, solve
 from slam.window.stereo import RectifiedStereo

@@ -18,9 +18,8 @@ from slam.archives import array, unpack
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.files import read_bytes, whole_file
-from slam.geometry.euler import angles
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, log, pose, transform
+from slam.geometry.se3 import Array, angles, inverse, log, pose, transform
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate

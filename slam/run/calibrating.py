@@ -21,7 +21,7 @@ from slam.errors import CalibrationError, ConfigurationError
 from slam.files import write_text
 from slam.geometry.se3 import Array
 from slam.outputs import Output, require_outputs
-from slam.runtime.blas import one_blas_thread
+from slam.runtime.threads import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live
 from slam.sequences.rigs import require_kalibr, write_kalibr, write_opencv

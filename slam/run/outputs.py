@@ -17,8 +17,7 @@ import numpy as np
 from slam.data import Estimate, FrameResult, IdArray
 from slam.errors import SlamError
 from slam.files import RowFile, lock_folder, reason, remove_file, write_text
-from slam.geometry.euler import angles
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, angles, transform
 from slam.geometry.trajectory import Trajectory, tum_line
 from slam.mapping.atlas.atlas import Atlas
 from slam.object_data import MovingObject

@@ -1,4 +1,4 @@
-"""Give any back end what a run gave its own (`slam.run.recorded`): estimators compared on identical measurements.
+"""Give any back end what a run gave its own (`slam.run.recording`): estimators compared on identical measurements.
 
 In closed loop each estimator's predictions steer its own data association instead.
 """
@@ -14,7 +14,7 @@ from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, Up
 from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
 from slam.input.rectification import Rectification
 from slam.interfaces import Backend, RevisingBackend
-from slam.run.recorded import RecordedFrame, Recording
+from slam.run.recording import RecordedFrame, Recording
 from slam.third_party import checked, named_failures
 from slam.tracks.config import AssociationConfig
 

@@ -24,15 +24,14 @@ from slam.outputs import require_outputs
 from slam.run.options import RunOptions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
 from slam.run.outputs import RunFiles, write_json, write_trajectory
-from slam.run.recorded import RecordedFrame, Recording
-from slam.run.recording import save_recording
+from slam.run.recording import RecordedFrame, Recording, save_recording
 from slam.run.repeat import origin, portable, versions
 from slam.run.replay import replay
 from slam.run.schema import schema
 from slam.run.settings_reference import in_force
 from slam.run.summary import Replayed, RunRecord, live_frames, results_of
 from slam.run.warm_up import warm_up
-from slam.runtime.blas import one_blas_thread
+from slam.runtime.threads import one_blas_thread
 from slam.sequences import Sequence, is_live
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam

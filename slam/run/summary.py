@@ -17,9 +17,9 @@ from slam.input.rectification import Rectification
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend
 from slam.rig_error import CommonError
-from slam.run.recorded import Recording
+from slam.run.recording import Recording
 from slam.run.schema import STAGES
-from slam.runtime.compile_clock import compile_clock, working_time
+from slam.runtime.compilation import compile_clock, working_time
 from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam

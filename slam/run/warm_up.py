@@ -13,8 +13,8 @@ from pathlib import Path
 
 from slam.data import FrameResult
 from slam.registry import ONLINE, create, resolve
-from slam.runtime.compile_clock import compile_clock
-from slam.runtime.cores import available_cores
+from slam.runtime.compilation import compile_clock
+from slam.runtime.threads import available_cores
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 

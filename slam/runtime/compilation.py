@@ -12,16 +12,133 @@ twice for each helper that it calls, a tenth of the time of small ones.
 
 from __future__ import annotations
 
+import dis
 import gc
+import hashlib
+import linecache
 import logging
 import os
-from collections.abc import Callable
-from types import SimpleNamespace
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from threading import RLock
+from types import CodeType, SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from slam.errors import ConfigurationError
-from slam.runtime.compile_clock import compile_clock
-from slam.runtime.sources import makes_arrays, stamp
+
+#: Names of NumPy's functions and methods that make arrays.
+_MAKERS = {
+    "arange", "argsort", "array", "ascontiguousarray", "asarray", "astype", "concatenate", "copy", "copyto", "cross",
+    "diag", "dot", "empty", "empty_like", "eye", "flatnonzero", "full", "full_like", "linalg", "linspace", "nonzero",
+    "ones", "ones_like", "outer", "repeat", "reshape", "sort", "stack", "sum", "take", "tile", "where", "zeros",
+    "zeros_like",
+}  # fmt: skip
+_VALUES = (int, float, str, tuple, np.generic, np.ndarray)
+
+
+def stamp(*functions: Callable[..., Any]) -> str:
+    """Digest of functions' files, of those of the helpers that they call, and of the numbers that all of them read.
+
+    Helpers are found by their names in the module: they are imported by name, never as attributes of a module.
+    """
+    parts = set()
+    for part in _parts(*functions):
+        parts.add((part.__module__, _digest(part.__code__.co_filename, part.__module__)))
+        for name in _names(part.__code__):
+            value = part.__globals__.get(name)
+            if isinstance(value, _VALUES):
+                exact = f"{value.dtype}{value.tolist()}" if isinstance(value, np.ndarray) else repr(value)
+                parts.add((f"{part.__module__}.{name}", exact))
+    return hashlib.sha256(repr(sorted(parts)).encode()).hexdigest()
+
+
+def makes_arrays(function: Callable[..., Any]) -> bool:
+    """Whether a function, or a helper that it calls, makes an array, as far as its text shows."""
+    codes = [part.__code__ for part in _parts(function)]
+    products = (step.argrepr.startswith("@") for code in codes for step in dis.get_instructions(code))
+    return any(name in _MAKERS for code in codes for name in _names(code)) or any(products)
+
+
+def _parts(*functions: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+    """Functions and the helpers that they call, each once."""
+    waiting, known = [*functions], {*functions}
+    while waiting:
+        part = waiting.pop()
+        yield part
+        for name in _names(part.__code__):
+            called = getattr(part.__globals__.get(name), "py_func", None)
+            if called is not None and called not in known:
+                known.add(called)
+                waiting.append(called)
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """All global names and attributes in a function and in those inside it."""
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+@cache
+def _digest(file: str, module: str) -> str:
+    """Of a file's text, which may lie in an archive; read once in a process."""
+    return hashlib.sha256("".join(linecache.getlines(file, vars(sys.modules[module]))).encode()).hexdigest()
+
+
+class CompileClock:
+    """Runs while any thread compiles: the others wait for it, or for the same processor.
+
+    Reading the clock needs no lock. For why a block stands on the lock's own line, see `slam.runtime.threads`.
+    """
+
+    watch: Callable[[int, int], None] | None = None  # is told how many kernels are compiled, of how many
+
+    def __init__(self) -> None:
+        self._missing: list[str] = []  # files in Numba's cache that kernels of the loaded modules did not have
+        self._lock = RLock()
+        self._state = 0, 0.0, 0.0  # compilations under way (they nest), since when, and the time before [s]
+
+    def change(self, by: int) -> bool:
+        """A compilation begins (1) or ends (-1); whether it is the only one."""
+        with self._lock: return self._change(by, time.perf_counter())  # noqa: E701  # fmt: skip
+
+    def seconds(self) -> float:
+        """Wall time in which something was compiled [s]."""
+        under_way, since, before = self._state
+        return before + (time.perf_counter() - since if under_way else 0.0)
+
+    def expect(self, file: str) -> None:
+        """A kernel was loaded which is compiled where this file of Numba's cache is missing."""
+        if not os.path.exists(file):  # noqa: PTH110 for each of some hundred kernels
+            self._missing.append(file)
+
+    def tell(self) -> bool:
+        """Tell the watch how many kernels have been compiled, here or by another process; whether there is a watch."""
+        if self.watch is None:
+            return False
+        self.watch(sum(map(os.path.exists, self._missing)), max(1, len(self._missing)))
+        return True
+
+    def _change(self, by: int, now: float) -> bool:
+        under_way, since, before = self._state
+        alone = max(under_way, under_way + by) == 1
+        self._state = under_way + by, now if not under_way else since, before + (now - since if alone and by < 0 else 0)
+        return alone
+
+
+#: Of this process.
+compile_clock = CompileClock()
+
+
+def working_time() -> float:
+    """A clock that stands still while kernels are compiled [s]."""
+    return time.perf_counter() - compile_clock.seconds()
+
 
 try:
     from numba import njit

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from slam.runtime.compile_clock import working_time
+from slam.runtime.compilation import working_time
 
 
 class Stages:

@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from slam.errors import CalibrationError, SequenceError, TrajectoryError
-from slam.geometry.euler import about
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, pose
+from slam.geometry.se3 import Array, about, inverse, pose
 from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence

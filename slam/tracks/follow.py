@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
+from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
-from slam.table import Table
 from slam.tracks.config import AssociationConfig
 
 Descriptors = NDArray[np.float32]

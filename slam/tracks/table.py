@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.geometry.arrays import among, ascending, isin
+from slam.geometry.arrays import Table, among, ascending, isin
 from slam.geometry.se3 import Array, transform
 from slam.naming import count
-from slam.table import Table
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from slam.geometry.arrays import Array, IndexArray
-from slam.table import Table
+from slam.geometry.arrays import Array, IndexArray, Table
 from slam.window import chart_kernels, kernels
 from slam.window.stereo import RectifiedStereo
 

@@ -20,8 +20,7 @@ from slam.data import BoolArray
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log
 from slam.window import pose_only
-from slam.window.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
-from slam.window.gating import squared_distances
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance, squared_distances
 
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it

@@ -18,8 +18,7 @@ from slam.geometry.kernels import project_rectified, triangulate_rectified
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.models import EstimatorModels
-from slam.window.agreement import landmarks_pose
-from slam.window.gating import with_noise
+from slam.window.gating import landmarks_pose, with_noise
 
 #: Why a back end refuses `slam.interfaces.ConsideringBackend.consider`.
 TOO_LATE = "errors of the rig are followed from before the first predict or insert on"
@@ -136,7 +135,7 @@ class RectifiedMeasurement:
         return left, self.rig.right.project((local + self.rig.b) @ self.rig.R.T), S
 
     def landmarks_pose(self, points: Array, z: Array, T: Array, seed: int) -> Array | None:
-        """The pose (4, 4) on which most landmarks agree, if there is one; see `slam.window.agreement.landmarks_pose`.
+        """The pose (4, 4) on which most landmarks agree, if there is one; see `slam.window.gating.landmarks_pose`.
 
         Args:
             points: the landmarks (M, 3) in the world [m].

@@ -14,8 +14,7 @@ import numpy as np
 from slam.errors import SequenceError
 from slam.files import write_png
 from slam.geometry.camera import PinholeCamera
-from slam.geometry.euler import angles
-from slam.geometry.se3 import Array, inverse
+from slam.geometry.se3 import Array, angles, inverse
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.sequence import WorldSequence

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.geometry.euler import about, rotation
-from slam.geometry.se3 import Array, pose
+from slam.geometry.se3 import Array, about, pose, rotation
 
 #: Camera axes of a level camera that looks along world +y: x right, y down, z forward.
 R_LEVEL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

@@ -16,7 +16,7 @@ from backends.ekf.motion import EulerCamera
 from backends.ekf.solve import Innovation, UnsolvableError, Update, Whitened, gate, solve
 from backends.ekf.state import FilterState
 from slam.geometry import se3
-from slam.geometry.euler import angles, body_rate_matrix
+from slam.geometry.se3 import angles, body_rate_matrix
 from slam.models import EstimatorModels, MotionModel
 from slam.window.stereo import RectifiedStereo
 from tests.backends.scenes import RIG

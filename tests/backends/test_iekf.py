@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from backends.iekf import IekfBackend
-from backends.iekf.camera import InvariantCamera
+from backends.iekf.filter import InvariantCamera
 from experiments.corridor import run as corridor
 from slam.geometry import se3
 from tests.backends.ekf_runs import MODELS, turning_drive

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from frontends.surf.selection import adapted_threshold, spread
+from frontends.surf.keypoints import adapted_threshold, spread
 
 
 def counter(total, steepness):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from slam.data import Observations
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
-from slam.runtime.blas import one_blas_thread
+from slam.runtime.threads import one_blas_thread
 
 Array = np.ndarray
 

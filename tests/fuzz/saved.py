@@ -22,8 +22,7 @@ from slam.mapping.map_io import SavedMap, decode, encode
 from slam.objects.config import ObjectsConfig
 from slam.papers.procedure1 import ObjectDatabase
 from slam.run.options import RunOptions
-from slam.run.recorded import record
-from slam.run.recording import load_recording, save_recording
+from slam.run.recording import load_recording, record, save_recording
 from slam.run.run_data import RunData, read_objects
 from slam.run.runner import run_recording
 from slam.system import StereoSlam

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 import slam
-from backends.ekf.config import EkfConfig
+from backends.ekf.filter import EkfConfig
 from backends.smoother.config import SmootherConfig
 from frontends.surf.config import SurfConfig
 from slam.calibration.config import SelfCalibrationConfig
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.mapping.selection import MapConfig
+from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam

@@ -17,7 +17,7 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.models import EstimatorModels, MotionModel
 from slam.run import calibrating, runner
-from slam.runtime.blas import one_blas_thread
+from slam.runtime.threads import one_blas_thread
 from tests.backends.scenes import RIG, path, run, scene
 
 DATA = scene(path(8, 0.1, np.array([0, 0, 1.5]), np.array([0, 0.3, 0])), points=600, limit=80)

@@ -20,7 +20,7 @@ from slam.data import FrameStatus
 from slam.errors import MeasurementError, PartError
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
-from slam.runtime.blas import one_blas_thread
+from slam.runtime.threads import one_blas_thread
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 

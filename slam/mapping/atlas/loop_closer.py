@@ -18,11 +18,11 @@ from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, Loop, step_covariance, view_has_changed
 from slam.mapping.atlas.verification import keyframe_landmarks, verify
-from slam.mapping.selection import depth_is_known
+from slam.mapping.management import depth_is_known
 from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.rig_error import Correction
-from slam.runtime.blas import one_blas_thread
+from slam.runtime.threads import one_blas_thread
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
 from slam.tracks.localizer import Localizer

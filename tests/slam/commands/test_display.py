@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from slam.commands.display import progress
-from slam.runtime.compile_clock import compile_clock
+from slam.runtime.compilation import compile_clock
 
 
 def test_kernels_that_are_compiled_are_counted_within_80_columns(capsys, monkeypatch):

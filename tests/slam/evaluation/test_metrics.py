@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from slam.evaluation.metrics import PathErrors, absolute_errors, associate, relative_errors, segment_errors
-from slam.geometry.alignment import align, align_positions
 from slam.geometry.se3 import exp, inverse
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, align, align_positions
 
 
 def wander(count: int, seed: int, step: float = 0.5, turn: float = 0.05) -> Trajectory:

@@ -5,8 +5,14 @@ import pytest
 
 from slam.data import StereoFeatures
 from slam.mapping.config import MapConfig
-from slam.mapping.culling import bad_landmarks, crowded_landmarks, doubled_landmarks, known_features, surplus_landmarks
-from slam.mapping.selection import new_landmarks
+from slam.mapping.management import (
+    bad_landmarks,
+    crowded_landmarks,
+    doubled_landmarks,
+    known_features,
+    new_landmarks,
+    surplus_landmarks,
+)
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView, expected_landmarks
 from tests.slam.scene import RIG

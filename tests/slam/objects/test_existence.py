@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from slam.objects.existence import EVEN, when_measured, when_missed
+from slam.objects.belief import EVEN, when_measured, when_missed
 
 
 def test_a_body_that_moves_clearly_is_soon_certain():

@@ -5,8 +5,7 @@ import pytest
 
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
-from slam.geometry.euler import rotation
-from slam.geometry.se3 import exp, inverse, log, pose, transform
+from slam.geometry.se3 import exp, inverse, log, pose, rotation, transform
 from slam.papers.procedure1 import (
     ObjectDatabase,
     body_frame,

@@ -12,8 +12,7 @@ from slam.calibration.posterior import RigPosterior
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError, SequenceError
-from slam.run.recorded import record
-from slam.run.recording import load_recording, save_recording
+from slam.run.recording import load_recording, record, save_recording
 from slam.run.replay import replay
 from slam.system import StereoSlam
 from tests.backends.fixed_map import FixedMapBackend

@@ -19,8 +19,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.map_io import load_map
 from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
-from slam.run.recorded import RecordedFrame
-from slam.run.recording import load_recording
+from slam.run.recording import RecordedFrame, load_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run
 from slam.sequences import open_sequence

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.geometry.euler import rotation
-from slam.geometry.se3 import pose
+from slam.geometry.se3 import pose, rotation
 from slam.object_data import MovingObject, ObjectEstimate
 from slam.run.options import RunOptions
 from slam.run.outputs import RunFiles

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from slam.runtime.compile_clock import compile_clock, working_time
+from slam.runtime.compilation import compile_clock, working_time
 
 
 def test_a_kernel_that_is_compiled_is_noticed_once(caplog, monkeypatch):

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from slam.runtime.prefetch import prefetch
+from slam.runtime.threads import prefetch
 
 
 def threads() -> set[threading.Thread]:
@@ -64,7 +64,7 @@ def test_the_thread_ends_before_the_program_does(source):
     program = f"""
 import atexit, sys, threading
 from types import SimpleNamespace
-from slam.runtime.prefetch import prefetch
+from slam.runtime.threads import prefetch
 from slam.sequences.live import LiveFrames
 
 def endless():

@@ -12,7 +12,7 @@ import pytest
 
 from slam.kernels.linear import factorise
 from slam.kernels.se3 import move
-from slam.runtime.sources import makes_arrays, stamp
+from slam.runtime.compilation import makes_arrays, stamp
 
 ROOT = Path(__file__).parents[3]
 
@@ -74,10 +74,10 @@ def test_a_change_of_a_helper_in_another_file_compiles_its_callers_again(package
 
 def test_a_stamp_covers_helpers_of_helpers_and_numbers(monkeypatch):
     from slam.kernels import se3, stereo
-    from slam.runtime import sources
+    from slam.runtime import compilation
 
     read = []
-    monkeypatch.setattr(sources, "_digest", lambda file, module: read.append(module) or module)
+    monkeypatch.setattr(compilation, "_digest", lambda file, module: read.append(module) or module)
     stamp(stereo.by_point.py_func)
     assert set(read) == {"slam.kernels.stereo", "slam.kernels.linear"}
     before = stamp(stereo.residual.py_func)

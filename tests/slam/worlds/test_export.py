@@ -8,8 +8,7 @@ import pytest
 import yaml
 
 from slam.errors import SequenceError
-from slam.geometry.euler import rotation
-from slam.geometry.se3 import pose
+from slam.geometry.se3 import pose, rotation
 from slam.sequences import open_sequence
 from slam.worlds import open_world
 from slam.worlds.export import DEPTH_STEPS, write_euroc

@@ -16,7 +16,7 @@ from slam.geometry.se3 import Array, adjoint, exp, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, covariance_growth, step_covariance, view_has_changed
 from slam.mapping.atlas.verification import refined_pose, verify
-from slam.mapping.selection import depth_is_known
+from slam.mapping.management import depth_is_known
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
 from slam.tracks.localizer import Localizer

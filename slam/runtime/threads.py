@@ -1,15 +1,31 @@
-"""One BLAS thread: the same sums in the same order on every machine, and no threads for small matrices."""
+"""Threads: the cores that there are, one BLAS thread, objects for one thread, and an iterator that works ahead in one.
+
+With one BLAS thread sums have the same order on every machine, and small matrices wait for no threads.
+"""
 
 from __future__ import annotations
 
+import atexit
+import os
+import queue
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import lru_cache, wraps
 from threading import RLock
 from typing import Any, TypeVar
 from weakref import WeakSet
 
 from threadpoolctl import LibController, ThreadpoolController
+
+from slam.errors import SlamError
+
+
+def available_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _Changed = list[tuple[LibController, int]]
@@ -105,3 +121,89 @@ def _set(numbers: _Changed) -> None:
         library.set_num_threads(threads)
         if clear is not None:
             clear(force=True)
+
+
+class OneThread:
+    """``with`` this around what one thread may do at a time; not to be nested.
+
+    A copy, also a pickled one, is free.
+
+    Args:
+        what: is refused, for the message.
+
+    Raises:
+        SlamError: on entry, while another thread is inside.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._inside: dict[str, int] = {}  # the thread inside; `setdefault` is atomic
+
+    def __enter__(self) -> None:
+        here = threading.get_ident()
+        if self._inside.setdefault("thread", here) != here:
+            raise SlamError(f"{self._what} is in use by another thread: give each thread its own, or take turns")
+
+    def __exit__(self, *error: object) -> None:
+        self._inside.clear()
+
+    def __reduce__(self) -> tuple[type[OneThread], tuple[str]]:
+        return OneThread, (self._what,)
+
+
+T = TypeVar("T")
+
+_LOOK = 0.1  # [s] between two looks for a signal
+
+
+class _End:
+    """What follows the last item: nothing, or the exception that ended the work."""
+
+    def __init__(self, error: BaseException | None = None) -> None:
+        self.error = error
+
+
+def _next(ready: queue.Queue[T]) -> T:
+    """The next item of a queue. A signal that comes just before the wait takes effect at the next look."""
+    while True:
+        with suppress(queue.Empty):
+            return ready.get(timeout=_LOOK)
+
+
+def prefetch(items: Iterable[T], depth: int = 2) -> Iterator[T]:
+    """The same items in the same order, made in a thread that is at most `depth` items ahead of the one in use.
+
+    An exception of the iterator is raised where its item would have come. The thread ends with the generator: after its
+    last item, when it is closed, or with the program, if an exception left the generator half used.
+    """
+    ready: queue.Queue[T | _End] = queue.Queue()
+    places = threading.Semaphore(depth)
+    stopped = threading.Event()
+
+    def work() -> None:
+        try:
+            iterator = iter(items)
+            while places.acquire() and not stopped.is_set():
+                ready.put(next(iterator))
+        except StopIteration:
+            ready.put(_End())
+        except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
+            ready.put(_End(error))
+
+    def end() -> None:
+        stopped.set()
+        places.release()
+        thread.join()
+
+    thread = threading.Thread(target=work, name="prefetch", daemon=True)
+    thread.start()
+    atexit.register(end)  # a thread that runs on while Python is taken down may hang or abort it
+    try:
+        while not isinstance(item := _next(ready), _End):
+            places.release()
+            yield item
+        if item.error is not None:
+            raise item.error
+    finally:
+        atexit.unregister(end)
+        end()
