@@ -106,6 +106,11 @@ class BatchBackend:
         """See `slam.interfaces.ConsideringBackend.sensitivities`: the smoother's."""
         return self._smoother.sensitivities(ids)
 
+    @property
+    def revises_path(self) -> bool:
+        """A revision changes the whole path, see `slam.interfaces.RevisingBackend`."""
+        return True
+
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`."""

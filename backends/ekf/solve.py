@@ -289,8 +289,10 @@ def solve(update: Update, gated: Gated) -> Posterior | None:
 def _iterate(update: Update, now: Linearisation, whitened: Whitened) -> tuple[Linearisation, Array, Whitened]:
     """The change of the state (n,), from where, by an update whose first linearisation is `whitened`, and the last.
 
-    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
-    is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
+    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. The prior is
+    transported from its own coordinates, not from those of the iterate: where landmarks move by much, the result is not
+    quite the posterior's maximum. Where the first is far from linear, the guess may be the better next place. One
+    iteration is taken as it is: the papers' filter.
     """
     rows, reached = whitened.rows, None
     for iteration in range(1, update.iterations + 1):

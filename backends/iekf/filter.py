@@ -130,9 +130,9 @@ def IekfBackend(rig: StereoRig, models: EstimatorModels = EstimatorModels(), **o
     """Right-invariant extended Kalman filter over the camera's motion and the landmarks.
 
     Gate, update, iteration, recovery, and the landmarks that leave the dense state are those of `backends.ekf`; what is
-    its own is the motion on SO(3) instead of Euler angles, and the invariant error, for which no covariance has to be
-    transported (`backends.iekf.filter` says why). A landmark that leaves the dense state takes its error in the world
-    as it is with it, and comes back to the invariant one.
+    its own is the motion on SO(3) instead of Euler angles, and the invariant error, of which no sequence of
+    linearisations says where the world is (the module says why, and how it is kept). A landmark that leaves the dense
+    state takes its error in the world as it is with it, and comes back to the invariant one.
 
     Args:
         rig: the cameras.

@@ -17,7 +17,8 @@ class SmootherConfig:
         lag: number of poses that are smoothed; older ones are marginalised, so that neither time nor memory grows
             with the run. Null (in Python None) keeps all poses and revises the whole path.
         landmarks: most landmarks that are variables of the graph. Where a frame measures no more than these, those that
-            are measured for longer than a smart factor spans become variables, and keep what it says of them.
+            are measured for longer than a smart factor spans become variables, and keep what it says of them; but only
+            while they are at least 30 of their standard deviations away, so that they are linear in space.
         past: number of poses, at least, whose measurements are kept, to revise the path when measurements are mended.
 
     Raises:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import SupportsFloat, SupportsIndex, SupportsInt
 
@@ -83,6 +82,7 @@ class Tracks:
         self._make, self._lag = make, lag
         self._smart: dict[int, Track] = {}
         self._variables: dict[int, int] = {}  # numbers of the poses as long as which they stay
+        self._solved = -1  # number of the newest pose that was solved for
 
     def add_pose(self, problem: GraphProblem, s: SmootherState, number: int, first: int) -> None:
         """A pose, and its tie to the one before it, if it is not the first one."""
@@ -125,14 +125,14 @@ class Tracks:
     def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
         """Variables that the state keeps do not leave; their serial numbers."""
         serials = s.landmarks.serial[s.landmarks.begun == VARIABLE].tolist()
-        kept = [serial for serial in serials if self._is_there(serial, s.number)]
+        kept = [serial for serial in serials if self._is_there(serial)]
         for serial in kept:
             self._stays(problem, serial, s.number)
         return kept
 
-    def _is_there(self, serial: int, number: int) -> bool:
-        """Whether a variable has not left the lag before a pose."""
-        return serial in self._variables and (self._lag is None or self._variables[serial] >= number - 1 - self._lag)
+    def _is_there(self, serial: int) -> bool:
+        """Whether a variable has not left the lag."""
+        return serial in self._variables and (self._lag is None or self._variables[serial] >= self._solved - self._lag)
 
     def _stays(self, problem: GraphProblem, serial: int, number: int) -> None:
         """A variable stays for as long as a pose."""
@@ -159,7 +159,7 @@ class Tracks:
         """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
         known = s.known.get(serial)
         if serial in self._variables and (begun == VARIABLE or known is not None):
-            return self._is_there(serial, number)
+            return self._is_there(serial)
         if known is None or 0 <= known.pose < first:
             return False
         self.add_known(problem, s, serial)
@@ -188,7 +188,8 @@ class Tracks:
         return made
 
     def forget(self, number: int) -> None:
-        """Forget the smart factors that will not grow at the next pose; once in a while."""
+        """After a pose was solved for: forget the smart factors that will not grow at the next; once in a while."""
+        self._solved = number
         if self._lag is not None and not number % self._lag:
             self._smart = {n: track for n, track in self._smart.items() if track.poses[0] > number - self._lag}
 
@@ -242,10 +243,10 @@ class Graph:
             SolverError: gtsam fails with the new graph as well.
         """
         why = ""
-        if s.begun <= self._number < s.number and self._kind == _kind(s):
+        if self._number < s.number and self._is_of(s):
             number, self._number = self._number, -1  # until it is done: an interrupted call leaves a graph unknown
             try:
-                return self._update(s, range(number + 1, s.number + 1), self.oldest(s), GraphProblem()), ""
+                return self._update(s, range(number + 1, s.number + 1), GraphProblem()), ""
             except FAILURES as error:
                 why, self.rebuilds = _line(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
@@ -266,7 +267,7 @@ class Graph:
             prior, self._base = held(s, oldest)
             begin = GraphProblem()
             begin.factors.add(self._make.prior(oldest, self._first, prior))
-            return self._update(s, range(oldest, s.number + 1), oldest, begin, again)
+            return self._update(s, range(oldest, s.number + 1), begin, again)
         except FAILURES as error:
             raise SolverError(_line(error)) from error
 
@@ -275,10 +276,10 @@ class Graph:
         least = max(s.begun, s.first)
         return least if self._lag is None else max(least, (s.number if newest is None else newest) - self._lag)
 
-    def _update(
-        self, s: SmootherState, numbers: Iterable[int], first: int, problem: GraphProblem, again: int = 0
-    ) -> Solved:
+    def _update(self, s: SmootherState, numbers: range, problem: GraphProblem, again: int = 0) -> Solved:
         """The solution after a problem, and some poses with what was measured from them; solved `again` so often."""
+        oldest, before = self.oldest(s), numbers.start - 1
+        first = min(oldest, before) if self._poses else oldest  # more than a lag of poses may have entered
         for number in numbers:
             if number > first:
                 self._tracks.add_rows(problem, s, number - 1, first, self._taken)
@@ -288,7 +289,7 @@ class Graph:
         kept = self._tracks.keep(problem, s)
         made = self._tracks.make_smart(problem, s.number < self._careful)
         # Nothing leaves before the newest pose is solved for: what leaves fixes where its neighbours are linearised.
-        now: Stamps = dict.fromkeys(problem.values.keys(), float(s.number - 1))
+        now: Stamps = dict.fromkeys(problem.values.keys(), float(before))
         self._solver.update(problem.factors, problem.values, now, problem.removed)
         slots = self._solver.getISAM2Result().getNewFactorsIndices()
         for track, place in made:
@@ -298,11 +299,11 @@ class Graph:
         self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
         self._tracks.forget(s.number)
         values = self._solver.calculateEstimate()
-        poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)])
-        self._poses = dict(zip(range(first, s.number + 1), poses))
+        poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)])
+        self._poses = dict(zip(range(oldest, s.number + 1), poses))
         points = np.array([values.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3)
-        joint = self._joint(list(range(max(first, s.number - 1), s.number + 1)))
-        solved = Solved(first, poses, np.array(kept, np.int64), points, joint)
+        joint = self._joint(list(range(max(oldest, s.number - 1), s.number + 1)))
+        solved = Solved(oldest, poses, np.array(kept, np.int64), points, joint)
         if not (np.isfinite(poses).all() and np.isfinite(solved.covariance).all()):
             raise ValueError("the solution is not finite")
         if (np.diag(solved.covariance) <= 0).any():
@@ -313,21 +314,35 @@ class Graph:
     def joint_covariance(self, s: SmootherState, first: int | None = None) -> tuple[int, Array]:
         """Number of the first pose, and the joint covariance (6 K, 6 K) of all poses from there on.
 
-        From `first` on, or the oldest in the graph; of the newest pose alone, if the graph is not the state's.
+        From `first` on, or the oldest in the graph; of the newest pose alone, if the graph is not the state's. Poses
+        that entered since are as uncertain as their ties, relative to the graph's newest; where there are more of them
+        than a lag, the last two lags are all.
         """
-        if self._number != s.number or self._kind != _kind(s):
+        if not self._is_of(s):
             return s.number, s.spread[-1]
-        first = max(self.oldest(s), self.oldest(s) if first is None else first)
-        return first, self._joint(list(range(first, s.number + 1)))
+        oldest = self.oldest(s, max(self._number, s.number - (self._lag or 0)))
+        first = oldest if first is None else max(oldest, first)
+        begin = min(first, self._number)
+        P = self._joint(list(range(begin, self._number + 1)))
+        for tie in s.ties[s.of(self._number) + 1 :]:
+            assert tie is not None  # only the pose with which the problem begins has none
+            A = adjoint(inverse(tie.relative))
+            cross = A @ P[-6:]
+            P = np.block([[P, cross.T], [cross, cross[:, -6:] @ A.T + tie.covariance]])
+        return first, P[6 * (first - begin) :, 6 * (first - begin) :]
 
     def landmark_covariance(self, s: SmootherState, serial: int, position: Array) -> Array | None:
         """Covariance (3, 3) in the world of a landmark at a position (3,), if it is a variable of the state's graph."""
         key = landmark_key(serial)
-        if self._number != s.number or self._kind != _kind(s) or not self._solver.getLinearizationPoint().exists(key):
+        if not self._is_of(s) or not self._solver.getLinearizationPoint().exists(key):
             return None
         R = self._first[:3, :3]
         J = R @ points_by_pose(transform(inverse(self._first), position[None]))[0]
         return np.asarray(self._solver.getISAM2().marginalCovariance(key) + J @ self._base @ J.T)
+
+    def _is_of(self, s: SmootherState) -> bool:
+        """Whether it is the state's graph, up to poses that entered since the last update."""
+        return s.begun <= self._number <= s.number and self._kind == _kind(s)
 
     def _joint(self, numbers: list[int]) -> Array:
         isam, keys = self._solver.getISAM2(), [pose_key(i) for i in numbers]

@@ -78,7 +78,7 @@ class SelfCalibration:
         self._own = RigPosterior(self._prior.mean, start)  # of the errors in this recording, without residual fields
         # covariance (n, n) of its mean by what its evidence has in common: a systematic error, unknown residual fields
         self._by_bias = np.zeros_like(start)
-        self._before = np.diag(start)  # variances (n,) without evidence
+        self._before = np.linalg.inv(start)  # information (n, n) without evidence
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
         self._fields: Evidence | None = None  # of rows: parameters and residual fields
@@ -269,10 +269,10 @@ class SelfCalibration:
         assert found is not None
         # The correction is to explain this recording, so it may take up what the residual fields do here.
         self._own = solve(self._own_prior, moved, found.whole)
-        # What is still from the prior has no bias of this recording: each parameter's weight of the evidence.
-        weight = np.clip(1 - np.diag(self._own.covariance) / self._before, 0.0, 1.0)
+        # What is still from the prior has no bias of this recording: the gain is the evidence's weight.
+        gain = np.eye(len(self._systematic)) - self._own.covariance @ self._before
         effect = self._own.covariance @ found.whole.cross
-        self._by_bias = np.diag(weight**2 * self._systematic) + found.fields * effect @ effect.T
+        self._by_bias = gain * self._systematic @ gain.T + found.fields * effect @ effect.T
 
 
 def _mean_variance(changes: Array, covariance: Array) -> float:

@@ -75,7 +75,7 @@ def shift(points, focal, parameters):
 
 @kernel
 def linearise(first, second, points, R, t, focal, noise):
-    """The fields of `slam.calibration.motion.Linear`; see `slam.calibration.motion.linearised` for the arguments."""
+    """The fields of `slam.calibration.pairs.Linear`; see `slam.calibration.pairs.linearised` for the arguments."""
     n = len(points)
     out = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3)), np.empty((n, 3, 3))
     _linearise(first, second, points, R, t, focal, noise, *out)
@@ -84,10 +84,10 @@ def linearise(first, second, points, R, t, focal, noise):
 
 @kernel
 def fit(first, second, R, t, focal, noise, median):
-    """Gauss-Newton of `slam.calibration.motion.fit_motion`; see there for the arguments.
+    """Gauss-Newton of `slam.calibration.pairs.fit_motion`; see there for the arguments.
 
     Points are weighted by Student's t distribution of four degrees of freedom, `median` being that of χ². Returns the
-    fields of `slam.calibration.motion.Fit`, and the last change of a predicted point [px], infinite where there is no
+    fields of `slam.calibration.pairs.Fit`, and the last change of a predicted point [px], infinite where there is no
     solution.
     """
     n, last = len(first), np.inf

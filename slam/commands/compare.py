@@ -9,9 +9,9 @@ from tempfile import TemporaryDirectory
 
 from slam.compare.plan import CLOSED_LOOP, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import write_report
-from slam.compare.sweep import Run, check, is_done, sweep
+from slam.compare.sweep import Run, check, is_done, run_alone, sweep
 from slam.compare.tables import groups, most_tests, write_tables
-from slam.compare.trial import COMPLETED, RESULT, run_trial
+from slam.compare.trial import COMPLETED, RESULT
 from slam.compare.wording import caution
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
@@ -101,7 +101,7 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
         kind = trial.sequence, trial.variant
         if kind not in tried:
             with said_before(), TemporaryDirectory(prefix="slam_trial_") as folder:
-                run_trial(replace(trial, seed=0, mode=CLOSED_LOOP, stop=trial.start + _TRIED), Path(folder))
+                run_alone(replace(trial, seed=0, mode=CLOSED_LOOP, stop=trial.start + _TRIED), Path(folder))
                 result = read_object(Path(folder) / RESULT)
             if result["outcome"] != COMPLETED:
                 return None

@@ -10,10 +10,11 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,11 @@ RUNS, SWEEP = "runs", "sweep.json"
 
 #: What a comparison leaves in its folder.
 NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "report.html")
+
+#: Outcome of a trial whose process died, and died again where it was run alone.
+KILLED = "failed: its process was killed: too little memory, perhaps"
+
+_Job = tuple[Trial, Path, Path | None]  # arguments of `run_trial`
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,9 @@ def sweep(
 ) -> list[Run]:
     """Run what is not done yet, and read all runs of the plan, in its order.
 
+    Where a worker process dies, the trials in work are run once more, one by one, each in a process of its own; one
+    whose process dies again has failed.
+
     Args:
         plan: what to run.
         out: folder; one of an earlier sweep with the same versions is gone on with.
@@ -72,8 +81,8 @@ def sweep(
         overwrite: whether to run all again, and to replace files that are there.
 
     Raises:
-        SlamError: a sequence, name or setting is bad (nothing is run then), the folder holds something else, or a
-            worker process died.
+        SlamError: a sequence, name or setting is bad (nothing is run then), the folder holds something else, or no
+            worker process can be started.
     """
     check(plan, out, overwrite)
     told = on_done or (lambda trial: None)
@@ -92,30 +101,70 @@ def sweep(
 
 
 def _run_all(trials: Sequence[Trial], first: str, out: Path, workers: int, told: Callable[[Trial], None]) -> None:
-    """Run trials in processes, which end with this call however it ends; `first` is the back end that is replayed."""
-    if not trials:
-        return
+    """Run trials in processes; `first` is the back end that is replayed."""
+
+    def job(trial: Trial) -> _Job:
+        recording = None
+        if trial.mode == REPLAY:
+            given = read_run(replace(trial, backend=first, mode=CLOSED_LOOP), out)
+            recording = given.folder / RECORDING if given.completed else None
+        return trial, out / RUNS / trial.folder, recording
+
+    jobs = deque(map(job, trials))
+    while jobs:
+        for lost in _run_in_pool(jobs, workers, told):
+            run_alone(*lost)
+            told(lost[0])
+
+
+def _run_in_pool(jobs: deque[_Job], workers: int, told: Callable[[Trial], None]) -> list[_Job]:
+    """Run jobs, taken from `jobs`, until none is left or a process dies; returns those that were in work then."""
+    running: dict[Future[None], _Job] = {}
+    lost: list[_Job] = []
+    with _processes(min(workers, len(jobs))) as pool:
+        while running or (jobs and not lost):
+            with suppress(BrokenProcessPool):  # those in work tell it
+                while jobs and len(running) < workers:
+                    running[pool.submit(run_trial, *jobs[0])] = jobs[0]
+                    jobs.popleft()
+            if not running:  # a process died that had no work
+                break
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                job, error = running.pop(future), future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    lost.append(job)
+                    continue
+                if error is not None:
+                    keep_result(job[0], job[1], error)
+                told(job[0])
+    return lost
+
+
+def run_alone(trial: Trial, folder: Path, recording: Path | None = None) -> None:
+    """`run_trial` in a process of its own; where that dies, the trial is kept as failed.
+
+    Raises:
+        SlamError: no process can be started.
+    """
+    with _processes(1) as pool:
+        try:
+            pool.submit(int).result()
+        except BrokenProcessPool as error:
+            raise SlamError(
+                'no worker process can be started: a script must call this below `if __name__ == "__main__":`'
+            ) from error
+        failure = pool.submit(run_trial, trial, folder, recording).exception()
+    if failure is not None:
+        keep_result(trial, folder, KILLED if isinstance(failure, BrokenProcessPool) else failure)
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Worker processes, which end with this context however it ends."""
     before = set(multiprocessing.active_children())
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(trials)), context, _begin_worker)
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin_worker)
     try:
-        running = {}
-        for trial in trials:
-            recording = None
-            if trial.mode == REPLAY:
-                given = read_run(replace(trial, backend=first, mode=CLOSED_LOOP), out)
-                recording = given.folder / RECORDING if given.completed else None
-            running[pool.submit(run_trial, trial, out / RUNS / trial.folder, recording)] = trial
-        for future in as_completed(running):
-            trial, error = running[future], future.exception()
-            if isinstance(error, BrokenProcessPool):
-                raise SlamError(
-                    "a worker process died, as where there is too little memory: the same command goes on, with fewer "
-                    "--workers if need be"
-                ) from error
-            if error is not None:  # a defect of a program
-                keep_result(trial, out / RUNS / trial.folder, error)
-            told(trial)
+        yield pool
     except BaseException:
         for process in set(multiprocessing.active_children()) - before:
             process.terminate()

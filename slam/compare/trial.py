@@ -15,7 +15,7 @@ import numpy as np
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Trial
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
-from slam.errors import SlamError
+from slam.errors import SlamError, text_of
 from slam.evaluation.association_truth import SurfacePoints
 from slam.evaluation.consistency import stretch_nees
 from slam.evaluation.summary import with_truth
@@ -53,8 +53,7 @@ _SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
 def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None:
     """Run a trial on one thread; its files are left in `folder`, `RESULT` last: what is there then is whole.
 
-    Bad input and failures of the estimator that the package knows are an outcome, kept with the frames done so far;
-    anything else is a defect of a program and is raised.
+    Bad input, failures of the estimator and defects of a program are an outcome, kept with the frames done so far.
 
     Args:
         trial: what to run.
@@ -65,7 +64,7 @@ def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None
     with one_thread():
         try:
             keep_result(trial, folder, COMPLETED, *_run(trial, recording, folder))
-        except SlamError as error:
+        except Exception as error:  # noqa: BLE001 (not every exception gets from a worker to the parent)
             keep_result(trial, folder, error)
 
 
@@ -78,7 +77,7 @@ def keep_result(
 ) -> None:
     """Write how a trial ended, also where an exception ended it, and its figures."""
     if isinstance(outcome, BaseException):
-        outcome = f"failed: {type(outcome).__name__}: {' '.join(str(outcome).split())}"
+        outcome = f"failed: {type(outcome).__name__}: {' '.join(text_of(outcome).split())}"
     result = {"trial": asdict(trial), "outcome": outcome, "metrics": metrics or {}, "milliseconds": milliseconds or {}}
     with naming_folder(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -37,7 +37,6 @@ class PairGeometry:
     at_same_place: int = 0  # at one and the same pixel of both images, as they are, not rectified
     off_rows: int = 0  # whose rows differ, by more than the front end finds reliably
     row_offset: float = 0.0  # median difference of their rows [px]
-    raw_offset: float = 0.0  # the same of the images as they are, not rectified [px]
     better_raw: int = 0  # whose rows rectification changes, and that agree better without it
     better_rectified: int = 0  # that agree better with it
 
@@ -95,7 +94,6 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         int((np.abs(b - a).max(axis=1) <= _TOLERANCE).sum()),
         int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
-        float(np.median(np.abs(raw))),
         int((changed & better).sum()),
         int((changed & ~better).sum()),
     )

@@ -245,7 +245,7 @@ def look_alikes(features: StereoFeatures) -> int:
 def _swapped(found: PairGeometry) -> str:
     return (
         f"left and right look swapped: {found.as_swapped} of {found.matches} features fit the cameras when the images "
-        f"are exchanged, {found.as_given} as they are; exchange them with the option swap=yes"
+        f"are exchanged, {found.as_given} as they are; exchange them with the option swap=yes, or leave it out"
     )
 
 

@@ -44,10 +44,11 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], fr
     _continue_landmarks(tracks, landmark, taken)
     expected = alive[~lost & (tracks.row[alive] < 0)]
     _look(tracks, frame, expected, tracks.position[expected], tracks.covariance[expected], taken)
-    held = tracks.row[tracks.seen & (tracks.body >= 0)]
+    of_lost = alive[lost]
+    held = tracks.row[np.setdiff1d(np.flatnonzero(tracks.seen & (tracks.body >= 0)), of_lost)]
     _carried_along(tracks, bodies, regions, frame, taken)
     _far(tracks, frame, taken)
-    unclaimed = alive[lost]
+    unclaimed = of_lost[tracks.row[of_lost] < 0]
     if len(unclaimed):
         _look(
             tracks, frame, unclaimed, tracks.position[unclaimed], tracks.covariance[unclaimed],
@@ -58,9 +59,10 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], fr
     tracks.missed += 1
     tracks.missed[seen] = 0
     named = seen[landmark[tracks.row[seen]] >= 0]
-    tracks.landmark[named] = landmark[tracks.row[named]]
-    if len(unclaimed):
-        seen = seen[~np.isin(seen, unclaimed)]
+    ids = landmark[tracks.row[named]]
+    tracks.landmark[np.isin(tracks.landmark, ids)] = -1  # one track a landmark
+    tracks.landmark[named] = ids
+    seen = np.setdiff1d(seen, of_lost)
     tracks.descriptors[seen] = frame.features.descriptors[tracks.row[seen]]
 
 
@@ -79,11 +81,12 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
 
 def _continue_landmarks(tracks: Tracks, landmark: IdArray, taken: BoolArray) -> None:
     """The features of landmarks (N,) that have a track, which are then `taken`."""
-    row_of = np.full(landmark.max(initial=-1) + 2, -1)  # by id, and at the end that of none
-    row_of[landmark] = np.where(landmark < 0, -1, np.arange(len(landmark)))
-    row = row_of[np.minimum(tracks.landmark, len(row_of) - 1)]
-    found = np.flatnonzero(row >= 0)
-    _enter(tracks, found, row[found], taken)
+    matched = np.flatnonzero(landmark >= 0)
+    if len(matched):
+        matched = matched[np.argsort(landmark[matched])]
+        row = matched[np.minimum(np.searchsorted(landmark[matched], tracks.landmark), len(matched) - 1)]
+        found = np.flatnonzero(landmark[row] == tracks.landmark)
+        _enter(tracks, found, row[found], taken)
 
 
 def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covariances: Array, taken: BoolArray) -> None:

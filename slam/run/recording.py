@@ -79,7 +79,10 @@ def load_recording(path: str | Path) -> Recording:
     Raises:
         SequenceError: the file is missing, no recording, of another version, or damaged.
     """
-    members = unpack(read_bytes(path, _LARGEST), str(path), SequenceError)
+    content = read_bytes(path, _LARGEST)
+    if content.startswith(b"surf-stereo-slam map"):
+        raise SequenceError(f"{path}: a saved map, which a run starts in with --map, no recording")
+    members = unpack(content, str(path), SequenceError)
     arrays = {name.removesuffix(".npy"): array(data, name, str(path), SequenceError) for name, data in members.items()}
     try:
         return _recording(arrays)

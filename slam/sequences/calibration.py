@@ -130,7 +130,7 @@ def read_form(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
             rows = read_kitti(path)
             return {f"P{i}": rows.get(f"{kitti[1]}{i}") for i in (0, 1)} | {"size": rows.get("S_rect_00")}, "KITTI's"
     root = read_yaml(path)
-    if "evidence" in root or "self_calibration" in root:
+    if {"evidence", "residual_scale", "self_calibration"} & set(root):
         what = "errors of a rig, as `slam calibrate` or a run found them, not a rig: see --calibration"
         raise CalibrationError(f"{path}: {what}")
     if "cameraData" in root:

@@ -241,10 +241,16 @@ def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:
     if any(_number(entry) for name in _COEFFICIENTS if (entry := entries.find(name, side)) is not None):
         raise CalibrationError("names distortion, but only one camera: images of five numbers are rectified")
     fx, fy, cx, cy, length = values
+    _require_pixels(fx, size)
     left, right = (PinholeCamera(fx, fy, cx, cy, *size) for _ in range(2))
     return StereoRig.side_by_side(
         left, right, np.eye(3), np.array([-unit * length / (fx if last == "bf" else 1), 0, 0])
     )
+
+
+def _require_pixels(focal: float, size: Size) -> None:
+    if focal < _SHORTEST_FOCAL * size[0]:
+        raise CalibrationError(f"a focal length of {focal:g} px for images {size[0]} px wide: is it in pixels?")
 
 
 def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCamera:
@@ -256,8 +262,7 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
             raise CalibrationError(f"{role} {model[1]!r} is not supported")
         fisheye = fisheye or name in _FISHEYE
     K = _matrix(entries, side)
-    if K[0, 0] < _SHORTEST_FOCAL * size[0]:
-        raise CalibrationError(f"a focal length of {K[0, 0]:g} px for images {size[0]} px wide: is it in pixels?")
+    _require_pixels(K[0, 0], size)
     D = entries.numbers("D", side, None)
     if D is None:
         names = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS

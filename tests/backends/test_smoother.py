@@ -104,6 +104,48 @@ def test_a_frame_that_saw_new_landmarks_alone_is_a_pose():
     assert off @ np.linalg.solve(backend.estimate(landmarks=False).covariance, off) < 25
 
 
+def enter(backend, k: int, stamp: float, seen: Observations) -> None:
+    """A frame that measures nothing, and adds two landmarks."""
+    backend.predict(stamp)
+    backend.update(Observations.empty())
+    backend.add(Observations(10**6 + 2 * k + np.arange(2), seen.uv_left[:2], seen.uv_right[:2]))
+
+
+@pytest.mark.parametrize(("options", "frames"), [({}, 1), ({}, 16), ({"lag": None}, 3), ({"lag": 4}, 4)], ids=str)
+def test_new_landmarks_in_a_frame_that_measured_nothing_leave_what_is_known(options, frames):
+    """Until the next update the graph lacks its pose: all that is known of the poses before it went unheard."""
+    data, backend, known = list(drive(30, points=250)), SmootherBackend(RIG, MODELS, **options), set()
+    for stamp, _, seen in data[: 30 - frames]:
+        step(backend, stamp, seen, known)
+    before, earlier = backend.estimate(), backend.recent(4)
+    for k in range(30 - frames, 30):
+        enter(backend, k, *data[k][::2])
+    after, recent = backend.estimate(), backend.recent(4 + frames)
+    old = np.isin(after.ids, before.ids)
+    np.testing.assert_allclose(after.covariances[old], before.covariances, rtol=1e-3, atol=1e-9)
+    assert len(recent.stamps) == 4 + frames
+    np.testing.assert_allclose(recent.covariance[:24, :24], earlier.covariance, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(recent.covariance[-6:, -6:], after.covariance, rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(recent.covariance).min() > 0
+
+
+@pytest.mark.parametrize("lag", [2, 4, 16])
+@pytest.mark.parametrize("more", [0, 3])
+def test_a_lag_of_frames_that_measured_nothing_is_no_failure(lag, more):
+    """A pose without its tie left the graph indeterminate."""
+    data, backend, known = drive(lag + more + 14, points=250), SmootherBackend(RIG, MODELS, lag=lag), set()
+    for k, (stamp, _, seen) in enumerate(data):
+        if 10 <= k < 10 + lag + more:
+            enter(backend, k, stamp, seen)
+            continue
+        report = step(backend, stamp, seen, known)
+        assert not k or (report.status is UpdateStatus.OK and not report.reason), (k, report.reason)
+    assert backend.rebuilds == 0
+    last = backend.estimate(landmarks=False)
+    off = se3.log(se3.inverse(last.T_world_left) @ data.poses[-1])
+    assert off @ np.linalg.solve(last.covariance, off) < 25
+
+
 def test_landmarks_that_were_found_together_do_not_all_begin_anew_together():
     """That would leave but the motion model between two poses, and the newest one 2.8 times as uncertain."""
     data = drive(22, points=150)
@@ -182,6 +224,7 @@ def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it(
     """A camera sways before the same few points: its error does not grow with every lag."""
     sway = np.cos(np.arange(150) / 12)
     poses = se3.pose(np.tile(np.eye(3), (150, 1, 1)), (sway - 1)[:, None] * np.array([0.4, 0.0, 0.2]))
+    # A variable is made only where a landmark's distance is at least 30 of its deviations: with 3 px few would be.
     data, models = scene(poses, points=8, limit=8), replace(MODELS, pixel_sigma=1.0)
     kept, anew = (SmootherBackend(RIG, models, landmarks=n) for n in (20, 0))
     for backend in (kept, anew):
@@ -193,6 +236,26 @@ def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it(
     off = estimate.positions - data.points[estimate.ids]
     distances = np.einsum("ni,nij,nj->n", off, np.linalg.inv(estimate.covariances), off)
     assert np.median(distances) < 6 and (kept.state.landmarks.begun == VARIABLE).sum() >= 4
+
+
+def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_measured_nothing():
+    """They had left the graph before they were measured again, and there was nothing but the motion model."""
+    sway = np.cos(np.arange(60) / 12)
+    poses = se3.pose(np.tile(np.eye(3), (60, 1, 1)), (sway - 1)[:, None] * np.array([0.4, 0.0, 0.2]))
+    data, backend, known = scene(poses, points=8, limit=8), SmootherBackend(RIG, MODELS, lag=6), set()
+    for k, (stamp, _, seen) in enumerate(data):
+        if 40 <= k < 50:
+            enter(backend, k, stamp, seen)
+        else:
+            step(backend, stamp, seen, known)
+        if k == 39:
+            before, variables = backend.estimate(landmarks=False), backend.state.landmarks.begun == VARIABLE
+    after = backend.estimate(landmarks=False)
+    assert backend.rebuilds == 0 and variables.sum() >= 4
+    assert (backend.state.landmarks.begun[: len(variables)] == VARIABLE)[variables].all()
+    deviations = [np.sqrt(np.trace(e.covariance[3:, 3:])) for e in (before, after)]
+    assert deviations[1] < 1.5 * deviations[0], deviations
+    assert errors(after.T_world_left, poses[-1])[0] < 3 * deviations[1]
 
 
 # --- the last poses together ---

@@ -70,6 +70,21 @@ def test_what_is_kept_corrects_from_the_first_frame_and_goes_on_being_learnt(fir
     np.testing.assert_allclose(second.kept().posterior.covariance, both.covariance, rtol=1e-6, atol=1e-15)
 
 
+def test_a_systematic_error_of_the_present_recording_is_claimed_also_after_its_evidence(first):
+    """Drives whose pixels are all off alike: evidence fixes far disparities, with that error in them."""
+    kept, off, claimed = first.kept(), [], []
+    for seed in range(3):
+        calibration = SelfCalibration(CAR, SelfCalibrationConfig(), kept)
+        far = calibration.model.field(calibration.model.far())[:, 2]
+        bias = np.random.default_rng(seed).standard_normal(far.shape[1])
+        theta = TURNED + bias * np.sqrt(systematic_variance(calibration.model, 0.05))
+        observed(calibration, theta, seed=10 + seed)
+        off.append(np.square(far @ (calibration.posterior.mean - TURNED)).mean())
+        claimed.append(np.einsum("ni,ij,nj->n", far, calibration.posterior.covariance, far).mean())
+    assert np.sqrt(np.mean(claimed)) > 0.13  # [px]; 0.10 where each parameter's own variance said what is evidence
+    assert np.sqrt(np.mean(off)) < 1.5 * np.sqrt(np.mean(claimed))
+
+
 def test_a_camera_that_has_turned_since_is_found(first):
     turned = TURNED + parameters(right_cx=-1.0 / 720)  # [px]
     second = observed(SelfCalibration(CAR, SelfCalibrationConfig(), first.kept()), turned, seed=3)

@@ -61,3 +61,13 @@ def test_a_feature_that_was_matched_to_a_landmark_continues_its_track_wherever_i
     assert tracks.row[free[:2]].tolist() == [1, 0]
     assert tracks.landmark[tracks.row == 3].tolist() == [20]
     assert np.unique(tracks.row[tracks.seen]).size == tracks.seen.sum()
+
+
+def test_members_of_a_lost_body_that_are_matched_landmarks_are_seen_and_ids_may_be_as_large_as_a_map_has_them():
+    body, tracks, features, _ = scene(4, np.zeros(6), np.random.default_rng(3))
+    members = np.flatnonzero(tracks.body == body.id)
+    landmark = np.array([7, 3, 2**53, 9])
+    tracks.landmark[members] = landmark
+    follow(tracks, {1: replace(body, missed=2)}, [], frame_of(features, 25.0), landmark)
+    assert tracks.row[members].tolist() == [0, 1, 2, 3]
+    assert tracks.landmark[members].tolist() == landmark.tolist()

@@ -155,6 +155,12 @@ def test_damaged_files_are_refused_in_one_line(recording, tmp_path, fault):
     assert "bad.npz" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_saved_map_is_told_from_a_recording(tmp_path):
+    (tmp_path / "desk.map").write_bytes(b"surf-stereo-slam map 5\n")
+    with pytest.raises(SequenceError, match="a saved map, which a run starts in with --map"):
+        load_recording(tmp_path / "desk.map")
+
+
 def test_recordings_are_checked_when_made(recording):
     with pytest.raises(MeasurementError, match="removed"):
         first, *others = recording.frames

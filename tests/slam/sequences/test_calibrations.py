@@ -126,6 +126,9 @@ def test_a_rectified_pair_by_five_numbers_and_all_that_is_wrong_with_them(tmp_pa
     rig = slam.load_rig(file, size=SIZE, unit="mm")
     assert (rig.left.fu, rig.left.fv, rig.left.u0, rig.left.v0) == (500, 501, 31.5, 23.5)
     assert rig.left == rig.right and np.allclose(rig.b, [-0.12, 0, 0])
+    file.write_text("fx: 0.8\nfy: 0.8\ncx: 0.5\ncy: 0.5\nbaseline: 0.2\n")
+    with pytest.raises(CalibrationError, match=r"a focal length of 0\.8 px for images 64 px wide: is it in pixels"):
+        slam.load_rig(file, size=SIZE)
     file.write_text("fx: true\ncx: wide\ncy: .inf\nbaseline: -0.12\n")
     with pytest.raises(CalibrationError) as error:
         slam.load_rig(file, size=SIZE)
