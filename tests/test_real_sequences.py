@@ -50,7 +50,7 @@ def test_errors_are_those_measured(slam_data, tmp_path, case, backend):
 
 def test_the_median_is_that_measured_where_single_runs_scatter(slam_data):
     sequence, allowed = open_sequence(slam_data / SCATTERED.path), bars(SCATTERED.name)
-    trials = [errors(SCATTERED, sequence, tuple(allowed), trial) for trial in range(3)]
+    trials = [errors(SCATTERED, sequence, tuple(allowed), trial) for trial in range(SCATTERED.trials)]
     for backend, figures in allowed.items():
         for path, most in figures.items():
             assert np.median([trial[backend][path] for trial in trials]) < most, (backend, path)
