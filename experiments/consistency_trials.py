@@ -83,7 +83,7 @@ def simulated(case: str, seed: int, frames: int) -> tuple[Recording, WorldSequen
     if case == "drawn":
         models = replace(models, motion=DRAWN, initial_velocity_sigma=0.1, initial_angular_velocity_sigma=0.1)
         path = drawn_path(sequence.world.T_world_left[0], sequence.world.stamps, models, rng)
-        sequence = WorldSequence(sequence.name, replace(sequence.world, T_world_left=path, seen={}), sequence.values)
+        sequence = WorldSequence(sequence.name, replace(sequence.world, T_world_left=path), sequence.values)
     sigma = np.repeat([models.initial_rotation_sigma, models.initial_position_sigma], 3)
     start = sequence.ground_truth.poses[0] @ se3.exp(sigma * rng.standard_normal(6))
     return true_recording(sequence, models=replace(models, T_world_left=start)), sequence
