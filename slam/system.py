@@ -119,7 +119,7 @@ class StereoSlam:
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
         if prior_map is not None:
-            prior_map.require_fits(self.frontend_name)
+            prior_map.require_fits(self.frontend_name, rig=rig)
         self._state = self._session.begin(first, prior_map)
 
     @property
@@ -326,7 +326,7 @@ class StereoSlam:
             rows = self.landmarks.in_world(self.atlas.T_map_odom)
             keyframes = (k.corrected(self.calibration.applied, self._session.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
-            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas)
+            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas, self.rig)
 
     @property
     def warnings(self) -> list[str]:

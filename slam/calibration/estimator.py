@@ -31,10 +31,11 @@ from slam.calibration.posterior import (
     solve,
     systematic_variance,
 )
-from slam.calibration.saved import SavedCalibration, joint_calibration, rig_numbers
+from slam.calibration.saved import SavedCalibration, joint_calibration
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
+from slam.geometry.rig_numbers import rig_numbers
 from slam.geometry.se3 import Array
 
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated

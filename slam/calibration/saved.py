@@ -19,6 +19,7 @@ from slam.calibration.posterior import Prior, RigPosterior, factory_prior, solve
 from slam.errors import CalibrationError
 from slam.files import expanded, read_text, write_text
 from slam.geometry.rig import StereoRig
+from slam.geometry.rig_numbers import NUMBERS, rig_difference, rig_numbers
 from slam.geometry.se3 import Array
 
 _LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller
@@ -26,27 +27,6 @@ _NOT_KEPT = (
     "neither a file of `slam calibrate` nor the summary.json of a run; the calibration file of a rig belongs to the "
     "sequence: 'FOLDER?calibration=FILE'"
 )
-_NUMBERS = ("width", "height", "focal", "u0", "v0", "right_u0", "baseline")
-
-
-def rig_numbers(rig: StereoRig) -> dict[str, float]:
-    """The rectified cameras as delivered, to which all corrections refer: they identify a rig in a calibration file.
-
-    Size of the images, focal length, principal point of the left camera and that of the right one along the rows [px],
-    distance of the cameras [m].
-    """
-    r = rig.rectified.rig
-    values = r.width, r.height, r.left.fu, r.left.u0, r.left.v0, r.right.u0, r.baseline
-    return dict(zip(_NUMBERS, map(float, values)))
-
-
-def rig_difference(there: Mapping[str, float], here: Mapping[str, float]) -> str:
-    """The first number of two rigs, see `rig_numbers`, that differs, in words; empty if none does."""
-    for name in _NUMBERS:
-        # 1e-5: relative difference of numbers of the same calibration, written and read
-        if abs(there[name] - here[name]) > 1e-5 * max(abs(there[name]), abs(here[name])):
-            return f"{name} {there[name]:g} there, {here[name]:g} here"
-    return ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +79,7 @@ class SavedCalibration:
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
         try:
-            rig = {name: float(tree["rig"][name]) for name in _NUMBERS}
+            rig = {name: float(tree["rig"][name]) for name in NUMBERS}
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise CalibrationError("calibration: it does not say of which rig it is") from error
         if not all(np.isfinite(numbers).all() for numbers in (mean, covariance, list(rig.values()))):

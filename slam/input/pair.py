@@ -6,7 +6,7 @@ matched anywhere in the image; those that agree on a fundamental matrix (RANSAC)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ _ROWS_AGREE = 1.0  # guard: [px] to which most rows of a rectified pair agree, a
 
 #: Disparities below this count as zero [px].
 NO_DISPARITY = _TOLERANCE
+
+_LENS_IS_RIGHT = 0.1  # guard: a lens is calibrated to a tenth of its distortion, and mostly far better
 
 _SAMPLE = 8  # fixed: matches that any fundamental matrix can be made to fit
 _SIGMAS = 5.0  # guard: a chance of 3e-7 to be wrong
@@ -39,6 +41,7 @@ class PairGeometry:
     row_offset: float = 0.0  # median difference of their rows [px]
     better_raw: int = 0  # whose rows rectification changes, and that agree better without it
     better_rectified: int = 0  # that agree better with it
+    lens_shown: float = 1.0  # share of the lenses' distortion that rows show; 1 where they do not contradict all of it
 
     @property
     def swapped(self) -> bool:
@@ -57,8 +60,11 @@ class PairGeometry:
 
     @property
     def rectified_before(self) -> bool:
-        """The rows of the images agree, and those of the rectified ones do not, be it near the edges alone."""
-        return self.conclusive and most(self.better_raw, self.better_rectified)
+        """The rows of the images agree, and those of the rectified ones do not, be it near the edges alone.
+
+        Or the calibration is that of rectified cameras, but for lenses that the images do not show.
+        """
+        return self.conclusive and (most(self.better_raw, self.better_rectified) or self.lens_shown < 1)
 
 
 def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) -> PairGeometry:
@@ -96,7 +102,39 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
         int((changed & better).sum()),
         int((changed & ~better).sum()),
+        _lens_shown(rig, a, b, left, right) if _but_for_lenses(rig) else 1.0,
     )
+
+
+def _but_for_lenses(rig: StereoRig) -> bool:
+    """Whether a rig is rectified but for its lenses: two real cameras have neither one matrix nor no rotation."""
+    plain = (replace(camera, model="none", distortion=()) for camera in (rig.left, rig.right))
+    return not rig.is_rectified and StereoRig(*plain, rig.R, rig.b).is_rectified
+
+
+def _lens_shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right: NDArray) -> float:
+    """Share of the lenses' distortion that the rows of matches (N, 2) show, by least squares; 1 where it may be all.
+
+    Cameras that are alike distort both pixels of a far point alike: what is left is less than ORB's accuracy, so the
+    right pixels are first moved to where the image patch is found.
+    """
+    import cv2
+
+    start = (uv[:, None].astype(np.float32) for uv in (uv_left, uv_right))
+    size, flags = (15, 15), cv2.OPTFLOW_USE_INITIAL_FLOW
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(left, right, *start, winSize=size, maxLevel=0, flags=flags)
+    b = moved[:, 0].astype(float)
+    _, offset = _offsets(rig, uv_left, b)
+    raw = b[:, 1] - uv_left[:, 1]
+    good = (found[:, 0] > 0) & (np.abs(b - uv_right).max(axis=1) < _TOLERANCE)
+    good &= np.minimum(np.abs(raw), np.abs(offset)) < _TOLERANCE  # NaN is not
+    raw, removed = raw[good], (raw - offset)[good]
+    whole = float(removed @ removed)
+    if len(raw) <= _SAMPLE or whole == 0:
+        return 1.0
+    share = float(removed @ raw) / whole
+    sigma = float(np.sqrt(np.square(raw - share * removed).mean() / whole))
+    return share if abs(share - 1) > max(_LENS_IS_RIGHT, _SIGMAS * sigma) else 1.0
 
 
 def _offsets(rig: StereoRig, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:

@@ -261,6 +261,12 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
     if rig.is_rectified:
         cause = "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
+    elif found.lens_shown < 1:
+        return (
+            f"by their calibration the cameras are rectified (one camera matrix, no rotation), but have lenses with "
+            f"distortion, of which rows show {100 * max(found.lens_shown, 0.0):.0f} %: the images were probably "
+            "rectified before, and are rectified again: leave the distortion out of the calibration"
+        )
     elif found.rectified_before:
         return (
             f"the images were rectified before, and the calibration rectifies them again: rows of left and right image "

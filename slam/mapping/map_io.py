@@ -24,6 +24,8 @@ from slam.checks import FARTHEST_POSITION, MOST_ID
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
 from slam.files import read_bytes, whole_file
+from slam.geometry.rig import StereoRig
+from slam.geometry.rig_numbers import rig_difference, rig_numbers
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import Keyframe, Loop
@@ -33,7 +35,7 @@ from slam.tracks.table import LandmarkTable
 from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 5  # fixed: of the file format
+_VERSION = 6  # fixed: of the file format
 _TEXTS = ("frontend", "world_frame", "written_by")  # of the header
 _DATE = (1980, 1, 1, 0, 0, 0)  # fixed: NumPy's for all members, so that the same map gives the same bytes
 
@@ -43,6 +45,8 @@ FIRST_FRAME = "left camera at the first frame"
 _LARGEST = 2**31  # bytes of a file
 _MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # guard: of descriptors
 _GREATEST = 1e12  # guard: entry of a covariance [rad², m²], and time [s]
+_RIG = ("width", "height", "focal", "baseline")  # by which a map tells its rig from others
+_REFINED = 0.03  # guard: calibrations of one rig differ by less: it is ten deviations of a focal length, by the prior
 _TURNED = 1e-6  # guard: largest deviation from a rotation matrix
 _FAR, _HALF = FARTHEST_POSITION, 65504.0  # guard: [m]; the largest half float
 
@@ -86,6 +90,7 @@ _ARRAYS = _LANDMARKS | {
     "loop_motions": _Kind(np.float64, "l44", -_FAR, _FAR, "pose", "T_first_second"),
     "loop_covariances": _Kind(np.float64, "l66", -_GREATEST, _GREATEST, "covariance", "covariance"),
     "loop_inliers": _Kind(np.int64, "l", 0, MOST_ID, field="inliers"),
+    "rig": _Kind(np.float64, "r", np.nextafter(0, 1), _GREATEST),
 }
 
 
@@ -134,6 +139,7 @@ class SavedMap:
         keyframes: with the poses of the rectified left camera that the back end estimated at the time.
         keyframe_poses: those poses in the map's world frame (K, 4, 4), corrected by loops; by default uncorrected.
         loops: between keyframes.
+        rig: width, height and focal length of the rectified images [px], and baseline [m], (4,); empty where not known.
 
     Raises:
         SlamError: arrays that do not fit together, or landmarks that no back end would take.
@@ -154,6 +160,7 @@ class SavedMap:
     keyframes: tuple[Keyframe, ...] = ()
     keyframe_poses: Array = field(default=None)  # type: ignore[arg-type]
     loops: tuple[Loop, ...] = ()
+    rig: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         n = len(self.ids) if isinstance(self.ids, np.ndarray) and self.ids.ndim else 0
@@ -204,27 +211,37 @@ class SavedMap:
 
     @classmethod
     def of(
-        cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, world_frame: str, atlas: Atlas
-    ) -> SavedMap:
+        cls, landmarks: LandmarkTable, estimate: Estimate, frontend: str, world_frame: str, atlas: Atlas,
+        rig: StereoRig,
+    ) -> SavedMap:  # fmt: skip
         """The map of a running system: landmark rows, the back end's estimate, what both belong to, and keyframes."""
+        numbers = rig_numbers(rig)
         P = definite(estimate.covariances)
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
             landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
             f"surf-stereo-slam {__version__}", seen_from=landmarks.seen_from,
             keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map, loops=atlas.loops,
+            rig=np.array([numbers[name] for name in _RIG]),
         )  # fmt: skip
 
-    def require_fits(self, frontend: str, dimensions: int | None = None) -> None:
-        """Check that a front end's descriptors can be compared with the map's.
+    def require_fits(self, frontend: str = "", dimensions: int | None = None, rig: StereoRig | None = None) -> None:
+        """Check that a front end's descriptors can be compared with the map's, and that the cameras are the same.
+
+        Another calibration of the same cameras is accepted: what it changes is small.
 
         Args:
             frontend: its name; empty where it is not known.
             dimensions: length of its descriptors, where it is known.
+            rig: the cameras, where they are known.
 
         Raises:
-            SlamError: they cannot.
+            SlamError: they cannot, or are not.
         """
+        if rig is not None and (
+            other := rig_difference(dict(zip(_RIG, self.rig.tolist())), rig_numbers(rig), _REFINED)
+        ):
+            raise SlamError(f"{self.source}: the map is of another rig: {other}")
         if self.frontend and frontend and self.frontend != frontend:
             raise SlamError(f"{self.source}: its descriptors are of front end {self.frontend!r}, not {frontend!r}")
         if dimensions is not None and dimensions != self.dimensions and len(self):
@@ -295,7 +312,15 @@ def map_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
     k, loops = saved.keyframes, saved.loops
     m = max((f.jacobian.shape[1] for f in k), default=0)
     k = tuple(f if f.jacobian.shape[1] == m else replace(f, jacobian=np.zeros((6, m))) for f in k)
-    sizes = {"k": len(k), "m": m, "l": len(loops), "n": len(saved), "d": saved.dimensions, "f": sum(map(len, k))}
+    sizes = {
+        "k": len(k),
+        "m": m,
+        "l": len(loops),
+        "n": len(saved),
+        "d": saved.dimensions,
+        "f": sum(map(len, k)),
+        "r": len(saved.rig),
+    }
     whole: dict[str, Any] = {"keyframe_features": [len(f) for f in k], "loop_pairs": [x.pair for x in loops]}
     arrays: dict[str, np.ndarray] = {}
     for name, kind in _ARRAYS.items():
@@ -331,5 +356,5 @@ def map_of(arrays: Mapping[str, np.ndarray], texts: Mapping[str, str], source: s
 
     keyframes = [Keyframe(-1, **fields_of(k=i, f=slice(*span))) for i, span in enumerate(pairwise(begin))]
     loops = [Loop(first, second, **fields_of(l=i)) for i, (first, second) in enumerate(pairs.tolist())]
-    whole: dict[str, Any] = {name: arrays[name] for name in (*_LANDMARKS, "keyframe_poses")} | dict(texts)
+    whole: dict[str, Any] = {name: arrays[name] for name in (*_LANDMARKS, "keyframe_poses", "rig")} | dict(texts)
     return SavedMap(**whole, source=source, keyframes=tuple(keyframes), loops=tuple(loops))

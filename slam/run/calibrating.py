@@ -14,11 +14,12 @@ from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
 from slam.calibration.evidence import RecordingEvidence
 from slam.calibration.posterior import factory_prior
-from slam.calibration.saved import agreement, agreement_in_words, joint_calibration, rig_difference, rig_numbers
+from slam.calibration.saved import agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
 from slam.files import write_text
+from slam.geometry.rig_numbers import rig_difference, rig_numbers
 from slam.geometry.se3 import Array
 from slam.outputs import Output, require_outputs
 from slam.runtime.threads import one_blas_thread

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from slam.calibration.saved import SavedCalibration, load_calibration, rig_numbers
+from slam.calibration.saved import SavedCalibration, load_calibration
 from slam.config import SystemConfig
+from slam.geometry.rig_numbers import rig_numbers
 from slam.mapping.map_io import SavedMap, decode, encode
 from slam.objects.config import ObjectsConfig
 from slam.papers.procedure1 import ObjectDatabase
@@ -31,7 +32,7 @@ from tests.fuzz.hostile import VALUES, broken_bytes, broken_text, choose
 from tests.fuzz.settings import scene
 
 _NUMBERS = (0, -1, 1, 2**31, 2**62, -(2**63), 1e308, -1e308, 1e-308, 1e30, 1e10, np.nan, np.inf, -np.inf, 0.5)
-_MAP = b"surf-stereo-slam map 5\n"
+_MAP = b"surf-stereo-slam map 6\n"
 
 
 @lru_cache(maxsize=1)

@@ -127,20 +127,20 @@ def test_right_images_that_slip_later_are_named():
     assert "not of one moment, though they were" in line and "a frame too late" in line
 
 
+def seen_by(image, camera, R):
+    """The image of a camera, turned by R, of what is in an image of `RIG`: where each pixel's ray meets that."""
+    v, u = np.mgrid[:240, :320]
+    rays = np.column_stack([camera.normalise(np.column_stack([u.ravel(), v.ravel()]).astype(float)), np.ones(76800)])
+    uv = np.nan_to_num(RIG.left.project(rays @ R), nan=-1).astype(np.float32).reshape(240, 320, 2)
+    return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
+
+
 def test_swapped_cameras_of_an_unrectified_rig():
     turn = cv2.Rodrigues(np.array([0.02, 0.05, -0.03]))[0]
     left = PinholeCamera(250.0, 251.0, 170.0, 110.0, 320, 240, "radtan", (-0.1, 0.02, 0.001, 0.0))
     right = PinholeCamera(255.0, 256.0, 150.0, 130.0, 320, 240, "radtan", (-0.12, 0.02, 0.0, 0.001))
     rig = slam.StereoRig(left, right, turn, turn.T @ np.array([-0.12, 0.004, 0.002]))
-    # The rig's own images: where each pixel's ray meets the rectified image of the world
-    views = []
-    for image, camera, R in ((FRAME.left, left, np.eye(3)), (FRAME.right, right, turn)):
-        v, u = np.mgrid[:240, :320]
-        rays = np.column_stack(
-            [camera.normalise(np.column_stack([u.ravel(), v.ravel()]).astype(float)), np.ones(76800)]
-        )
-        uv = np.nan_to_num(RIG.left.project(rays @ R), nan=-1).astype(np.float32).reshape(240, 320, 2)
-        views.append(cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR))
+    views = [seen_by(image, c, R) for image, c, R in ((FRAME.left, left, np.eye(3)), (FRAME.right, right, turn))]
     rig = slam.StereoRig(left, right, turn, RIG.b)
     good, bad = pair_geometry(rig, *views, 1.5), pair_geometry(rig, *views[::-1], 1.5)
     assert good.conclusive and not good.swapped and not good.rows_differ
@@ -272,10 +272,30 @@ def alike():
     return slam.StereoRig(lens, lens, np.eye(3), np.array([-0.12, 0.0, 0.0]))
 
 
-@pytest.mark.parametrize("rig", [distorted, alike])
-def test_images_rectified_twice_are_named(rig):
+@pytest.mark.parametrize(
+    ("rig", "said"), [(distorted, "the calibration rectifies them again"), (alike, "leave the distortion out")]
+)
+def test_images_rectified_twice_are_named(rig, said):
     (line,) = lines(stamped([0.0, 0.1]), rig=rig())  # of a rectified camera
-    assert "the images were rectified before, and the calibration rectifies them again" in line
+    assert "rectified before" in line and said in line
+
+
+def test_equal_lenses_that_the_images_do_have_are_left_in_peace():
+    rig = alike()
+    left, right = (seen_by(image, rig.left, np.eye(3)) for image in images(FRAME))
+    assert lines([replace(f, left=left, right=right) for f in stamped([0.0, 0.1, 0.2])], rig=rig) == []
+
+
+@pytest.mark.parametrize("drive", ["0001", "0013"])
+def test_rectified_drives_with_the_lens_of_their_cameras_are_named(drive, slam_data):
+    """The cameras see mostly far points, whose pixels such a lens moves alike: rows differ by less than a pixel."""
+    (folder,) = slam_data.glob(f"kitti_raw/*/*_drive_{drive}_sync")
+    sequence = slam.open_sequence(folder)
+    lens = {"model": "radtan", "distortion": (-0.37, 0.2, 0.0, 0.0)}
+    left, right = (replace(camera, **lens) for camera in (sequence.rig.left, sequence.rig.right))
+    said = lines(sequence.frames(0, 5), rig=slam.StereoRig(left, right, sequence.rig.R, sequence.rig.b), kind="driving")
+    assert any("rectified before" in line for line in said)
+    assert not lines(sequence.frames(0, 5), rig=sequence.rig, kind="driving")
 
 
 def test_images_never_rectified_are_named():

@@ -14,6 +14,7 @@ from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry import se3
+from slam.geometry.rig import StereoRig
 from slam.mapping.known_landmarks import definite, require_known
 from slam.mapping.map_io import SavedMap, decode, encode, load_map, save_map
 from slam.models import EstimatorModels
@@ -74,7 +75,7 @@ def test_any_altered_byte_is_found():
 
 
 def signed(body: bytes) -> bytes:
-    return b"surf-stereo-slam map 5\n" + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+    return b"surf-stereo-slam map 6\n" + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
 
 
 def with_member(name: str, content: bytes | None) -> bytes:
@@ -145,9 +146,9 @@ def test_other_files_and_versions_are_refused(tmp_path):
     (tmp_path / "text").write_text("hello")
     with pytest.raises(SlamError, match="not a saved map"):
         load_map(tmp_path / "text")
-    for version in (b"2", b"6"):
-        data = encode(some_map()).replace(b"map 5\n", b"map " + version + b"\n", 1)
-        with pytest.raises(SlamError, match=f"version '{version.decode()}'.*version 5"):
+    for version in (b"2", b"5"):
+        data = encode(some_map()).replace(b"map 6\n", b"map " + version + b"\n", 1)
+        with pytest.raises(SlamError, match=f"version '{version.decode()}'.*version 6"):
             decode(data, "a.map")
     with pytest.raises(SlamError, match="cannot be written"):
         save_map(tmp_path / "no" / "folder.map", some_map())
@@ -201,6 +202,27 @@ def test_descriptors_of_another_kind_are_refused():
         StereoSlam(RIG, "surf", "ekf", prior_map=replace(known, frontend="orb"))
     with pytest.raises(ConfigurationError, match="by name"):
         StereoSlam(RIG, None, StereoSlam(RIG, None, "ekf").backend, prior_map=known)
+
+
+@pytest.mark.parametrize(
+    ("focal", "baseline", "width", "said"),
+    [
+        (1.01, 0.995, 1, ""),  # calibrated anew
+        (1.0, 1.2, 1, "baseline 0.12 there, 0.144 here"),
+        (0.5, 1.0, 1, "focal"),
+        (1.0, 1.0, 2, "width"),
+    ],
+)
+def test_a_map_of_another_rig_is_refused(focal, baseline, width, said):
+    known = decode(encode(first_run("ekf").snapshot()), "a.map")
+    K = RIG.left.K * [[focal], [focal], [1]]
+    size = RIG.width * width, RIG.height
+    rig = StereoRig.from_pinhole(K, baseline=RIG.baseline * baseline, size=size)
+    if not said:
+        StereoSlam(rig, None, "ekf", config=CONFIG, prior_map=known)
+        return
+    with pytest.raises(SlamError, match=r"a\.map: the map is of another rig: " + said):
+        StereoSlam(rig, None, "ekf", config=CONFIG, prior_map=known)
 
 
 def test_a_prior_map_that_is_larger_than_the_limit_is_kept():
