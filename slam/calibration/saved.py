@@ -97,7 +97,7 @@ class SavedCalibration:
 
 #: Recordings agree in a parameter if they differ by less than this many standard deviations of the difference, and
 #: disagree if by more than the second number; differences between the two limits may be chance.
-_AGREES, _DIFFERS = 2.0, 3.0
+_AGREES, CERTAIN = 2.0, 3.0
 
 
 def joint_calibration(
@@ -172,7 +172,7 @@ def agreement_in_words(largest: Array) -> str:
     differing = ", ".join(name for name, z in zip(RigModel.names, largest) if z > _AGREES)
     if not differing:
         return f"The recordings agree in all {known.sum()} of {len(known)} parameters that two of them show: {least}."
-    if largest[worst] <= _DIFFERS:
+    if largest[worst] <= CERTAIN:
         return f"The recordings agree, but for {differing}, where chance may do it: {least}."
     return f"The recordings do not agree in {differing}: {least}. Is it one rig, and has it not changed?"
 

@@ -14,7 +14,7 @@ from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
 from slam.calibration.evidence import RecordingEvidence
 from slam.calibration.posterior import factory_prior
-from slam.calibration.saved import agreement, agreement_in_words, joint_calibration
+from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
@@ -116,7 +116,8 @@ def calibrate(
     pairs, unsolved = sum(one.pairs for one in found), sum(one.unsolved for one in found)
     warning = _UNSOLVED.format(pairs=pairs, unsolved=unsolved) if unsolved > pairs else "" if pairs else _NO_PAIRS
     matched = float(np.median([one.matched for one in found]))
-    judgement = "" if unsolved > pairs else _judged(model, kept.posterior, configs[0].models.pixel_sigma, matched)
+    noise = configs[0].models.pixel_sigma
+    judgement = "" if unsolved > pairs else _judged(model, kept.posterior, noise, matched, apart)
     tree = kept.to_json() | {
         "recordings": [
             {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
@@ -135,10 +136,11 @@ def calibrate(
     return Calibrated(found, kept, apart, agreed, judgement, off, warning, units)
 
 
-def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: float) -> str:
-    """What the errors of a calibration do to pixels and depths, and whether that is much beside the noise.
+def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: float, apart: Array | None) -> str:
+    """What the errors of a calibration do to pixels and depths, and whether correcting them is expected to help.
 
     The noise [px] of a feature averages out over those of a frame, `matched` of them; the rig's error is in all alike.
+    Recordings that are `apart`, see `agreement`, do not speak of one rig; a single one may speak of itself.
     """
     points = model.far() + np.array([0.0, 0.0, model.focal / _AWAY])
     fields = np.stack([model.field(points)[:, 2], model.vertical(points)])  # of disparity and rows (2, N, n)
@@ -147,17 +149,27 @@ def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: flo
     left = noise / np.sqrt(max(matched, 1.0))
     beside = f"the noise of a frame's {matched:.0f} features leaves {left:.2f} px"
     if max(off) < left:
-        word = f"good: {beside}"
-    elif (off <= 2 * sigma).all():
-        word = "no more than is uncertain: longer recordings, with turns, say more"
+        word = f"This is good: {beside}."
+    elif off[0] <= CERTAIN * sigma[0]:
+        word = (
+            f"Of depths this is too uncertain to be worth correcting: a correction of less than {CERTAIN:g} standard "
+            "deviations may make them worse as well as better; longer recordings, with turns, say more."
+        )
+    elif apart is None:
+        word = (
+            "One recording alone does not tell whether this is worth correcting: its own errors look like the rig's. "
+            "Give others of the same rig, too: what they agree in is the rig's."
+        )
+    elif np.nanmax(apart, initial=0.0) > CERTAIN:
+        word = "It is not worth correcting by these recordings, which do not agree."
     elif max(off) < noise:
-        word = f"worth correcting, as runs do by default: {beside}"
+        word = f"This is worth correcting: {beside}."
     else:
-        word = f"bad: calibrate anew. The noise of one feature is {noise:g} px"
+        word = f"This is bad: calibrate anew. The noise of one feature is {noise:g} px."
     return (
         f"By this the calibration is off by {off[0]:.2f} ± {sigma[0]:.2f} px in disparity and {off[1]:.2f} ± "
         f"{sigma[1]:.2f} px in rows (RMS over the image), so that at {_AWAY:g} baselines depths are "
-        f"{100 * off[0] * _AWAY / model.focal:.1f} % wrong. This is {word}."
+        f"{100 * off[0] * _AWAY / model.focal:.1f} % wrong. {word}"
     )
 
 

@@ -62,14 +62,22 @@ def test_two_recordings_of_one_rig(made):
 
 
 @pytest.mark.parametrize(
-    ("off", "sigma", "word"),
-    [(0.01, 0.001, "good"), (0.2, 0.01, "worth correcting"), (0.2, 0.2, "uncertain"), (3.0, 0.01, "bad")],
+    ("off", "sigma", "apart", "word"),
+    [
+        (0.01, 0.001, 1.0, "This is good"),
+        (0.2, 0.01, 1.0, "This is worth correcting"),
+        (0.2, 0.09, 1.0, "too uncertain to be worth correcting"),  # two standard deviations make many runs worse
+        (0.2, 0.01, None, "One recording alone does not tell"),
+        (0.2, 0.01, 4.0, "which do not agree"),
+        (3.0, 0.01, 1.0, "This is bad"),
+    ],
 )
-def test_a_calibration_is_judged_by_the_noise_of_features_and_its_own_uncertainty(off, sigma, word):
+def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, apart, word):
     model = RigModel(slam.open_sequence(WORLD).rig)
     shift = np.array([float(name == "right_cx") for name in model.names]) / model.focal  # of all disparities by 1 px
     posterior = RigPosterior(off * shift, sigma**2 * np.outer(shift, shift))
-    words = _judged(model, posterior, noise=0.4, matched=100.0)
+    differing = None if apart is None else np.array([np.nan, apart])
+    words = _judged(model, posterior, 0.4, 100.0, differing)
     assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
 
 
