@@ -292,7 +292,6 @@ def render_command(
     sequence: Annotated[str, argument("A folder, or synthetic:NAME?key=value.", "SEQUENCE")],
     out: _Out,
     frames: _Frames = None,
-    truth_images: Annotated[bool, option("Depth and object images as well.")] = True,
     quiet: Annotated[bool, option("No progress.", None, "--quiet", "-q")] = False,
 ) -> None:
     """Write a built-in sequence as an EuRoC folder with its truth, for other programs."""
@@ -309,7 +308,7 @@ def render_command(
     require_outputs([Output(out, "--out", [f"{FOLDER}/"])], inputs, overwrite=None)
     start, stop = parse_frames(frames)
     with counting(frame_count(opened, start, stop), f"{opened.name} · render", quiet) as tell:
-        root = write_euroc(opened, out, start, stop, tell, truth_images)
+        root = write_euroc(opened, out, start, stop, tell)
     if not quiet:
         print(f"Files: {root}")
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from slam.data import BoolArray
 from slam.errors import ConfigurationError
-from slam.geometry.se3 import Array
 from slam.naming import suggestion
 
 
@@ -87,7 +86,6 @@ IMAGING = (
     Option("shutter", 0.0, "time that the shutter is open, as a share of a frame: motion blur", 0, 1),
     Option("lens", 0.5, "blur of the lens, standard deviation [px]", 0, 10),
     Option("colour", 0, "1 for colour images (BGR), 0 for grey ones", 0, 1),
-    Option("supersample", 2, "samples per pixel along each axis", 1, 4),
 )
 
 #: Keys for faults; values are frames (100), ranges (100:110, end left out), or a chance for each frame (0.02), and
@@ -96,7 +94,6 @@ FAULTS = (
     Option("drop", "", "frames that are missing from the recording"),
     Option("dropright", "", "frames without a right image"),
     Option("black", "", "black frames"),
-    Option("jump", "", "FRAME:SECONDS: the clock jumps ahead before this frame"),
 )
 
 COMMON = (*RECORDING, *OBSERVATION, *IMAGING, *FAULTS)
@@ -129,33 +126,18 @@ def parse_query(world: str, query: str, table: Mapping[str, Option]) -> dict[str
     return {name: o.default for name, o in table.items()} | given
 
 
-@dataclass(frozen=True, eq=False)
-class Faults:
-    """Faults of every frame of the undisturbed recording."""
+def faulty_frames(values: Mapping[str, Any], frames: int, seed: int) -> dict[str, BoolArray]:
+    """Which of the undisturbed recording's frames (N,) suffer from what, by the options' names.
 
-    frames: Mapping[str, BoolArray]  # which frames suffer (N,), by the option's name
-    delay: Array  # what the clock has jumped ahead by (N,) [s]
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any], frames: int, seed: int) -> Faults:
-        """Faults by the options' texts; ConfigurationError where one cannot be read, or every frame is dropped."""
-        chosen = {
-            name: _frames(name, values[name], frames, np.random.default_rng([seed, 7, number]))
-            for number, name in enumerate(option.name for option in FAULTS if option.name != "jump")
-        }
-        if chosen["drop"].all():
-            raise ConfigurationError("drop: no frame is left")
-        delay = np.zeros(frames)
-        for part in filter(None, values["jump"].split(",")):
-            frame, _, seconds = part.partition(":")
-            try:
-                start, by = int(frame), float(seconds)
-            except ValueError:
-                raise ConfigurationError(f"jump must be FRAME:SECONDS, got {part!r}") from None
-            if start < 1 or not (np.isfinite(by) and by > 0):
-                raise ConfigurationError(f"jump must be from frame 1 on and ahead in time, got {part!r}")
-            delay[start:] += by
-        return cls(chosen, delay)
+    ConfigurationError where a text cannot be read, or every frame is dropped.
+    """
+    chosen = {
+        option.name: _frames(option.name, values[option.name], frames, np.random.default_rng([seed, 7, number]))
+        for number, option in enumerate(FAULTS)
+    }
+    if chosen["drop"].all():
+        raise ConfigurationError("drop: no frame is left")
+    return chosen
 
 
 def _frames(name: str, text: str, frames: int, rng: np.random.Generator) -> BoolArray:

@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from slam.data import StereoFrame
+from slam.data import BoolArray, StereoFrame
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, exp, inverse, log
-from slam.worlds.options import Faults
 from slam.worlds.painting import paint
 from slam.worlds.raster import NEAR, Ripmap, View, draw, place
 from slam.worlds.world import World
 
 _PAINTED = 1500  # textures that are kept
+_SUPERSAMPLE = 2  # samples per pixel along each axis
 _EXPOSURES = 6  # pictures averaged where the shutter is open for a while
 _SKY = (230, 225, 220)  # where no surface is, BGR
 
@@ -33,13 +33,13 @@ class Recorder:
         faults: which frames suffer from what.
     """
 
-    def __init__(self, world: World, values: Mapping[str, Any], faults: Faults) -> None:
+    def __init__(self, world: World, values: Mapping[str, Any], faults: Mapping[str, BoolArray]) -> None:
         self._world, self._values, self._faults = world, values, faults
 
     def record(self, frame: int, index: int, stamp: float) -> StereoFrame:
         """The images of one frame of the world, as frame `index` of the recording."""
         left, right = self._shoot(frame, self._lenses[0], np.eye(4), 2), None
-        if not self._faults.frames["dropright"][frame]:
+        if not self._faults["dropright"][frame]:
             right = self._shoot(frame, self._lenses[1], inverse(self._world.rig.T_right_left), 3)
         return StereoFrame(index, stamp, left, right)
 
@@ -52,7 +52,7 @@ class Recorder:
         else:
             image = self._picture(frame, lens, T_left_camera, 0.0)
         rng = np.random.default_rng([self._values["seed"], frame, stream])
-        return sense(image, self._values, self._faults.frames["black"][frame], rng)
+        return sense(image, self._values, self._faults["black"][frame], rng)
 
     def _picture(self, frame: int, lens: Lens, T_left_camera: Array, ahead: float) -> np.ndarray:
         """One camera's light, `ahead` of the frame's time by a share of a frame."""
@@ -64,8 +64,7 @@ class Recorder:
     @cached_property
     def _lenses(self) -> tuple[Lens, Lens]:
         """Left and right camera."""
-        rig = self._world.rig
-        return Lens.of(rig.left, self._values["supersample"]), Lens.of(rig.right, self._values["supersample"])
+        return Lens.of(self._world.rig.left, _SUPERSAMPLE), Lens.of(self._world.rig.right, _SUPERSAMPLE)
 
     def _ripmap(self, rectangle: int) -> Ripmap:
         """The texture of a rectangle drawn, painted when first seen; the last ones are kept with the world."""

@@ -19,7 +19,7 @@ from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
 from slam.naming import sequence_line
 from slam.worlds.observe import Appearance, SimulatedFeatures, appearance, simulate
-from slam.worlds.options import Faults
+from slam.worlds.options import faulty_frames
 from slam.worlds.world import World
 
 if TYPE_CHECKING:
@@ -64,9 +64,9 @@ class WorldSequence:
         self.rig = world.rig if rig is None else rig
         self.warnings: list[str] = []
         self.masks: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
-        self.faults = Faults.of(values, len(world), values["seed"])
-        self._kept = np.flatnonzero(~self.faults.frames["drop"])
-        self.stamps: Array = (world.stamps + self.faults.delay)[self._kept]
+        self.faults = faulty_frames(values, len(world), values["seed"])
+        self._kept = np.flatnonzero(~self.faults["drop"])
+        self.stamps: Array = world.stamps[self._kept]
         self._last_truth: tuple[int, TruthImages] | None = None
         self._images: list[StereoFrame] = []
 
@@ -132,8 +132,7 @@ class WorldSequence:
         source = self.source(k)
         rng = np.random.default_rng([self.values["seed"], source, 1])
         seen = simulate(self.world, self._looks, self.values, source, float(self.stamps[int(k)]), rng)
-        faults = self.faults.frames
-        return seen.without(all_rows=faults["black"][source], right=faults["dropright"][source])
+        return seen.without(all_rows=self.faults["black"][source], right=self.faults["dropright"][source])
 
     @cached_property
     def _looks(self) -> Appearance:

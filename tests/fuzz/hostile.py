@@ -20,8 +20,8 @@ PATHS = (
     "/dev", "/dev/null", "/dev/full", "a\0b", "x" * 300, "/".join(["y" * 200] * 30), "new\nline", "\udc80", "?",
     "?fps=", "a?b?c", "?left=a%00b&right=c", "\x1b[31mred", "synthetic:", "synthetic:desk?frames=1e9",
     "synthetic:desk?frames=" + "9" * 5000, "synthetic:desk?frames=3&drop=0:" + "9" * 30,
-    "synthetic:desk?frames=3&drop=" + "9" * 30, "synthetic:desk?frames=3&jump=1:1e308",
-    "synthetic:desk?frames=3&jump=" + "9" * 30 + ":1", "synthetic:desk?frames=2&drop=nan", "synthetic:\0",
+    "synthetic:desk?frames=3&drop=" + "9" * 30,
+    "synthetic:desk?frames=2&drop=nan", "synthetic:\0",
 )  # fmt: skip
 
 #: Values of other types than expected, or far out of their range.

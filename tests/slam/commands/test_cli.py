@@ -29,7 +29,7 @@ def fails_with_one_line(done, *words):
 def euroc(tmp_path):
     """A tiny EuRoC folder of noise images."""
     folder, rng = tmp_path / "euroc", np.random.default_rng(0)
-    write_euroc(open_sequence("synthetic:desk?frames=3&width=160&height=120"), folder, truth_images=False)
+    write_euroc(open_sequence("synthetic:desk?frames=3&width=160&height=120"), folder)
     for image in sorted(folder.rglob("cam?/data/*.png")):
         cv2.imwrite(str(image), rng.integers(0, 255, (120, 160), dtype=np.uint8))
     return folder

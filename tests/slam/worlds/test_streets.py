@@ -74,7 +74,7 @@ def test_no_house_stands_on_a_road_and_every_house_faces_it():
 
 @pytest.mark.slow
 def test_a_round_later_images_are_the_same(loop):
-    sequence = opened(loop, f"{SMALL}&noise=0&supersample=1")
+    sequence = opened(loop, f"{SMALL}&noise=0")
     first, later = sequence.frame(20).left.astype(int), sequence.frame(20 + LAP).left.astype(int)
     assert np.mean(np.abs(first - later) > 20) < 1e-3
 
