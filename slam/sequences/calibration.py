@@ -166,7 +166,7 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
                 what = "nested too deeply" if depth > _DEEPEST else "no aliases are read"
                 row = event.start_mark.line + 1  # type: ignore[union-attr]
                 raise CalibrationError(f"{path}, row {row}: {what} in a calibration")
-        root = yaml.load(text, loader)
+        root = next(yaml.load_all(text, loader), None)  # of messages that ROS prints, a line ends each
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", row {mark.line + 1}" if mark else ""

@@ -22,7 +22,7 @@ from slam.sequences.images import Size
 #: Names of entries, in lower case, letters and digits only, without the side: K1, cameraMatrix1, camera_matrix_left,
 #: LEFT.K, cam0/intrinsics and Camera1.fx are all found.
 _SPELLINGS: dict[str, tuple[str, ...]] = {
-    "K": ("k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsicmatrix"),
+    "K": ("k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix"),
     "D": ("d", "distcoeffs", "dist", "distortion", "distortioncoeffs", "distortioncoefficients", "distortioncoeff"),
     "P": ("p", "projectionmatrix", "projection"),
     "R_rect": ("r", "rectificationmatrix"),
@@ -45,7 +45,7 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
 _FISHEYE = ("equidistant", "fisheye", "kannalabrandt8", "kannalabrandt")
 _PINHOLE = ("", "none", "radialtangential", "radtan", "plumbbob", "rationalpolynomial", "pinhole", "perspective",
             "rectified")  # fmt: skip
-_OF_ONE = ("tbs", "cameramatrix", "projectionmatrix")  # names that a file of one camera has
+_OF_ONE = ("tbs", "cameramatrix", "projectionmatrix", "p")  # names that a file of one camera has
 _FROM_ZERO = ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx")  # one of these: cameras are counted from 0
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PLAIN = ("fx", "fy", "cx", "cy")
@@ -57,7 +57,7 @@ _FORMS = {
         "cam0 and cam1, each with intrinsics and resolution, and T_cn_cnm1 in cam1",
     ),
     "EuRoC's": (("lefttbs",), "intrinsics, resolution and T_BS, in two files"),
-    "ROS's": (("leftcameramatrix",), "camera_matrix, rectification_matrix and projection_matrix, in two files"),
+    "ROS's": (("leftcameramatrix", "leftp"), "camera_matrix, rectification_matrix and projection_matrix, in two files"),
     "ORB-SLAM's": (
         ("camerabf", "stereotc1c2", "stereob", "camera1fx"),
         "Camera.bf for rectified images, LEFT.K … and RIGHT.K …, or Camera1.fx …, Camera2.fx … and Stereo.T_c1_c2",
@@ -107,8 +107,9 @@ class Entries:
             names = [*spellings, *(f"camera{s}" for s in spellings)]
         else:
             names = [name for s in spellings for token in self._sides[side] for name in (s + token, token + s)]
-        there = (entry for n in names if (entry := self._values.get(n)) is not None)
-        return next((e for e in there if not (e[1] is None or (isinstance(e[1], str) and not e[1]))), None)
+        least = 2 if role == "K" else 1  # words; k1 and k2 alone are coefficients of distortion
+        there = (entry for n in names if (entry := self._values.get(n)) is not None and entry[1] is not None)
+        return next((e for e in there if not isinstance(e[1], str) or len(e[1].split()) >= least), None)
 
     def both(self, role: str) -> bool:
         """Whether both cameras have an entry."""

@@ -28,13 +28,14 @@ _DATE = re.compile(
     r"(?:[-_.s]?(\d{1,9}))?(?!\d)",
     re.ASCII,
 )
-# Since 1973: seconds with a fraction, nano-, micro-, milliseconds, whole seconds; or seconds since a start.
+# Since 1973: seconds with a fraction, nano-, micro-, milliseconds, these with a fraction, too, or whole seconds; or
+# seconds since a start.
 _STAMP = re.compile(
-    r"(?<!\d)(?<!\d\.)(?:([1-9]\d{8,9})[._-](\d{1,9})|([1-9]\d{17,18})|([1-9]\d{15})|([1-9]\d{12})|([12]\d{9})"
-    r"|(\d{1,10})\.(\d{1,9}))(?!\d|\.\d)",
+    r"(?<!\d)(?<!\d[.,])(?:([1-9]\d{8,9})[.,_-](\d{1,9})|([1-9]\d{17,18})|([1-9]\d{15})|([1-9]\d{12}(?:[.,]\d{1,6})?)"
+    r"|([12]\d{9})|(\d{1,10})[.,](\d{1,9}))(?!\d|[.,]\d)",
     re.ASCII,
 )
-_SECONDS = re.compile(r"(-?\d{1,10})\.(\d{1,9})", re.ASCII)  # a whole name
+_SECONDS = re.compile(r"(-?\d{1,10})[.,](\d{1,9})", re.ASCII)  # a whole name
 _NUMBER = re.compile(r"\d+", re.ASCII)
 
 
@@ -59,7 +60,7 @@ def natural(name: str) -> list[tuple[str, int]]:
 
 def _skeleton(name: str) -> str:
     """A name's text around its numbers."""
-    return re.sub(r"-?\d+(\.\d+)?", "0", stem(name))
+    return re.sub(r"-?\d+([.,]\d+)?", "0", stem(name))
 
 
 def odd_ones(names: Sequence[str]) -> set[str]:
@@ -83,9 +84,10 @@ def of_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
 def keys_of(sides: Sequence[Sequence[str]]) -> Keys | None:
     """What the names of each camera's images say; None where neither stamps nor numbers tell the images apart.
 
-    A stamp is 19 digits (nanoseconds), 16 (microseconds), 13 (milliseconds), 10 (seconds), seconds with a fraction, or
-    a date with the time, anywhere in the names; or numbers so far apart that they cannot count frames. A frame's number
-    is the one that differs from name to name; of several, those that both cameras share, and that count best.
+    A stamp is 19 digits (nanoseconds), 16 (microseconds), 13 (milliseconds), 10 (seconds), the last two also with a
+    fraction, or a date with the time, anywhere in the names; or numbers so far apart that they cannot count frames. A
+    frame's number is the one that differs from name to name; of several, those that both cameras share, and that count
+    best.
     """
     for read in (_dates, _stamps):
         found = [read([stem(name) for name in names]) for names in sides]
@@ -150,7 +152,8 @@ def _nanoseconds(part: tuple[str, ...], width: int) -> int:
     if seconds or whole:
         below = int(fraction.rjust(width, "0").ljust(9, "0"))
         return int(seconds or whole) * 10**9 + (-below if seconds.startswith("-") else below)
-    return int(nano) if nano else int(micro) * 10**3 if micro else int(milli) * 10**6
+    whole_milli, _, below_milli = milli.replace(",", ".").partition(".")
+    return int(nano) if nano else int(micro) * 10**3 if micro else int(whole_milli + below_milli.ljust(6, "0"))
 
 
 def _dates(names: Sequence[str]) -> IntArray | None:

@@ -129,6 +129,9 @@ def test_a_rectified_pair_by_five_numbers_and_all_that_is_wrong_with_them(tmp_pa
     file.write_text("fx: 0.8\nfy: 0.8\ncx: 0.5\ncy: 0.5\nbaseline: 0.2\n")
     with pytest.raises(CalibrationError, match=r"a focal length of 0\.8 px for images 64 px wide: is it in pixels"):
         slam.load_rig(file, size=SIZE)
+    file.write_text("fx: 500\nfy: 500\ncx: 31\ncy: 23\nk1: -0.37\nk2: 0.2\nbaseline: 0.2\n")
+    with pytest.raises(CalibrationError, match="names distortion, but only one camera"):
+        slam.load_rig(file, size=SIZE)
     file.write_text("fx: true\ncx: wide\ncy: .inf\nbaseline: -0.12\n")
     with pytest.raises(CalibrationError) as error:
         slam.load_rig(file, size=SIZE)
@@ -220,6 +223,18 @@ def test_ros_s_two_camera_files(tmp_path: Path) -> None:
     right.write_text(camera_yaml(0))
     with pytest.raises(CalibrationError, match="P of the right one holds no baseline"):
         slam.load_rig(left, right)
+
+
+@pytest.mark.parametrize("names", ["DKRP", "dkrp"])
+def test_camera_messages_as_ros_prints_them(tmp_path: Path, names: str) -> None:
+    for side, tx in (("left", 0), ("right", -8)):
+        P = [40, 0, 32, tx, 0, 40, 24, 0, 0, 0, 1, 0]
+        values = [0.1, 0, 0, 0, 0], [50, 0, 31, 0, 51, 23, 0, 0, 1], np.eye(3).ravel().tolist(), P
+        text = "header:\n  frame_id: cam\nheight: 48\nwidth: 64\ndistortion_model: plumb_bob\n"
+        text += "".join(f"{name}: {value}\n" for name, value in zip(names, values))
+        (tmp_path / f"{side}.yaml").write_text(f"{text}roi:\n  height: 0\n  width: 0\n---\n")
+    rig = slam.load_rig(tmp_path)
+    assert (rig.left.fu, rig.left.distortion[0], rig.baseline) == (50, 0.1, pytest.approx(0.2))
 
 
 FOUR = (("fx", 45), ("fy", 45), ("cx", 31), ("cy", 23))

@@ -26,6 +26,8 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "nanoseconds": ("{}", "{}", lambda i: 1_403_715_273_000_000_000 + i * 50_000_000, 1_403_715_273, 0.05),
     "microseconds": ("{}", "{}", lambda i: 1_403_715_273_000_000 + i * 50_000, 1_403_715_273, 0.05),
     "milliseconds": ("{}", "{}", lambda i: 1_403_715_273_000 + i * 50, 1_403_715_273, 0.05),
+    "milliseconds with a fraction": ("{:.4f}_l", "{:.4f}_r", lambda i: 16e11 + 0.25 + 50.5 * i, 1.6e9 + 25e-5, 0.0505),
+    "comma": ("a1700000000,{:03d}", "a1700000000,{:03d}", lambda i: 7 + 50 * i, 1.7e9 + 0.007, 0.05),
     "since a start": ("{}", "{}", lambda i: 2_000_000_000 * (i + 1), 2.0, 2.0),
     "seconds": ("1403715273.{:02d}", "1403715273.{:02d}", lambda i: 5 * i, 1_403_715_273, 0.05),
     "seconds since a start": ("{:.3f}", "{:.3f}", lambda i: 9.95 + 0.05 * i, 9.95, 0.05),
