@@ -62,7 +62,7 @@ class PairGeometry:
     def rectified_before(self) -> bool:
         """The rows of the images agree, and those of the rectified ones do not, be it near the edges alone.
 
-        Or the calibration is that of rectified cameras, but for lenses that the images do not show.
+        Or the images do not show the lenses' distortion.
         """
         return self.conclusive and (most(self.better_raw, self.better_rectified) or self.lens_shown < 1)
 
@@ -102,39 +102,35 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
         int((changed & better).sum()),
         int((changed & ~better).sum()),
-        _lens_shown(rig, a, b, left, right) if _but_for_lenses(rig) else 1.0,
+        _lens_shown(rig, a, b, left, right) if rig.left.has_distortion or rig.right.has_distortion else 1.0,
     )
-
-
-def _but_for_lenses(rig: StereoRig) -> bool:
-    """Whether a rig is rectified but for its lenses: two real cameras have neither one matrix nor no rotation."""
-    plain = (replace(camera, model="none", distortion=()) for camera in (rig.left, rig.right))
-    return not rig.is_rectified and StereoRig(*plain, rig.R, rig.b).is_rectified
 
 
 def _lens_shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right: NDArray) -> float:
     """Share of the lenses' distortion that the rows of matches (N, 2) show, by least squares; 1 where it may be all.
 
     Cameras that are alike distort both pixels of a far point alike: what is left is less than ORB's accuracy, so the
-    right pixels are first moved to where the image patch is found.
+    right pixels are first moved to where the image patch is found. Two cameras of one matrix, without rotation, are
+    rectified ones, so that hardly a lens is believed; others may be calibrated badly.
     """
     import cv2
 
+    plain = StereoRig(*(replace(c, model="none", distortion=()) for c in (rig.left, rig.right)), rig.R, rig.b)
     start = (uv[:, None].astype(np.float32) for uv in (uv_left, uv_right))
     size, flags = (15, 15), cv2.OPTFLOW_USE_INITIAL_FLOW
     moved, found, _ = cv2.calcOpticalFlowPyrLK(left, right, *start, winSize=size, maxLevel=0, flags=flags)
     b = moved[:, 0].astype(float)
-    _, offset = _offsets(rig, uv_left, b)
-    raw = b[:, 1] - uv_left[:, 1]
+    (_, offset), (_, without) = _offsets(rig, uv_left, b), _offsets(plain, uv_left, b)
     good = (found[:, 0] > 0) & (np.abs(b - uv_right).max(axis=1) < _TOLERANCE)
-    good &= np.minimum(np.abs(raw), np.abs(offset)) < _TOLERANCE  # NaN is not
-    raw, removed = raw[good], (raw - offset)[good]
+    good &= np.minimum(np.abs(without), np.abs(offset)) < _TOLERANCE  # NaN is not
+    without, removed = without[good], (without - offset)[good]
     whole = float(removed @ removed)
-    if len(raw) <= _SAMPLE or whole == 0:
+    if len(removed) <= _SAMPLE or whole == 0:
         return 1.0
-    share = float(removed @ raw) / whole
-    sigma = float(np.sqrt(np.square(raw - share * removed).mean() / whole))
-    return share if abs(share - 1) > max(_LENS_IS_RIGHT, _SIGMAS * sigma) else 1.0
+    share = float(removed @ without) / whole
+    sigma = float(np.sqrt(np.square(without - share * removed).mean() / whole))
+    believed = 1 - _LENS_IS_RIGHT if plain.is_rectified else 0.5
+    return share if share + _SIGMAS * sigma < believed else 1.0
 
 
 def _offsets(rig: StereoRig, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:

@@ -147,6 +147,9 @@ class InputWarnings:
         if not self._pair_is_known and (own.swapped or own.same):
             self._pair_is_named = True
             self._warn(_swapped(own) if own.swapped else _the_same(own, self._rig))
+        elif not self._pair_is_known and self._before is not None and own.rectified_before:
+            self._pair_is_named = True  # hardly a feature fits then, and of another moment's some may by chance
+            self._warn(_rows_differ(own, self._rig))
         elif self._before is not None and (not self._moment_is_known or own.as_given < _FITS * own.matches):
             self._check_moment(frame, own)
         self._partners_are_known |= self._pair_is_named  # the reason is known then
@@ -173,7 +176,7 @@ class InputWarnings:
             self._fits[:] = 0  # what comes later is counted anew
         if own.conclusive and not self._pair_is_known:
             self._pair_is_known = True
-            if own.rows_differ or own.rectified_before:
+            if own.rows_differ:
                 self._pair_is_named = True
                 self._warn(_rows_differ(own, self._rig))
 
@@ -261,17 +264,17 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
     if rig.is_rectified:
         cause = "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
-    elif found.lens_shown < 1:
-        return (
-            f"by their calibration the cameras are rectified (one camera matrix, no rotation), but have lenses with "
-            f"distortion, of which rows show {100 * max(found.lens_shown, 0.0):.0f} %: the images were probably "
-            "rectified before, and are rectified again: leave the distortion out of the calibration"
-        )
-    elif found.rectified_before:
+    elif most(found.better_raw, found.better_rectified):
         return (
             f"the images were rectified before, and the calibration rectifies them again: rows of left and right image "
             f"agree better without it at {found.better_raw} features, with it at {found.better_rectified}; give the "
             "calibration after rectification"
+        )
+    elif found.lens_shown < 1:
+        return (
+            f"rows of left and right image show {100 * max(found.lens_shown, 0.0):.0f} % of the lenses' distortion in "
+            "the calibration: the images were rectified before, or undistorted, and are again; give the calibration "
+            "after that, or leave the distortion out"
         )
     else:
         cause = "check that the calibration is this camera's, at this size"
