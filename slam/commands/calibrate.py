@@ -32,9 +32,10 @@ def calibrate(
     frames: tuple[int, int | None],
     format: str | None,
     quiet: bool,
-    **files: Path | bool | None,
+    opencv: Path | None,
+    overwrite: bool,
 ) -> None:
-    """Run recordings of one rig; write and print what they say of it; `files` as `slam.run.calibrating` has them.
+    """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`.
 
     Raises:
         SlamError: bad input; one line says what and where.
@@ -49,12 +50,12 @@ def calibrate(
     require_settable(settings, SystemConfig().to_json(), "surf")
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
-    done = run(opened, out, show, settings, frames, inputs, **files)  # type: ignore[arg-type]
+    done = run(opened, out, show, settings, frames, inputs, opencv, overwrite)
     if done.warning:
         logging.getLogger(__name__).warning("%s", done.warning)
     if not quiet:
         _print(done)
-        if files.get("opencv") or files.get("kalibr"):
+        if opencv:
             print(f"The corrected calibration holds the corrections to {done.off:.3f} px, and no uncertainty.")
         print(f"Use it: slam run SEQUENCE --calibration {out}")
 

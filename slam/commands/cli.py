@@ -269,7 +269,6 @@ def calibrate_command(
     sequences: Annotated[list[str], argument("Recordings of one rig.", "SEQUENCE")],
     out: Annotated[Path, option("For `slam run --calibration`.", "FILE", "--out", "-o")] = Path("rig_errors.json"),
     opencv: Annotated[_File, option("The corrected calibration in OpenCV's form.", "FILE.yaml")] = None,
-    kalibr: Annotated[_File, option("The same in the form of Kalibr's camchain.", "FILE.yaml")] = None,
     settings: _Set = None,
     frames: _Frames = None,
     format: _Format = None,
@@ -282,9 +281,9 @@ def calibrate_command(
     from slam.run.options import parse_frames
     from slam.sequences import with_mask
 
-    texts, files = [with_mask(text, mask) for text in sequences], {"opencv": opencv, "kalibr": kalibr}
+    texts = [with_mask(text, mask) for text in sequences]
     with leaving("nothing is written"):
-        calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, overwrite=overwrite, **files)
+        calibrate(texts, out, settings or [], parse_frames(frames), format, quiet, opencv, overwrite)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

@@ -25,7 +25,7 @@ from slam.outputs import Output, require_outputs
 from slam.runtime.threads import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live
-from slam.sequences.rigs import require_kalibr, write_kalibr, write_opencv
+from slam.sequences.rigs import write_opencv
 from slam.system import StereoSlam
 
 _BACKEND, _FRONTEND = "ekf", "surf"  # poses are a first guess alone
@@ -86,12 +86,11 @@ def calibrate(
     frames: tuple[int, int | None] = (0, None),
     inputs: Sequence[Path] = (),
     opencv: Path | None = None,
-    kalibr: Path | None = None,
     overwrite: bool = False,
 ) -> Calibrated:
     """Run a range of frames of recordings of one rig, and write what they say of it to `out`, with its covariance.
 
-    `opencv` and `kalibr` are files for the corrected calibration in those forms; `inputs` are never replaced. Raises
+    `opencv` is a file for the corrected calibration in that form; `inputs` are never replaced. Raises
     SlamError on bad input, before anything is run.
     """
     rig = sequences[0].rig
@@ -101,9 +100,7 @@ def calibrate(
         difference = rig_difference(rig_numbers(rig), rig_numbers(sequence.rig))
         if difference:
             raise CalibrationError(f"{sequence.name}: not the rig of {sequences[0].name}: {difference}")
-    if kalibr is not None:
-        require_kalibr(kalibr, rig)
-    files = ((out, "--out"), (opencv, "--opencv"), (kalibr, "--kalibr"))
+    files = ((out, "--out"), (opencv, "--opencv"))
     require_outputs([Output(file, option) for file, option in files if file is not None], inputs, overwrite)
     configs = [_config(sequence, settings) for sequence in sequences]
     found = [_run(sequence, config, frames, show) for sequence, config in zip(sequences, configs)]
@@ -129,8 +126,6 @@ def calibrate(
     write_text(out, json.dumps(tree, indent=1) + "\n")
     if opencv is not None:
         write_opencv(opencv, corrected.rig)
-    if kalibr is not None:
-        write_kalibr(kalibr, corrected.rig)
     off = float(np.hypot(corrected.left_off, corrected.right_off))
     units = [_unit(name, unit, model.focal) for name, unit in zip(model.names, model.units)]
     return Calibrated(found, kept, apart, agreed, judgement, off, warning, units)

@@ -12,9 +12,7 @@ import numpy as np
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.files import expanded, write_text
-from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import pose
 from slam.sequences.calibration import is_kitti, naming
 from slam.sequences.calibration_keys import read_entries, rig_of
 from slam.sequences.images import Size, recorded_size, size_text
@@ -143,30 +141,3 @@ def write_opencv(path: Path, rig: StereoRig) -> None:
     storage.write("R", R)
     storage.write("T", (R @ b).reshape(3, 1))
     write_text(path, storage.releaseAndGetString())
-
-
-def write_kalibr(path: Path, rig: StereoRig) -> None:
-    """Write a rig, as recorded, as a camchain, cam0 the left camera; raises as `require_kalibr`, or SlamError."""
-    import yaml
-
-    require_kalibr(path, rig)
-    cameras = rig.as_recorded
-    left, right = (_kalibr_camera(camera) for camera in cameras[:2])
-    right["T_cn_cnm1"] = pose(cameras[2], cameras[2] @ cameras[3]).tolist()
-    write_text(path, yaml.safe_dump({"cam0": left, "cam1": right}, default_flow_style=None, sort_keys=False))
-
-
-def require_kalibr(path: Path, rig: StereoRig) -> None:
-    """Raise CalibrationError where a camera has more than the four coefficients of distortion of Kalibr's form."""
-    if max(len(camera.distortion) for camera in (rig.left, rig.right)) > 4:
-        raise CalibrationError(f"{path}: Kalibr's form has k1, k2, p1 and p2, and this rig further distortion")
-
-
-def _kalibr_camera(camera: PinholeCamera) -> dict[str, object]:
-    return {
-        "camera_model": "pinhole",
-        "intrinsics": [float(x) for x in (camera.fu, camera.fv, camera.u0, camera.v0)],
-        "distortion_model": _FISHEYE if camera.model == _FISHEYE else "radtan",
-        "distortion_coeffs": [float(x) for x in camera.distortion or (0.0,) * 4],
-        "resolution": [int(camera.width), int(camera.height)],
-    }

@@ -6,11 +6,10 @@ import pytest
 import slam
 from slam.calibration import RigCorrection, RigModel
 from slam.calibration.corrected import corrected_rig
-from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
-from slam.sequences.rigs import write_kalibr, write_opencv
+from slam.sequences.rigs import write_opencv
 from tests.slam.calibration.drives import CAR
 from tests.slam.scene import GENERAL_RIG
 
@@ -63,15 +62,9 @@ def fisheye():
 
 
 def test_what_a_form_cannot_hold_is_said(tmp_path):
-    """A fisheye has no tangential distortion; Kalibr's form no third radial coefficient."""
+    """A fisheye has no tangential distortion."""
     tangential = np.where(np.array([name == "left_p1" for name in RigModel.names]), 3e-3, 0.0)
     corrected = corrected_rig(RigModel(fisheye()), tangential)
     assert corrected.left_off > 0.05 > 1e-3 > corrected.right_off
-    write_kalibr(tmp_path / "fisheye.yaml", corrected.rig)
-    assert slam.load_rig(tmp_path / "fisheye.yaml").left == corrected.rig.left
     write_opencv(tmp_path / "opencv.yaml", corrected.rig)
     assert slam.load_rig(tmp_path / "opencv.yaml").left == corrected.rig.left
-    long = PinholeCamera(300, 300, 320, 240, 640, 480, "radtan", (0.01, 0.0, 0.0, 0.0, 0.001))
-    with pytest.raises(CalibrationError, match="further distortion"):
-        write_kalibr(tmp_path / "long.yaml", StereoRig(long, long, np.eye(3), np.array([-0.1, 0, 0])))
-    assert not (tmp_path / "long.yaml").exists()
