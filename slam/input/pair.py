@@ -115,10 +115,11 @@ def _lens_shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, 
     """
     import cv2
 
-    plain = StereoRig(*(replace(c, model="none", distortion=()) for c in (rig.left, rig.right)), rig.R, rig.b)
-    start = (uv[:, None].astype(np.float32) for uv in (uv_left, uv_right))
+    own, other = (replace(camera, model="none", distortion=()) for camera in (rig.left, rig.right))
+    plain = StereoRig(own, other, rig.R, rig.b)
+    a, b = (uv[:, None].astype(np.float32) for uv in (uv_left, uv_right))
     size, flags = (15, 15), cv2.OPTFLOW_USE_INITIAL_FLOW
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(left, right, *start, winSize=size, maxLevel=0, flags=flags)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(left, right, a, b, winSize=size, maxLevel=0, flags=flags)
     b = moved[:, 0].astype(float)
     (_, offset), (_, without) = _offsets(rig, uv_left, b), _offsets(plain, uv_left, b)
     good = (found[:, 0] > 0) & (np.abs(b - uv_right).max(axis=1) < _TOLERANCE)
