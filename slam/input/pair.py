@@ -18,6 +18,8 @@ _FEATURES = 1000  # guard: features of an image that are matched
 _TOLERANCE = 2.0  # guard: [px] from an epipolar line: ORB places features to a pixel or two
 
 _ROWS_AGREE = 1.0  # guard: [px] to which most rows of a rectified pair agree, at ORB's accuracy
+_SHOWN = 0.5  # guard: share of what rectification does to rows that images show at least, which are not rectified yet
+_SHOWN_PLAIN = 0.9  # guard: the same of cameras that are rectified but for lenses, as no two real ones are
 
 #: Disparities below this count as zero [px].
 NO_DISPARITY = _TOLERANCE
@@ -39,9 +41,7 @@ class PairGeometry:
     at_same_place: int = 0  # at one and the same pixel of both images, as they are, not rectified
     off_rows: int = 0  # whose rows differ, by more than the front end finds reliably
     row_offset: float = 0.0  # median difference of their rows [px]
-    better_raw: int = 0  # whose rows rectification changes, and that agree better without it
-    better_rectified: int = 0  # that agree better with it
-    lens_shown: float = 1.0  # share of the lenses' distortion that rows show; 1 where they do not contradict all of it
+    shown: float = 1.0  # share of what rectification does to rows that the images show; 1 where that may be all
 
     @property
     def swapped(self) -> bool:
@@ -57,14 +57,6 @@ class PairGeometry:
     def rows_differ(self) -> bool:
         """The rows of most matches differ."""
         return self.conclusive and most(self.off_rows, self.matches - self.off_rows)
-
-    @property
-    def rectified_before(self) -> bool:
-        """The rows of the images agree, and those of the rectified ones do not, be it near the edges alone.
-
-        Or the images do not show the lenses' distortion.
-        """
-        return self.conclusive and (most(self.better_raw, self.better_rectified) or self.lens_shown < 1)
 
 
 def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) -> PairGeometry:
@@ -89,9 +81,6 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
     band = max(rows, _TOLERANCE)
     shift, offset = _offsets(rig, a, b)
     shift_swapped, offset_swapped = _offsets(rig, b, a)
-    raw = b[:, 1] - a[:, 1]
-    changed = np.abs(offset - raw) > _ROWS_AGREE  # by more than whole pixels of ORB's hide
-    better = np.abs(raw) < np.abs(offset)
     return PairGeometry(
         len(a),
         True,
@@ -100,18 +89,16 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         int((np.abs(b - a).max(axis=1) <= _TOLERANCE).sum()),
         int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
-        int((changed & better).sum()),
-        int((changed & ~better).sum()),
-        _lens_shown(rig, a, b, left, right) if rig.left.has_distortion or rig.right.has_distortion else 1.0,
+        1.0 if rig.is_rectified else _shown(rig, a, b, left, right),
     )
 
 
-def _lens_shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right: NDArray) -> float:
-    """Share of the lenses' distortion that the rows of matches (N, 2) show, by least squares; 1 where it may be all.
+def _shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right: NDArray) -> float:
+    """Share of what rectification, or its undistortion alone, does to the rows of matches (N, 2) that they show.
 
-    Cameras that are alike distort both pixels of a far point alike: what is left is less than ORB's accuracy, so the
-    right pixels are first moved to where the image patch is found. Two cameras of one matrix, without rotation, are
-    rectified ones, so that hardly a lens is believed; others may be calibrated badly.
+    Rows of images that were rectified or undistorted before agree without that. Cameras that are alike distort both
+    pixels of a far point alike: what is left is less than ORB's accuracy, so the right pixels are first moved to where
+    the image patch is found. 1 where the images may show all.
     """
     import cv2
 
@@ -120,17 +107,24 @@ def _lens_shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, 
     a, b = (uv[:, None].astype(np.float32) for uv in (uv_left, uv_right))
     size, flags = (15, 15), cv2.OPTFLOW_USE_INITIAL_FLOW
     moved, found, _ = cv2.calcOpticalFlowPyrLK(left, right, a, b, winSize=size, maxLevel=0, flags=flags)
-    b = moved[:, 0].astype(float)
-    (_, offset), (_, without) = _offsets(rig, uv_left, b), _offsets(plain, uv_left, b)
-    good = (found[:, 0] > 0) & (np.abs(b - uv_right).max(axis=1) < _TOLERANCE)
-    good &= np.minimum(np.abs(without), np.abs(offset)) < _TOLERANCE  # NaN is not
-    without, removed = without[good], (without - offset)[good]
-    whole = float(removed @ removed)
-    if len(removed) <= _SAMPLE or whole == 0:
+    kept = (found[:, 0] > 0) & (np.abs(moved[:, 0] - uv_right).max(axis=1) < _TOLERANCE)
+    a, b = uv_left[kept], moved[kept, 0].astype(float)
+    rectified, believed = _offsets(rig, a, b)[1], _SHOWN_PLAIN if plain.is_rectified else _SHOWN
+    return min(_share(before, rectified, believed) for before in (b[:, 1] - a[:, 1], _offsets(plain, a, b)[1]))
+
+
+def _share(before: Array, after: Array, believed: float) -> float:
+    """Share of the change from row differences `before` to those `after` (N,) [px] that is seen, by least squares.
+
+    1 where it is not certainly less than what is `believed`.
+    """
+    good = np.minimum(np.abs(before), np.abs(after)) < _TOLERANCE  # NaN is not
+    before, change = before[good], (before - after)[good]
+    whole = float(change @ change)
+    if len(change) <= _SAMPLE or whole == 0:
         return 1.0
-    share = float(removed @ without) / whole
-    sigma = float(np.sqrt(np.square(without - share * removed).mean() / whole))
-    believed = 1 - _LENS_IS_RIGHT if plain.is_rectified else 0.5
+    share = float(change @ before) / whole
+    sigma = float(np.sqrt(np.square(before - share * change).mean() / whole))
     return share if share + _SIGMAS * sigma < believed else 1.0
 
 

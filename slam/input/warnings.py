@@ -147,7 +147,7 @@ class InputWarnings:
         if not self._pair_is_known and (own.swapped or own.same):
             self._pair_is_named = True
             self._warn(_swapped(own) if own.swapped else _the_same(own, self._rig))
-        elif not self._pair_is_known and self._before is not None and own.rectified_before:
+        elif not self._pair_is_known and self._before is not None and own.shown < 1:
             self._pair_is_named = True  # hardly a feature fits then, and of another moment's some may by chance
             self._warn(_rows_differ(own, self._rig))
         elif self._before is not None and (not self._moment_is_known or own.as_given < _FITS * own.matches):
@@ -264,17 +264,11 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
     if rig.is_rectified:
         cause = "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
-    elif most(found.better_raw, found.better_rectified):
+    elif found.shown < 1:
         return (
-            f"the images were rectified before, and the calibration rectifies them again: rows of left and right image "
-            f"agree better without it at {found.better_raw} features, with it at {found.better_rectified}; give the "
-            "calibration after rectification"
-        )
-    elif found.lens_shown < 1:
-        return (
-            f"rows of left and right image show {100 * max(found.lens_shown, 0.0):.0f} % of the lenses' distortion in "
-            "the calibration: the images were rectified before, or undistorted, and are again; give the calibration "
-            "after that, or leave the distortion out"
+            f"rows of left and right image show {100 * max(found.shown, 0.0):.0f} % of what the calibration's "
+            "rectification does to rows: the images were rectified before, or undistorted, and are again; give the "
+            "calibration after that, or leave the distortion out"
         )
     else:
         cause = "check that the calibration is this camera's, at this size"
