@@ -15,7 +15,7 @@ from slam.data import BoolArray, StereoFrame
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, exp, inverse, log
 from slam.worlds.painting import paint
-from slam.worlds.raster import NEAR, Ripmap, View, draw, place
+from slam.worlds.raster import Ripmap, View, draw, place, shown
 from slam.worlds.world import World
 
 _PAINTED = 1500  # textures that are kept
@@ -134,25 +134,17 @@ class TruthImages(NamedTuple):
 def truth_images(world: World, frame: int) -> TruthImages:
     """Depth and objects in one frame's left image, at the pixels' centres, also of a camera with distortion."""
     lens, bodies = Lens.of(world.rig.left, 1), world.T_world_body(frame)
+    placed = place(world.arrays, bodies, world.T_world_left[frame], lens.view)
+    labels = shown(placed, lens.view).astype(int)
     x, y = np.meshgrid(np.arange(world.rig.width), np.arange(world.rig.height), indexing="xy")
     if lens.places is not None:
         x, y = np.moveaxis(lens.places.astype(float), 2, 0)
-    nearness, objects = np.zeros(x.shape), np.zeros(x.shape, np.int32)
-    columns, rows = (x.min(axis=0), x.max(axis=0)), (y.min(axis=1), y.max(axis=1))
-    placed = place(world.arrays, bodies, world.T_world_left[frame], lens.view)
-    for i, (s, t, n) in enumerate(placed.Q):
-        part = tuple(np.flatnonzero((high > first - 1) & (low < last + 1)) for (low, high), (first, last) in
-                     ((rows, placed.rows[i]), (columns, placed.columns[i])))  # fmt: skip
-        if not all(map(len, part)):
-            continue
-        window = tuple(slice(inside[0], inside[-1] + 1) for inside in part)
-        across, down, near = (a * x[window] + b * y[window] + c for a, b, c in (s, t, n))
-        shown = (across >= 0) & (across <= near) & (down >= 0) & (down <= near) & (near < 1 / NEAR)
-        shown &= near > nearness[window]
-        nearness[window][shown] = near[shown]
-        objects[window][shown] = world.arrays.body[placed.source[i]]
-    with np.errstate(divide="ignore"):
-        return TruthImages(np.where(nearness > 0, 1 / nearness, 0.0).astype(np.float32), objects)
+        labels = labels[np.rint(y).astype(int), np.rint(x).astype(int)]
+    planes = np.concatenate([[[0.0, 0.0, np.inf]], placed.Q[:, 2]])[labels]  # row 0: nothing, whose depth is 0
+    depth = 1 / (planes[..., 0] * x + planes[..., 1] * y + planes[..., 2])
+    return TruthImages(
+        depth.astype(np.float32), np.append(0, world.arrays.body[placed.source])[labels].astype(np.int32)
+    )
 
 
 def sense(image: np.ndarray, values: Mapping[str, Any], black: bool, rng: np.random.Generator) -> np.ndarray:
