@@ -289,7 +289,7 @@ def startup(values: Mapping[str, Any]) -> Parts:
     """Paper B, 4.2: the camera stands before a board of features with known positions."""
     stamps, _ = clock(values, 5.0)
     layout, floor = values["layout"], -0.45  # the robot is half a metre tall
-    offsets, angles = carried(stamps, np.random.default_rng([layout, 47]), gait=1.1, amount=values["tremor"])
+    offsets, angles = carried(stamps, np.random.default_rng([layout, 47]), gait=1.1, amount=0.1)
     rectangles = [
         rectangle(Signs(0.8, 0.6, layout), (-0.4, 0, 0.3), RIGHT, DOWN),
         rectangle(Material(6.0, 2.5, "plaster", layout), (-3.0, 0.02, floor + 2.5), RIGHT, DOWN),

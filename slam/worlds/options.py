@@ -83,7 +83,6 @@ OBSERVATION = (
 IMAGING = (
     Option("noise", 2.0, "standard deviation of the sensor noise [grey levels]", 0, 100),
     Option("vignetting", 0.2, "loss of light in the image corners", 0, 1),
-    Option("shutter", 0.0, "time that the shutter is open, as a share of a frame: motion blur", 0, 1),
     Option("lens", 0.5, "blur of the lens, standard deviation [px]", 0, 10),
     Option("colour", 0, "1 for colour images (BGR), 0 for grey ones", 0, 1),
 )

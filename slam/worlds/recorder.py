@@ -13,14 +13,13 @@ import numpy as np
 
 from slam.data import BoolArray, StereoFrame
 from slam.geometry.camera import PinholeCamera
-from slam.geometry.se3 import Array, exp, inverse, log
+from slam.geometry.se3 import Array, inverse
 from slam.worlds.painting import paint
 from slam.worlds.raster import Ripmap, View, draw, place, shown
 from slam.worlds.world import World
 
 _PAINTED = 1500  # textures that are kept
 _SUPERSAMPLE = 2  # samples per pixel along each axis
-_EXPOSURES = 6  # pictures averaged where the shutter is open for a while
 _SKY = (230, 225, 220)  # where no surface is, BGR
 
 
@@ -45,21 +44,11 @@ class Recorder:
 
     def _shoot(self, frame: int, lens: Lens, T_left_camera: Array, stream: int) -> np.ndarray:
         """One camera's image."""
-        if self._values["shutter"] > 0:
-            shares = self._values["shutter"] * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
-            images = [self._picture(frame, lens, T_left_camera, x).astype(np.float32) for x in shares]
-            image = np.rint(np.mean(images, axis=0)).astype(np.uint8)
-        else:
-            image = self._picture(frame, lens, T_left_camera, 0.0)
+        bodies, T_world_camera = self._world.T_world_body(frame), self._world.T_world_left[frame] @ T_left_camera
+        sky = _SKY if self._values["colour"] else (round(float(np.mean(_SKY))),)
+        image = lens.expose(draw(self._world.drawn[1], self._ripmap, bodies, T_world_camera, lens.view, sky))
         rng = np.random.default_rng([self._values["seed"], frame, stream])
         return sense(image, self._values, self._faults["black"][frame], rng)
-
-    def _picture(self, frame: int, lens: Lens, T_left_camera: Array, ahead: float) -> np.ndarray:
-        """One camera's light, `ahead` of the frame's time by a share of a frame."""
-        T = _between(self._world.T_world_left, frame, ahead)
-        bodies = np.array([np.eye(4), *(_between(Ts, frame, ahead) for Ts in self._world.T_world_object)])
-        sky = _SKY if self._values["colour"] else (round(float(np.mean(_SKY))),)
-        return lens.expose(draw(self._world.drawn[1], self._ripmap, bodies, T @ T_left_camera, lens.view, sky))
 
     @cached_property
     def _lenses(self) -> tuple[Lens, Lens]:
@@ -78,14 +67,6 @@ class Recorder:
                 del painted[next(iter(painted))]
         painted[key] = found  # at the end: what has not been seen for the longest time comes first
         return found
-
-
-def _between(poses: Array, frame: int, ahead: float) -> Array:
-    """The pose `ahead` of a frame by a share of a frame, of poses (N, 4, 4), at constant velocity."""
-    other = frame + (1 if ahead > 0 else -1)
-    if ahead == 0 or not 0 <= other < len(poses):
-        return poses[frame]
-    return poses[frame] @ exp(abs(ahead) * log(inverse(poses[frame]) @ poses[other]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,7 +79,6 @@ SCENES = {
     "startup": Scene(
         "a board of features with known positions, the camera at [3, -70, 2.7] cm (paper B, section 4.2)",
         indoors.startup, (0.2, 3.0), 1000.0,
-        options=(Option("tremor", 0.1, "of the standing robot, as a multiple of a walking person's", 0, 10),),
         defaults={"density": 200.0},
     ),
     "street": Scene(

@@ -100,7 +100,7 @@ def test_rendering_twice_gives_the_same_bytes_whatever_the_order_and_the_threads
 
 
 def test_depth_is_that_of_the_landmarks_and_of_the_stereo_pair():
-    sequence = open_world("startup?rig=toedin&tremor=0&frames=2")
+    sequence = open_world("startup?rig=toedin&frames=2")
     depth = sequence.depth(0)
     assert depth.dtype == np.float32 and depth.shape == (240, 320)
     seen = visible_landmarks(sequence.world, 0)
@@ -141,10 +141,6 @@ def test_options_of_the_camera():
     dim = open_world("box?frames=400&noise=0&vignetting=0.5").frame(75).left
     assert dim[:20, :20].mean() < 0.7 * plain[:20, :20].mean()
     assert dim[110:130, 150:170].mean() > 0.97 * plain[110:130, 150:170].mean()
-    blurred = open_world("box?frames=400&noise=0&vignetting=0&shutter=1").frame(75).left
-    moving = open_world("box?frames=400").object_ids(75) > 0
-    change = np.abs(blurred - plain)
-    assert change[moving].mean() > 3 * change[~moving].mean(), "the box moves, the camera hardly does"
     colour = open_world("box?frames=2&colour=1").frame(0).left
     assert colour.shape == (240, 320, 3)
     assert np.ptp(colour.astype(int), axis=2).mean() > 5
