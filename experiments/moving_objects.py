@@ -72,7 +72,7 @@ def table1(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     name = "box?density=300&camera=still"
     sequence = slam.open_sequence(f"synthetic:{name}")
     frames = 40 if quick else len(sequence)
-    true = np.array([sequence.objects(k).T_world_object[0] for k in range(frames)])
+    true = np.array([sequence.objects(k)[0] for k in range(frames)])
     rows = []
     for backend in BACKENDS:
         for mode in ("detect", "procedure1"):
@@ -94,7 +94,7 @@ def table1(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
 def known_box(sequence: Any, system: slam.StereoSlam, features: StereoFeatures, labels: Any) -> Procedure1Detector:
     """The papers' detector with the box's features of the first frame."""
     start = np.eye(4) if system.config.models.T_world_left is None else system.config.models.initial_pose
-    corner = inverse(sequence.ground_truth.poses[0]) @ sequence.objects(0).T_world_object[0]
+    corner = inverse(sequence.ground_truth.poses[0]) @ sequence.objects(0)[0]
     database = ObjectDatabase.of(features, labels == 1, sequence.rig, start, (start @ corner)[:3, 3])
     return Procedure1Detector(sequence.rig, system.config.objects, system.config.models, database)
 

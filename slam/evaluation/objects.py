@@ -264,9 +264,9 @@ def _first_motion(poses: Array, cameras: Array, focal: float, pixel: float) -> i
 def score_for(sequence: Any) -> ObjectScore | None:
     """A score for a sequence that knows its moving objects; None for all others."""
     world = getattr(sequence, "world", None)
-    if world is None or not len(world.object_ids):
+    if world is None or not len(world.T_world_object):
         return None
-    frames = [sequence.objects(k).T_world_object for k in range(len(sequence))]
+    frames = [sequence.objects(k) for k in range(len(sequence))]
     poses = np.swapaxes(np.array(frames), 0, 1)
     return ObjectScore(poses, sequence.stamps, sequence.ground_truth.poses, sequence.rig.left.fu)
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slam.data import IdArray, StereoFeatures, StereoFrame
+from slam.data import StereoFeatures, StereoFrame
 from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -24,19 +24,6 @@ from slam.worlds.world import World
 
 if TYPE_CHECKING:
     from slam.worlds.recorder import Recorder, TruthImages
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectPoses:
-    """Poses of the moving objects in one frame.
-
-    Attributes:
-        ids: of the objects (B,), from 1 on.
-        T_world_object: their poses (B, 4, 4).
-    """
-
-    ids: IdArray
-    T_world_object: Array
 
 
 class WorldSequence:
@@ -114,9 +101,9 @@ class WorldSequence:
         """Which object each pixel of frame k's left image shows (H, W) int32, 0 for the still world."""
         return self._truth(k).objects
 
-    def objects(self, k: int) -> ObjectPoses:
-        """Poses of the moving objects in frame k."""
-        return ObjectPoses(self.world.object_ids, self.world.T_world_object[:, self.source(k)])
+    def objects(self, k: int) -> Array:
+        """Poses ``T_world_object`` (B, 4, 4) of the moving objects 1 to B in frame k."""
+        return self.world.T_world_object[:, self.source(k)]
 
     def observe(self, start: int = 0, stop: int | None = None) -> Iterator[SimulatedFeatures]:
         """Features with their truth, without images, of frames `start` up to, but without, `stop`; see `frames`."""

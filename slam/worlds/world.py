@@ -33,11 +33,6 @@ class World:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    @cached_property
-    def object_ids(self) -> IdArray:
-        """Ids of the moving objects (B,)."""
-        return np.arange(1, len(self.T_world_object) + 1)
-
     def T_world_body(self, frame: int) -> Array:
         """Poses (B + 1, 4, 4) of all bodies in one frame; row 0, the still world, is the identity."""
         return np.concatenate([np.eye(4)[None], self.T_world_object[:, frame]])

@@ -112,7 +112,7 @@ def test_object_image_is_where_the_object_is():
     sequence = open_world("box?camera=still")
     ids = sequence.object_ids(30)
     assert np.unique(ids).tolist() == [0, 1]
-    T, size = sequence.objects(30).T_world_object[0], np.array([0.24, 0.16, 0.20])
+    T, size = sequence.objects(30)[0], np.array([0.24, 0.16, 0.20])
     corner = np.array([[-size[0], 0, -size[2]], [0, 0, 0]])  # of its front, at rest in B0
     world = corner @ T[:3, :3].T + T[:3, 3]
     camera = sequence.ground_truth.poses[30]

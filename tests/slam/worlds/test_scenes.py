@@ -60,12 +60,12 @@ def test_box_stands_at_the_places_of_table_1():
     sequence = open_world("box")
     pause = round((indoors.REST + indoors.MOVE) * 30)
     for i, (x, y, z, yaw, pitch, roll) in enumerate(indoors.PLACES):
-        T = sequence.objects(i * pause + 30).T_world_object[0]
+        T = sequence.objects(i * pause + 30)[0]
         assert np.allclose(T[:3, 3], (x, y, z), atol=1e-12)
         a, b, c = np.deg2rad([yaw, pitch, roll])
         R = _about(2, a) @ _about(1, b) @ _about(0, c)
         assert np.allclose(T[:3, :3], R, atol=1e-12)
-        assert np.array_equal(T, sequence.objects(i * pause + 31).T_world_object[0]), "it stands still there"
+        assert np.array_equal(T, sequence.objects(i * pause + 31)[0]), "it stands still there"
 
 
 def _about(axis: int, angle: float) -> np.ndarray:
