@@ -25,7 +25,7 @@ _SHORTEST_MICRO = 10**4  # [µs] between frames: a hundred a second; no count of
 
 _DATE = re.compile(
     r"(?<!\d)(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_T ]?([0-2]\d)[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)"
-    r"(?:[-_.s]?(\d{1,9}))?(?!\d)",
+    r"(?:[-_.s]?(?!20\d\d[-_.]?[01]\d[-_.]?[0-3]\d)(\d{1,9}))?(?!\d)",
     re.ASCII,
 )
 # Since 1973: seconds with a fraction, nano-, micro-, milliseconds, these with a fraction, too, or whole seconds; or
@@ -112,6 +112,10 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
             continue
         # Fractions of unequal length have lost zeros at their ends, or those in front: then steps are uneven.
         lengths = {len(fraction) for fraction in fractions}
+        if all(part[6] for part in parts) and len(whole) < len(names) and len(lengths) == 1:
+            moments = [_nanoseconds(part, 0) for part in parts]
+            if [names[row] for row in np.argsort(moments, kind="stable")] != sorted(names, key=natural):
+                continue  # seconds of a time of day, an exposure
         widths = (0, 6 if max(lengths) <= 6 else 9) if len(lengths) > 1 else (0,)
         keys = min(([_nanoseconds(part, width) for part in parts] for width in widths), key=_unevenness)
         far = len(keys) > 1 and median(_steps(keys)) > _LONGEST  # a clock from its start, in a finer unit
@@ -158,23 +162,23 @@ def _nanoseconds(part: tuple[str, ...], width: int) -> int:
 
 def _dates(names: Sequence[str]) -> IntArray | None:
     """Dates with the time [ns since 1970] that every name has and that tell the names apart."""
-    found = [match for name in names if (match := _DATE.search(name))]
-    if len(found) < len(names):
-        return None
-    digits = [match[7] or "" for match in found]
-    counters = [int(own or 0) for own in digits]
-    together = len({match.groups()[:6] for match in found}) == 1  # then a count of few digits is likelier than 100 Hz
-    steps = _steps(counters) if together else np.diff(counters).tolist()
-    counted = 4 * steps.count(1) >= 3 * len(steps) if together else set(steps) == {1}
-    if steps and (counted or _counters(["".join(match.groups()[:6]) for match in found], digits)):
-        return None
-    moments = ["{}-{}-{}T{}:{}:{}".format(*match.groups()) for match in found]
-    fractions = [int((match[7] or "0").ljust(9, "0")) for match in found]
-    try:
-        keys = np.array(moments, "datetime64[ns]").astype(np.int64) + np.array(fractions)
-    except ValueError:  # no date
-        return None
-    return keys if len(np.unique(keys)) == len(names) else None
+    for found in zip(*(list(_DATE.finditer(name)) for name in names)):  # the session's may stand before the image's
+        digits = [match[7] or "" for match in found]
+        counters = [int(own or 0) for own in digits]
+        together = len({match.groups()[:6] for match in found}) == 1  # then a few digits count likelier than at 100 Hz
+        steps = _steps(counters) if together else np.diff(counters).tolist()
+        counted = 4 * steps.count(1) >= 3 * len(steps) if together else set(steps) == {1}
+        if steps and (counted or _counters(["".join(match.groups()[:6]) for match in found], digits)):
+            continue
+        moments = ["{}-{}-{}T{}:{}:{}".format(*match.groups()) for match in found]
+        fractions = [int((match[7] or "0").ljust(9, "0")) for match in found]
+        try:
+            keys = np.array(moments, "datetime64[ns]").astype(np.int64) + np.array(fractions)
+        except ValueError:  # no date
+            continue
+        if len(np.unique(keys)) == len(names):
+            return keys
+    return None
 
 
 def _numbers(sides: Sequence[Sequence[str]]) -> Keys | None:

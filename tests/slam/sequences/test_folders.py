@@ -43,6 +43,10 @@ NAMES = {  # of the left and the right images, and the stamps that they say; pla
     "dash": ("frame-1600000000-{:03d}",) * 2 + (lambda i: 700 + 50 * i, 1.6e9 + 0.7, 0.05),
     "counted in each second": ("{0[0]}_{0[1]}",) * 2 + (lambda i: (1_600_000_000 + i // 3, i % 3), 0.0, 0.1),
     "date": ("20230405_120000_{:03d}", "20230405_120000_{:03d}", lambda i: 90 * i, 1680696000, 0.09),
+    "two dates": ("2018-07-09-16-11-56_2018-07-09-16-11-5{0[0]}-{0[1]:03d}",) * 2
+    + (lambda i: divmod(6700 + 110 * i, 1000), 1531152716.7, 0.11),
+    "time of day": ("a12-{0[0]:02.0f}-{0[1]:04.1f}",) * 2 + (lambda i: divmod(238.5 + 0.5 * i, 60), 0.0, 0.1),
+    "exposure in seconds": ("{0[0]:05d}_{0[1]:.3f}",) * 2 + (lambda i: (i, 0.02 - 0.002 * i), 0.0, 0.1),
     "numbers": ("frame{:04d}", "frame{:04d}", lambda i: 3 + i, 0.0, 0.1),
     "unpadded numbers": ("{}_cam0", "{}_cam1", lambda i: 7 + i, 0.0, 0.1),
     "size in name": ("frame{}_1226x370", "frame{}_1226x370", lambda i: 7 + i, 0.0, 0.1),
