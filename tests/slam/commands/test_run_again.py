@@ -33,7 +33,7 @@ def here(tmp_path, monkeypatch):
 def recording(tmp_path_factory):
     """A tiny recording on disk."""
     folder = tmp_path_factory.mktemp("recordings")
-    slam("render", WORLD, "--out", folder / "rendered", "--no-truth-images", "-q")
+    slam("render", WORLD, "--out", folder / "rendered", "-q")
     return folder / "rendered"
 
 
