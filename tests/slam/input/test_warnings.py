@@ -13,7 +13,7 @@ import slam
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import SequenceError
 from slam.geometry.camera import PinholeCamera
-from slam.input.pair import pair_geometry
+from slam.input.pair import pair_geometry, points_of
 from slam.input.warnings import InputWarnings, farthest_apart
 from slam.models import models_for
 
@@ -140,11 +140,20 @@ def test_swapped_cameras_of_an_unrectified_rig():
             [camera.normalise(np.column_stack([u.ravel(), v.ravel()]).astype(float)), np.ones(76800)]
         )
         uv = np.nan_to_num(RIG.left.project(rays @ R), nan=-1).astype(np.float32).reshape(240, 320, 2)
-        views.append(cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR))
+        views.append(points_of(cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)))
     rig = slam.StereoRig(left, right, turn, RIG.b)
     good, bad = pair_geometry(rig, *views, 1.5), pair_geometry(rig, *views[::-1], 1.5)
     assert good.conclusive and not good.swapped and not good.rows_differ
     assert bad.swapped
+
+
+def test_points_of_an_image_are_found_once(monkeypatch):
+    """Else the second frame of a live run, which is compared with the first one too, takes longer than two frames."""
+    found, name = [], "slam.input.warnings.points_of"
+    monkeypatch.setattr(name, lambda image: found.append(image.ctypes.data) or points_of(image))
+    frames = [replace(f, left=f.left.copy(), right=f.right.copy()) for f in stamped(0.05 * np.arange(3))]
+    assert lines(frames) == []
+    assert len(found) == len(set(found)) == 6
 
 
 @pytest.mark.parametrize("shift", [-9, 4])
