@@ -25,7 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
-from experiments.ablation_parts import CASES, Case, error_of, opened
+from experiments.ablation_parts import RECORDED, Case, error_of, opened
 from experiments.common import script_options
 from experiments.perturbations import NONE, frames_of
 from experiments.tables import show
@@ -39,13 +39,20 @@ from slam.sequences import Sequence
 from slam.system import StereoSlam
 
 BACKENDS = ("ekf", "window")
+#: Worlds are rendered so large that there are as many features as are asked for.
+CASES = (
+    *RECORDED[:-1],
+    Case("desk", "synthetic:desk?frames=60&width=752&height=480", 60),
+    Case("street", "synthetic:street?frames=45&width=752&height=300", 45, 10),
+    RECORDED[-1],
+)
 FEATURES = (300, 450, 600, 800, 1100)
 IN_VIEW = {"driving": (60, 100, 150, 220), "handheld": (40, 60, 80, 120)}
 USUAL = {"driving": (800, 150), "handheld": (800, 80)}  # the number that is kept while the other changes
 ROOM = 4 / 3  # driving: size of the map over the landmarks in view
 STAGES = ("predict", "associate", "update", "estimate", "objects", "manage", "atlas")
 HEADER = ("sequence", "kind", "trial", "back end", "asked", "in view", "error", "NEES", "lost", "features", "measured",
-          "extract", *STAGES)  # fmt: skip
+          "bodies", "extract", *STAGES)  # fmt: skip
 COLUMNS = ("kind", "what", "number", "error", "±", "ekf", "window", "largest", "NEES", "features", "measured",
            "extract [ms]", "ekf [ms]", "window [ms]")  # fmt: skip
 
@@ -64,6 +71,7 @@ class Run:
         self.sequence, self.case, self.record = sequence, case, RunRecord()
         self.spent: list[list[float]] = []
         self.counts: list[tuple[int, int]] = []
+        self.bodies = 0
         self.failed = False
 
     def step(self, number: int, features: StereoFeatures) -> None:
@@ -79,18 +87,19 @@ class Run:
         self.record.add(number, result)
         self.spent.append([result.milliseconds.get(stage, 0.0) for stage in STAGES])
         self.counts.append((len(features), len(result.matched)))
+        self.bodies += len(result.objects)
 
     def figures(self) -> list[float]:
-        """Error [m], NEES, frames without a measured pose; medians of features, landmarks measured, CPU of stages."""
+        """Error [m], NEES, frames without a measured pose, features and landmarks measured (medians), bodies, times."""
         if self.failed:
-            return [float("nan")] * (5 + len(STAGES))
+            return [float("nan")] * (6 + len(STAGES))
         measured = np.array(self.record.measured)
         path, rows = self.record.trajectory.select(measured), np.flatnonzero(measured)
         common = [self.record.common[row] for row in rows]
         nees = consistency(path, np.array(self.record.covariances)[rows], self.sequence, common)
         figures = error_of(path, self.sequence), nees.get(f"NEES over {self.case.over} m", float("nan"))
         middle = np.median(np.hstack([self.counts, self.spent]), axis=0)
-        return [*figures, int((~measured).sum()), *middle[:2], *middle[2:].round(2)]
+        return [*figures, int((~measured).sum()), *middle[:2], self.bodies, *middle[2:].round(2)]
 
 
 def settings(kind: str) -> dict[int, list[int]]:
@@ -124,9 +133,8 @@ def runs(cases: list[Case], trials: int, done: set[Key]) -> Iterator[list[object
                 for system in systems:
                     system.step(number, features)
             for (backend, in_view), system in zip(wanted, systems):
-                error, nees, lost, found, measured, *spent = system.figures()
-                yield [case.name, kind, trial, backend, asked, in_view, error, nees, lost, found, measured,
-                       round(float(np.median(extraction)), 2), *spent]  # fmt: skip
+                figures, took = system.figures(), round(float(np.median(extraction)), 2)
+                yield [case.name, kind, trial, backend, asked, in_view, *figures[:6], took, *figures[6:]]
 
 
 def table(rows: list[Row], kind: str) -> tuple[list[list[object]], dict[str, int]]:
