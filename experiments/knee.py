@@ -7,9 +7,10 @@ with another seed as well (`experiments/perturbations.py`): with each number of 
 landmarks in view, and with each number of landmarks at the usual number of features. Runs are appended to
 ``knee.csv`` as they end, and a later call goes on with those that are missing.
 
-Printed are, for each kind of motion, ratios to the runs with the largest number: of the online error, geometric means
-over sequences, trials and back ends, with the standard error of that mean; of NEES; and CPU times of a frame. The knee
-is the least number whose error is larger than the smallest by no more than the standard error of their difference.
+Printed are, for each kind of motion, ratios to the runs with both usual numbers: of the online error, geometric means
+over sequences, trials and back ends, with the standard error of that mean; of NEES; of the frames in which bodies are
+followed, all bodies together; and of CPU times of a frame, for extraction and for all that follows. The knee of the
+error is the least number whose error is larger than the smallest by no more than the standard error of the difference.
 """
 
 from __future__ import annotations
@@ -50,11 +51,17 @@ FEATURES = (300, 450, 600, 800, 1100)
 IN_VIEW = {"driving": (60, 100, 150, 220), "handheld": (40, 60, 80, 120)}
 USUAL = {"driving": (800, 150), "handheld": (800, 80)}  # the number that is kept while the other changes
 ROOM = 4 / 3  # driving: size of the map over the landmarks in view
-STAGES = ("predict", "associate", "update", "estimate", "objects", "manage", "atlas")
 HEADER = ("sequence", "kind", "trial", "back end", "asked", "in view", "error", "NEES", "lost", "features", "measured",
-          "bodies", "extract", *STAGES)  # fmt: skip
-COLUMNS = ("kind", "what", "number", "error", "±", "ekf", "window", "largest", "NEES", "features", "measured",
-           "extract [ms]", "ekf [ms]", "window [ms]")  # fmt: skip
+          "bodies", "extract", "step")  # fmt: skip
+COLUMNS = ("kind", "what", "number", "error", "±", "ekf", "window", "largest", "NEES", "bodies", "measured",
+           "CPU extract", "CPU ekf", "CPU window")  # fmt: skip
+
+NAMES = {"asked": "features", "in view": "landmarks in view"}
+#: What was decided by these tables, without figures: they are above it.
+FOLLOWED = """
+On drives the landmarks in view are at the knee. There are more features than the path needs in the mean: with the
+fewest, a drive is much farther off, and moving cars are followed for fewer frames.
+"""
 
 Row = dict[str, str]
 Key = tuple[str, str, str, str, str]  # the columns that tell a run from others, without the kind
@@ -69,8 +76,7 @@ class Run:
         wanted = {"map.target_in_view": in_view, "map.max_landmarks": largest}
         self.system = StereoSlam(sequence.rig, frontend, backend, config=config.with_settings(wanted))
         self.sequence, self.case, self.record = sequence, case, RunRecord()
-        self.spent: list[list[float]] = []
-        self.counts: list[tuple[int, int]] = []
+        self.counts: list[tuple[float, ...]] = []  # features, landmarks measured, CPU time [ms]
         self.bodies = 0
         self.failed = False
 
@@ -85,20 +91,19 @@ class Run:
             self.failed = True
             return
         self.record.add(number, result)
-        self.spent.append([result.milliseconds.get(stage, 0.0) for stage in STAGES])
-        self.counts.append((len(features), len(result.matched)))
+        self.counts.append((len(features), len(result.matched), sum(result.milliseconds.values())))
         self.bodies += len(result.objects)
 
     def figures(self) -> list[float]:
         """Error [m], NEES, frames without a measured pose, features and landmarks measured (medians), bodies, times."""
         if self.failed:
-            return [float("nan")] * (6 + len(STAGES))
+            return [float("nan")] * 7
         measured = np.array(self.record.measured)
         path, rows = self.record.trajectory.select(measured), np.flatnonzero(measured)
         common = [self.record.common[row] for row in rows]
         nees = consistency(path, np.array(self.record.covariances)[rows], self.sequence, common)
         figures = error_of(path, self.sequence), nees.get(f"NEES over {self.case.over} m", float("nan"))
-        middle = np.median(np.hstack([self.counts, self.spent]), axis=0)
+        middle = np.median(self.counts, axis=0)
         return [*figures, int((~measured).sum()), *middle[:2], self.bodies, *middle[2:].round(2)]
 
 
@@ -137,39 +142,47 @@ def runs(cases: list[Case], trials: int, done: set[Key]) -> Iterator[list[object
                 yield [case.name, kind, trial, backend, asked, in_view, *figures[:6], took, *figures[6:]]
 
 
+Runs = dict[tuple[str, str, str], dict[int, Row]]  # rows by number, of each sequence, trial and back end
+
+
 def table(rows: list[Row], kind: str) -> tuple[list[list[object]], dict[str, int]]:
     """Figures over both numbers, for one kind of motion; and the knees."""
     out: list[list[object]] = []
     knees = {}
-    for what, fixed, usual in (("asked", "in view", USUAL[kind][1]), ("in view", "asked", USUAL[kind][0])):
-        own = [row for row in rows if row["kind"] == kind and row[fixed] == str(usual)]
+    for what, fixed, usual in (("asked", "in view", USUAL[kind]), ("in view", "asked", USUAL[kind][::-1])):
+        own = [row for row in rows if row["kind"] == kind and row[fixed] == str(usual[1])]
         numbers = sorted({int(row[what]) for row in own})
-        found: dict[tuple[str, str, str], dict[int, Row]] = {}
+        found: Runs = {}
         for row in own:
             found.setdefault((row["sequence"], row["trial"], row["back end"]), {})[int(row[what])] = row
-        whole = {key: by for key, by in found.items() if len(by) == len(numbers)}
-        if not whole:
-            continue
-        logs = np.array([[np.log(float(by[n]["error"])) for n in numbers] for by in whole.values()])
-        knees[what] = numbers[_knee(logs)]
-        for column, number in enumerate(numbers):
-            ratio = logs[:, column] - logs[:, -1]
-            of = [by[number] for by in whole.values()]
-            by_backend = [ratio[[key[2] == b for key in whole]] for b in BACKENDS]
-            cases = {name: np.median(ratio[[key[0] == name for key in whole]]) for name, _, _ in whole}
-            worst = max(cases, key=lambda name: cases[name])
-            last = [by[numbers[-1]] for by in whole.values()]
-            nees = [float(r["NEES"]) / float(r1["NEES"]) for r, r1 in zip(of, last)]
-            out.append([
-                kind, {"asked": "features", "in view": "landmarks in view"}[what], number,
-                float(np.exp(np.nanmean(ratio))), _scatter(ratio), *(float(np.exp(np.nanmean(r))) for r in by_backend),
-                f"{np.exp(cases[worst]):.2f} {worst}", float(np.nanmedian(nees)),
-                round(float(np.nanmedian([float(r["features"]) for r in of]))),
-                round(float(np.nanmedian([float(r["measured"]) for r in of]))),
-                f"{np.nanmedian([float(r['extract']) for r in of]):.1f}",
-                *(f"{np.nanmedian([_step_time(r) for r in of if r['back end'] == b]):.1f}" for b in BACKENDS),
-            ])  # fmt: skip
+        found = {key: by for key, by in found.items() if len(by) == len(numbers)}
+        if found:
+            logs = np.log([[float(by[n]["error"]) for n in numbers] for by in found.values()])
+            knees[what] = numbers[_knee(logs)]
+            out += ([kind, NAMES[what], number, *figures(found, number, usual[0])] for number in numbers)
     return out, knees
+
+
+def figures(found: Runs, number: int, usual: int) -> list[object]:
+    """The columns of a number, from the error on."""
+
+    def ratios(column: str, backend: str = "") -> np.ndarray:
+        pairs = [(by[number], by[usual]) for key, by in found.items() if backend in ("", key[2])]
+        return np.array([float(own[column]) / float(base[column]) for own, base in pairs])
+
+    def mean(logs: np.ndarray) -> float:
+        return float(np.exp(np.nanmean(logs)))
+
+    log = np.log(ratios("error"))
+    cases = {name: np.median(log[[key[0] == name for key in found]]) for name, _, _ in found}
+    worst = max(cases, key=lambda name: cases[name])
+    bodies = (sum(float(by[n]["bodies"]) for by in found.values()) for n in (number, usual))
+    return [
+        mean(log), _scatter(log), *(mean(np.log(ratios("error", b))) for b in BACKENDS),
+        f"{np.exp(cases[worst]):.2f} {worst}", float(np.nanmedian(ratios("NEES"))), next(bodies) / max(next(bodies), 1),
+        round(float(np.nanmedian([float(by[number]["measured"]) for by in found.values()]))),
+        float(np.nanmedian(ratios("extract"))), *(float(np.nanmedian(ratios("step", b))) for b in BACKENDS),
+    ]  # fmt: skip
 
 
 def _scatter(ratio: np.ndarray) -> float:
@@ -183,10 +196,6 @@ def _knee(logs: np.ndarray) -> int:
     best = int(np.argmin(np.nanmean(logs, axis=0)))
     differences = [logs[:, k] - logs[:, best] for k in range(best + 1)]
     return next(k for k, d in enumerate(differences) if k == best or np.nanmean(d) <= _scatter(d))
-
-
-def _step_time(row: Row) -> float:
-    return sum(float(row[stage]) for stage in STAGES)
 
 
 def main() -> int:
@@ -210,13 +219,17 @@ def main() -> int:
             after.flush()
     with file.open(newline="", encoding="utf-8") as whole:
         rows = list(csv.DictReader(whole))
-    table_rows: list[list[object]] = []
-    for kind in USUAL:
-        more, knees = table(rows, kind)
-        table_rows += more
+    tables = {kind: table(rows, kind) for kind in USUAL}
+    show(given.out / "knee.json", COLUMNS, [row for shown, _ in tables.values() for row in shown], 2)
+    trials: dict[str, set[str]] = {}
+    for row in rows:
+        trials.setdefault(row["sequence"], set()).add(row["trial"])
+    print("\nTrials:", ", ".join(f"{name} {len(of)}" for name, of in trials.items()) + ".")
+    for kind, (_, knees) in tables.items():
         for what, number in knees.items():
-            print(f"{kind}, knee of {what}: {number}", file=sys.stderr)
-    show(given.out / "knee.json", COLUMNS, table_rows, 2)
+            print(f"\nKnee of the error, {kind}, {NAMES[what]}: {number}.")
+    if not given.quick:
+        print(FOLLOWED)
     return 0
 
 
