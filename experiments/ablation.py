@@ -46,7 +46,6 @@ What follows:
 - Self-calibration earns its time on drives, several times over. Where the rig is right it does no harm.
 - Patch alignment is on for handheld cameras, which gain everywhere. Recorded drives are no better with it; the rendered
   `street` is (`association.align=true`).
-- With half as many landmarks in view, a step takes only a tenth less.
 - The detector of moving objects takes a fifth of a step, and the path needs it little here: it stays for the bodies
   that it finds. `objects.mode=off` is for scenes where nothing moves.
 - One iteration fails where frames are far apart (V1_01, `street`): the filter iterates.

@@ -107,7 +107,6 @@ class Variant:
         return SystemConfig.for_kind(sequence.kind, "surf", backend).with_settings([*case.settings, *known])
 
 
-_HALF = {"driving": ("map.target_in_view=80",), "handheld": ("map.target_in_view=40",)}
 ALL_ON = Variant("everything on")
 USUAL = Variant("default settings", base=False)
 #: In the order in which they are run; those of one tuple share the features of a trial.
@@ -115,9 +114,7 @@ GROUPS = (
     (
         ALL_ON,
         USUAL,
-        Variant("defaults, half as many in view", {"driving": _HALF["driving"], "handheld": ()}, base=False),
         Variant("no patch alignment", ("association.align=false",)),
-        Variant("half as many landmarks in view", _HALF),
         Variant("the other form of landmarks", {
             "driving": ("backend.landmarks=inverse_depth",), "handheld": ("backend.landmarks=euclidean",),
         }),

@@ -73,6 +73,7 @@ EXPERIMENTS = (
         "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
     ),
     Experiment("ablation", "recordings", "What each part is worth", left_out=("smaller in", "lost")),
+    Experiment("knee", "recordings", "How many features and landmarks"),
     Experiment(
         "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
             "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."

@@ -16,11 +16,10 @@ from slam.settings import apply_settings
 from slam.tracks.config import AssociationConfig
 
 #: Map management by kind of motion: a car does not soon return to what it has passed, and gets so much nearer to what
-#: lies ahead that descriptors change. With 200 landmarks, errors on three drives and three seeds of `street` are no
-#: larger than with 300.
+#: lies ahead that descriptors change. With more landmarks errors on drives are no smaller (`experiments/knee.py`).
 MAPS = {
     "handheld": MapConfig(),
-    "driving": MapConfig(target_in_view=150, max_landmarks=200, descriptor_update=1.0, confirmed=1, spacing=0.0),
+    "driving": MapConfig(target_in_view=100, max_landmarks=133, descriptor_update=1.0, confirmed=1, spacing=0.0),
 }
 
 #: Association by kind of motion: in a car, descriptors are updated on approach, so the angle and distance of view are
@@ -38,10 +37,10 @@ OBJECTS = {
 }
 
 #: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does; nothing comes
-#: within a metre of the cameras of a car.
+#: within a metre of the cameras of a car. More features make drives no better (`experiments/knee.py`).
 FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
     ("handheld", "surf"): {"upright": False},
-    ("driving", "surf"): {"upright": True, "min_depth": 1.0},
+    ("driving", "surf"): {"features": 600, "upright": True, "min_depth": 1.0},
 }
 
 #: Options of back ends that depend on the kind of motion: there are none.

@@ -55,6 +55,7 @@ class SurfFrontend:
         self.rig = rig
         self.config = c = from_options(SurfConfig, "surf", options)
         self._surf = Surf(c.threshold, c.octaves, c.layers, c.descriptor, c.upright, c.threads)
+        self._maps = () if rig.is_rectified else rig.rectified.maps  # made here: the first frame must not wait for them
         self._threshold = float(np.clip(c.threshold, *_THRESHOLDS))
         self._white = 0.0
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
@@ -128,11 +129,11 @@ class SurfFrontend:
 
     def _rectify(self, image: NDArray, side: int) -> NDArray:
         """Image of the rectified rig's left (0) or right (1) camera."""
-        if self.rig.is_rectified:
+        if not self._maps:
             return image
         import cv2
 
-        columns, rows = self.rig.rectified.maps[side]
+        columns, rows = self._maps[side]
         return cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
 
     def _rectified_mask(self, mask: NDArray | None) -> NDArray | None:

@@ -104,15 +104,6 @@ def _distorted(coefficients, a, b, D):
 
 
 @kernel
-def moved(poses, steps):
-    """Poses (n, 4, 4) changed on the right by tangent vectors (n, 6)."""
-    out = poses.copy()
-    for i in range(len(out)):
-        move(out[i], steps[i])
-    return out
-
-
-@kernel
 def residuals(camera, points, z, T):
     """Measured less predicted (M, 3), NaN where missing or behind, and the prediction's Jacobians (M, 3, 6) by T."""
     r, J = np.empty((len(points), 3)), np.empty((len(points), 3, 6))

@@ -7,6 +7,7 @@ matched anywhere in the image; those that agree on a fundamental matrix (RANSAC)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,13 +60,30 @@ class PairGeometry:
         return self.conclusive and most(self.off_rows, self.matches - self.off_rows)
 
 
-def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) -> PairGeometry:
+class Points(NamedTuple):
+    """What is matched of an image."""
+
+    uv: Array  # pixels (N, 2)
+    descriptors: NDArray[np.uint8]  # (N, 32), ORB's
+    image: NDArray[np.uint8]  # (H, W)
+
+
+def points_of(image: NDArray) -> Points:
+    """Points of a grey image (H, W), uint8."""
+    import cv2
+
+    orb = cv2.ORB_create(_FEATURES)  # type: ignore[attr-defined, unused-ignore]
+    found, descriptors = orb.detectAndCompute(image, None)
+    return Points(np.array([point.pt for point in found], float).reshape(-1, 2), descriptors, image)
+
+
+def pair_geometry(rig: StereoRig, left: Points, right: Points, rows: float) -> PairGeometry:
     """How the matches of two images fit the rig.
 
     Args:
         rig: the cameras.
-        left: grey image (H, W), uint8.
-        right: the same of the right camera.
+        left: points of the left image.
+        right: those of the right one.
         rows: largest row difference that the front end allows [px].
     """
     import cv2
@@ -89,7 +107,7 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         int((np.abs(b - a).max(axis=1) <= _TOLERANCE).sum()),
         int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
-        1.0 if rig.is_rectified else _shown(rig, a, b, left, right),
+        1.0 if rig.is_rectified else _shown(rig, a, b, left.image, right.image),
     )
 
 
@@ -146,15 +164,11 @@ def most(some: int, others: int) -> bool:
     return some - others > _SIGMAS * np.sqrt(some + others)
 
 
-def _matches(left: NDArray, right: NDArray) -> tuple[Array, Array]:
-    """Pixels (N, 2) of features that are each other's best match, wherever they lie."""
+def _matches(left: Points, right: Points) -> tuple[Array, Array]:
+    """Pixels (N, 2) of points that are each other's best match, wherever they lie."""
     import cv2
 
-    orb = cv2.ORB_create(_FEATURES)  # type: ignore[attr-defined, unused-ignore]
-    (points_left, a), (points_right, b) = (orb.detectAndCompute(image, None) for image in (left, right))
-    if a is None or b is None:
-        return np.zeros((0, 2)), np.zeros((0, 2))
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(a, b)
-    uv_left = np.array([points_left[m.queryIdx].pt for m in pairs], float).reshape(-1, 2)
-    uv_right = np.array([points_right[m.trainIdx].pt for m in pairs], float).reshape(-1, 2)
-    return uv_left, uv_right
+    if not (len(left.uv) and len(right.uv)):
+        return left.uv[:0], right.uv[:0]
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left.descriptors, right.descriptors)
+    return left.uv[[m.queryIdx for m in pairs]], right.uv[[m.trainIdx for m in pairs]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from slam.errors import CalibrationError, SequenceError
 from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
-from slam.input.pair import NO_DISPARITY, PairGeometry, most, pair_geometry
+from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of
 from slam.models import EstimatorModels
 from slam.tracks.state import ENOUGH_FEATURES
 
@@ -64,7 +65,7 @@ class InputWarnings:
         self._two_images = self._copied = False  # a pair of different images was seen, a copy was named
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
-        self._before: StereoFrame | None = None
+        self._before: _Images | None = None
         self._fits = np.zeros(3, int)  # matches with the right image of this frame, the next one and the one before
         for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig.left, rig.right))):
             self._warn(unlikely)
@@ -77,9 +78,9 @@ class InputWarnings:
             SequenceError: left and right are exchanged, for certain: no pair before was right, features fit the rig
                 the other way round, and hardly any has a right match as it is. Nothing is changed then.
         """
-        own = None
+        own, images = None, _Images(frame, self._rig)
         if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK:  # a power of two
-            own = self._own_geometry(frame, 10 * int(features.has_stereo.sum()) < len(features))
+            own = self._own_geometry(images, 10 * int(features.has_stereo.sum()) < len(features))
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
@@ -87,10 +88,10 @@ class InputWarnings:
         if not self._texture_is_known:
             self._check_texture(frame.left, len(features))
         if own is not None:
-            self._check_pair(frame, own)
+            self._check_pair(images, own)
         if not self._partners_are_known and frame.right is not None:
             self._check_partners(features)
-        self._before = frame
+        self._before = images
         self._count += 1
 
     def _check_intervals(self, interval: float) -> None:
@@ -135,14 +136,14 @@ class InputWarnings:
         found = f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image"
         self._warn(found + cause)
 
-    def _own_geometry(self, frame: StereoFrame, unpaired: bool) -> PairGeometry | None:
+    def _own_geometry(self, images: _Images, unpaired: bool) -> PairGeometry | None:
         """How left and right image fit, None where that is not asked; SequenceError where they are exchanged."""
-        own = None if self._pair_is_named else self._geometry(frame, frame)
+        own = None if self._pair_is_named else self._geometry(images, images)
         if own is not None and not self._pair_is_known and own.swapped and unpaired:
             raise SequenceError(_swapped(own))
         return own
 
-    def _check_pair(self, frame: StereoFrame, own: PairGeometry) -> None:
+    def _check_pair(self, images: _Images, own: PairGeometry) -> None:
         """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
         if not self._pair_is_known and (own.swapped or own.same):
             self._pair_is_named = True
@@ -151,13 +152,13 @@ class InputWarnings:
             self._pair_is_named = True  # hardly a feature fits then, and of another moment's some may by chance
             self._warn(_rows_differ(own, self._rig))
         elif self._before is not None and (not self._moment_is_known or own.as_given < _FITS * own.matches):
-            self._check_moment(frame, own)
+            self._check_moment(images, own)
         self._partners_are_known |= self._pair_is_named  # the reason is known then
 
-    def _check_moment(self, frame: StereoFrame, own: PairGeometry) -> None:
+    def _check_moment(self, images: _Images, own: PairGeometry) -> None:
         """Warn if left images fit the right ones of other frames, or else if rows do not match."""
         assert self._before is not None
-        neighbours = self._geometry(self._before, frame), self._geometry(frame, self._before)
+        neighbours = self._geometry(self._before, images), self._geometry(images, self._before)
         if neighbours[0] is not None and neighbours[1] is not None:
             self._fits += [own.as_given, neighbours[0].as_given, neighbours[1].as_given]
         fit, *others = self._fits.tolist()
@@ -180,12 +181,12 @@ class InputWarnings:
                 self._pair_is_named = True
                 self._warn(_rows_differ(own, self._rig))
 
-    def _geometry(self, left: StereoFrame, right: StereoFrame) -> PairGeometry | None:
+    def _geometry(self, left: _Images, right: _Images) -> PairGeometry | None:
         """How one frame's left image fits another's right one; None where an image is missing or unusable."""
-        if not (_is_image(left.left, self._rig) and _is_image(right.right, self._rig)):
-            return None  # the front end refuses such images, or has a format of its own
+        if left.left is None or right.right is None:
+            return None
         try:
-            return pair_geometry(self._rig, _eight_bits(left.left), _eight_bits(np.asarray(right.right)), self._rows)
+            return pair_geometry(self._rig, left.left, right.right, self._rows)
         except CalibrationError:  # the rig cannot be rectified: a front end may not need that
             self._pair_is_named = True
             return None
@@ -304,10 +305,29 @@ def shows_something(image: object) -> bool:
     return bool(image.min() != image.max())
 
 
-def _is_image(image: object, rig: StereoRig) -> bool:
-    if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
-        return False
-    return image.shape[:2] == (rig.height, rig.width) and image.shape[2:] in ((), (1,), (3,), (4,))
+class _Images:
+    """The points of a frame's images, found once, when they are asked for.
+
+    They are None where an image is missing or unusable: the front end refuses it, or has a format of its own.
+    """
+
+    def __init__(self, frame: StereoFrame, rig: StereoRig) -> None:
+        self._frame, self._rig = frame, rig
+
+    @cached_property
+    def left(self) -> Points | None:
+        return self._points(self._frame.left)
+
+    @cached_property
+    def right(self) -> Points | None:
+        return self._points(self._frame.right)
+
+    def _points(self, image: object) -> Points | None:
+        if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
+            return None
+        if image.shape[:2] != (self._rig.height, self._rig.width) or image.shape[2:] not in ((), (1,), (3,), (4,)):
+            return None
+        return points_of(_eight_bits(image))
 
 
 def _eight_bits(image: np.ndarray) -> np.ndarray:

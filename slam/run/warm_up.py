@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
+from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.registry import ONLINE, create, resolve
 from slam.runtime.compilation import compile_clock
@@ -22,8 +23,11 @@ from slam.system import StereoSlam
 _IMAGES = "synthetic:desk?frames=3&width=160&height=120"
 _SCENES = (_IMAGES, f"{_IMAGES}&rig=toedin")
 
-#: Cars that move, as features without images; a body is found in the seventh frame.
-_BODIES = "synthetic:street?frames=9&density=5"
+#: Features asked for: fewer than there are, so that some are chosen, as in larger images.
+_FEATURES = 40
+
+#: Cars that move, as features without images: long enough that a body is found, and frames leave its window.
+_BODIES = "synthetic:street?frames=12&density=5"
 
 _POLL = 0.2  # cost: between two looks at what the other process has compiled [s]
 
@@ -58,13 +62,15 @@ def warm_up(*backends: str, until: threading.Event | None = None) -> float:
 def _with_images(backend: str) -> Iterator[FrameResult]:
     for scene in _SCENES:
         sequence = open_sequence(scene)
-        yield from (result for _, result in StereoSlam(sequence.rig, backend=backend).run(sequence))
+        config = SystemConfig.for_kind(sequence.kind).with_settings({"frontend.features": _FEATURES})
+        yield from (result for _, result in StereoSlam(sequence.rig, backend=backend, config=config).run(sequence))
 
 
 def _with_bodies(backend: str) -> Iterator[FrameResult]:
     world = open_sequence(_BODIES)
     system = StereoSlam(world.rig, None, backend, kind=world.kind)
     yield from (system.process_features(seen.features) for seen in world.observe())  # type: ignore[attr-defined]
+    system.estimate()
 
 
 def compile_kernels(backend: str, frontend: str = "surf") -> None:

@@ -13,7 +13,7 @@ import slam
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import SequenceError
 from slam.geometry.camera import PinholeCamera
-from slam.input.pair import pair_geometry
+from slam.input.pair import pair_geometry, points_of
 from slam.input.warnings import InputWarnings, farthest_apart
 from slam.models import models_for
 
@@ -140,11 +140,20 @@ def test_swapped_cameras_of_an_unrectified_rig():
     left = PinholeCamera(250.0, 251.0, 170.0, 110.0, 320, 240, "radtan", (-0.1, 0.02, 0.001, 0.0))
     right = PinholeCamera(255.0, 256.0, 150.0, 130.0, 320, 240, "radtan", (-0.12, 0.02, 0.0, 0.001))
     rig = slam.StereoRig(left, right, turn, turn.T @ np.array([-0.12, 0.004, 0.002]))
-    views = [seen_by(image, c, R) for image, c, R in ((FRAME.left, left, np.eye(3)), (FRAME.right, right, turn))]
+    views = [points_of(seen_by(image, c, R)) for image, c, R in ((FRAME.left, left, np.eye(3)), (FRAME.right, right, turn))]
     rig = slam.StereoRig(left, right, turn, RIG.b)
     good, bad = pair_geometry(rig, *views, 1.5), pair_geometry(rig, *views[::-1], 1.5)
     assert good.conclusive and not good.swapped and not good.rows_differ
     assert bad.swapped
+
+
+def test_points_of_an_image_are_found_once(monkeypatch):
+    """Else the second frame of a live run, which is compared with the first one too, takes longer than two frames."""
+    found, name = [], "slam.input.warnings.points_of"
+    monkeypatch.setattr(name, lambda image: found.append(image.ctypes.data) or points_of(image))
+    frames = [replace(f, left=f.left.copy(), right=f.right.copy()) for f in stamped(0.05 * np.arange(3))]
+    assert lines(frames) == []
+    assert len(found) == len(set(found)) == 6
 
 
 @pytest.mark.parametrize("shift", [-9, 4])

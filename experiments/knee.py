@@ -1,0 +1,238 @@
+"""How many measurements carry information: errors, NEES and cost over the numbers of features and of landmarks in view.
+
+    [SLAM_DATA=/path/to/data] python experiments/knee.py [--quick] [--trials 3] [--sequences NAME …] [--out DIR]
+
+Each recording and world is run several times, with another first frame and pixel noise of half a grey level, a world
+with another seed as well (`experiments/perturbations.py`): with each number of features at the usual number of
+landmarks in view, and with each number of landmarks at the usual number of features. Runs are appended to
+``knee.csv`` as they end, and a later call goes on with those that are missing.
+
+Printed are, for each kind of motion, ratios to the runs with both usual numbers: of the online error, geometric means
+over sequences, trials and back ends, with the standard error of that mean; of NEES; of the frames in which bodies are
+followed, all bodies together; and of CPU times of a frame, for extraction and for all that follows. The knee of the
+error is the least number whose error is larger than the smallest by no more than the standard error of the difference.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import slam
+from experiments.ablation_parts import RECORDED, Case, error_of, opened
+from experiments.common import script_options
+from experiments.perturbations import NONE, frames_of
+from experiments.tables import show
+from frontends import create
+from slam.config import SystemConfig
+from slam.data import StereoFeatures
+from slam.evaluation.summary import consistency
+from slam.run.summary import RunRecord
+from slam.runtime import stages
+from slam.sequences import Sequence
+from slam.system import StereoSlam
+
+BACKENDS = ("ekf", "window")
+#: Worlds are rendered so large that there are as many features as are asked for.
+CASES = (
+    *RECORDED[:-1],
+    Case("desk", "synthetic:desk?frames=60&width=752&height=480", 60),
+    Case("street", "synthetic:street?frames=45&width=752&height=300", 45, 10),
+    RECORDED[-1],
+)
+FEATURES = {"driving": (300, 450, 600, 800, 1100), "handheld": (400, 600, 800)}
+IN_VIEW = {"driving": (60, 100, 150, 220), "handheld": (50, 80, 120)}
+USUAL = {"driving": (800, 150), "handheld": (800, 80)}  # both numbers: each is kept while the other changes
+ROOM = 4 / 3  # driving: size of the map over the landmarks in view
+HEADER = ("sequence", "kind", "trial", "back end", "asked", "in view", "error", "NEES", "lost", "features", "measured",
+          "bodies", "extract", "step")  # fmt: skip
+COLUMNS = ("kind", "what", "number", "error", "±", "ekf", "window", "largest", "NEES", "bodies", "measured",
+           "CPU extract", "CPU ekf", "CPU window")  # fmt: skip
+
+NAMES = {"asked": "features", "in view": "landmarks in view"}
+#: What was decided by these tables, without figures: they are above it.
+FOLLOWED = """
+On drives the landmarks in view are at the knee. There are more features than the path needs in the mean: with the
+fewest, a drive is much farther off, and moving cars are followed for fewer frames. For hand-held cameras the usual
+numbers stay: MH_01 is as good with fewer of both, V1_01 and the desk are not. Nothing moves there: bodies are false.
+"""
+
+Row = dict[str, str]
+Key = tuple[str, str, str, str, str]  # the columns that tell a run from others, without the kind
+
+
+class Run:
+    """One system on one sequence."""
+
+    def __init__(self, sequence: Sequence, case: Case, frontend: object, backend: str, in_view: int) -> None:
+        config = SystemConfig.for_kind(sequence.kind, "surf", backend).with_settings(case.settings)
+        largest = round(ROOM * in_view) if sequence.kind == "driving" else max(config.map.max_landmarks, in_view)
+        wanted = {"map.target_in_view": in_view, "map.max_landmarks": largest}
+        self.system = StereoSlam(sequence.rig, frontend, backend, config=config.with_settings(wanted))
+        self.sequence, self.case, self.record = sequence, case, RunRecord()
+        self.counts: list[tuple[float, ...]] = []  # features, landmarks measured, CPU time [ms]
+        self.bodies = 0
+        self.failed = False
+
+    def step(self, number: int, features: StereoFeatures) -> None:
+        """A frame; nothing after one that ended the run."""
+        if self.failed:
+            return
+        try:
+            result = self.system.process_features(features)
+        except slam.SlamError as error:
+            print(f"{self.case.name}: {error}", file=sys.stderr, flush=True)
+            self.failed = True
+            return
+        self.record.add(number, result)
+        self.counts.append((len(features), len(result.matched), sum(result.milliseconds.values())))
+        self.bodies += len(result.objects)
+
+    def figures(self) -> list[float]:
+        """Error [m], NEES, frames without a measured pose, features and landmarks measured (medians), bodies, times."""
+        if self.failed:
+            return [float("nan")] * 7
+        measured = np.array(self.record.measured)
+        path, rows = self.record.trajectory.select(measured), np.flatnonzero(measured)
+        common = [self.record.common[row] for row in rows]
+        nees = consistency(path, np.array(self.record.covariances)[rows], self.sequence, common)
+        figures = error_of(path, self.sequence), nees.get(f"NEES over {self.case.over} m", float("nan"))
+        middle = np.median(self.counts, axis=0)
+        return [*figures, int((~measured).sum()), *middle[:2], self.bodies, *middle[2:].round(2)]
+
+
+def settings(kind: str) -> dict[int, list[int]]:
+    """Numbers of landmarks in view that are run with each number of features."""
+    features, in_view = USUAL[kind]
+    wanted = {number: [in_view] for number in FEATURES[kind]}
+    wanted[features] = sorted({in_view, *IN_VIEW[kind]})
+    return wanted
+
+
+def runs(cases: list[Case], trials: int, done: set[Key]) -> Iterator[list[object]]:
+    """The rows that are missing, trial by trial; all runs with one number of features get the same ones."""
+    for trial, case in ((t, c) for t in range(trials) for c in cases if t < c.trials):
+        sequence = opened(case, trial)
+        if sequence is None:
+            continue
+        kind, frames = sequence.kind, None
+        for asked, numbers in settings(kind).items():
+            both = [(b, n) for n in numbers for b in BACKENDS]
+            wanted = [(b, n) for b, n in both if (case.name, str(trial), b, str(asked), str(n)) not in done]
+            if not wanted:
+                continue
+            frames = frames or list(frames_of(sequence, NONE, case.frames, trial))
+            frontend = create("surf", sequence.rig, **{**SystemConfig.for_kind(kind).frontend, "features": asked})
+            systems = [Run(sequence, case, frontend, *one) for one in wanted]
+            extraction = []
+            for number, frame in enumerate(frames):
+                start = time.process_time()
+                features = frontend.extract(frame)
+                extraction.append(1e3 * (time.process_time() - start))
+                for system in systems:
+                    system.step(number, features)
+            for (backend, in_view), system in zip(wanted, systems):
+                figures, took = system.figures(), round(float(np.median(extraction)), 2)
+                yield [case.name, kind, trial, backend, asked, in_view, *figures[:6], took, *figures[6:]]
+
+
+Runs = dict[tuple[str, str, str], dict[int, Row]]  # rows by number, of each sequence, trial and back end
+
+
+def table(rows: list[Row], kind: str) -> tuple[list[list[object]], dict[str, int]]:
+    """Figures over both numbers, for one kind of motion; and the knees."""
+    out: list[list[object]] = []
+    knees = {}
+    for what, fixed, usual in (("asked", "in view", USUAL[kind]), ("in view", "asked", USUAL[kind][::-1])):
+        own = [row for row in rows if row["kind"] == kind and row[fixed] == str(usual[1])]
+        numbers = sorted({int(row[what]) for row in own})
+        found: Runs = {}
+        for row in own:
+            found.setdefault((row["sequence"], row["trial"], row["back end"]), {})[int(row[what])] = row
+        found = {key: by for key, by in found.items() if len(by) == len(numbers)}
+        if found:
+            logs = np.log([[float(by[n]["error"]) for n in numbers] for by in found.values()])
+            knees[what] = numbers[_knee(logs)]
+            out += ([kind, NAMES[what], number, *figures(found, number, usual[0])] for number in numbers)
+    return out, knees
+
+
+def figures(found: Runs, number: int, usual: int) -> list[object]:
+    """The columns of a number, from the error on."""
+
+    def ratios(column: str, backend: str = "") -> np.ndarray:
+        pairs = [(by[number], by[usual]) for key, by in found.items() if backend in ("", key[2])]
+        return np.array([float(own[column]) / float(base[column]) for own, base in pairs])
+
+    def mean(logs: np.ndarray) -> float:
+        return float(np.exp(np.nanmean(logs)))
+
+    log = np.log(ratios("error"))
+    cases = {name: np.median(log[[key[0] == name for key in found]]) for name, _, _ in found}
+    worst = max(cases, key=lambda name: cases[name])
+    bodies = (sum(float(by[n]["bodies"]) for by in found.values()) for n in (number, usual))
+    return [
+        mean(log), _scatter(log), *(mean(np.log(ratios("error", b))) for b in BACKENDS),
+        f"{np.exp(cases[worst]):.2f} {worst}", float(np.nanmedian(ratios("NEES"))), next(bodies) / max(next(bodies), 1),
+        round(float(np.nanmedian([float(by[number]["measured"]) for by in found.values()]))),
+        float(np.nanmedian(ratios("extract"))), *(float(np.nanmedian(ratios("step", b))) for b in BACKENDS),
+    ]  # fmt: skip
+
+
+def _scatter(ratio: np.ndarray) -> float:
+    """Standard error of a mean."""
+    known = ratio[np.isfinite(ratio)]
+    return float(np.std(known, ddof=1) / np.sqrt(len(known))) if len(known) > 1 else float("nan")
+
+
+def _knee(logs: np.ndarray) -> int:
+    """Column of the least number whose error is no larger than the smallest, within their difference's error."""
+    best = int(np.argmin(np.nanmean(logs, axis=0)))
+    differences = [logs[:, k] - logs[:, best] for k in range(best + 1)]
+    return next(k for k, d in enumerate(differences) if k == best or np.nanmean(d) <= _scatter(d))
+
+
+def main() -> int:
+    parser = script_options(__file__, __doc__, "one trial of twelve frames of one world")
+    parser.add_argument("--trials", type=int, default=3, help="runs of each sequence")
+    parser.add_argument("--sequences", nargs="*", metavar="NAME", help="these alone")
+    given = parser.parse_args()
+    cases = [case for case in CASES if not given.sequences or case.name in given.sequences]
+    if given.quick:
+        cases = [Case("desk", "synthetic:desk?frames=12", 12)]
+    file = given.out / ("quick.csv" if given.quick else "knee.csv")
+    given.out.mkdir(parents=True, exist_ok=True)
+    if not file.exists():
+        file.write_text(",".join(HEADER) + "\n", encoding="utf-8")
+    with file.open(newline="", encoding="utf-8") as before:
+        done = {(r["sequence"], r["trial"], r["back end"], r["asked"], r["in view"]) for r in csv.DictReader(before)}
+    stages.working_time = time.process_time
+    with file.open("a", newline="", encoding="utf-8") as after:
+        for row in runs(cases, 1 if given.quick else given.trials, done):
+            csv.writer(after).writerow(row)
+            after.flush()
+    with file.open(newline="", encoding="utf-8") as whole:
+        rows = list(csv.DictReader(whole))
+    tables = {kind: table(rows, kind) for kind in USUAL}
+    show(given.out / "knee.json", COLUMNS, [row for shown, _ in tables.values() for row in shown], 2)
+    trials: dict[str, set[str]] = {}
+    for row in rows:
+        trials.setdefault(row["sequence"], set()).add(row["trial"])
+    print("\nTrials:", ", ".join(f"{name} {len(of)}" for name, of in trials.items()) + ".")
+    for kind, (_, knees) in tables.items():
+        for what, number in knees.items():
+            print(f"\nKnee of the error, {kind}, {NAMES[what]}: {number}.")
+    if not given.quick:
+        print(FOLLOWED)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
