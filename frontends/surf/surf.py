@@ -87,9 +87,10 @@ class Surf:
             >>> Surf.create(400).config.octaves
             4
         """
-        if extended:
-            raise ConfigurationError("extended: there are no descriptors of 128 numbers; extended=False gives 64")
-        return cls(hessianThreshold, nOctaves, nOctaveLayers, 64, upright)
+        surf = cls(hessianThreshold, nOctaves, nOctaveLayers, 64)
+        surf.setUpright(upright)
+        surf.setExtended(extended)
+        return surf
 
     def detect(
         self, image: NDArray | Picture, mask: NDArray | None = None, threshold: float | None = None
@@ -203,6 +204,58 @@ class Surf:
             raise ConfigurationError("useProvidedKeypoints: use compute(image, keypoints)")
         keypoints, described = self.detect_and_describe(image, mask)
         return tuple(keypoints), described
+
+    def getHessianThreshold(self) -> float:
+        """Least determinant of the Hessian."""
+        return self.config.threshold
+
+    def setHessianThreshold(self, hessianThreshold: float) -> None:
+        """Set it; raises ConfigurationError for a value out of range, as the other setters do."""
+        self.config = replace(self.config, threshold=hessianThreshold)
+
+    def getNOctaves(self) -> int:
+        """Number of octaves."""
+        return self.config.octaves
+
+    def setNOctaves(self, nOctaves: int) -> None:
+        """Set it, 1 to 4."""
+        self.config = replace(self.config, octaves=nOctaves)
+
+    def getNOctaveLayers(self) -> int:
+        """Layers searched for maxima in each octave."""
+        return self.config.layers
+
+    def setNOctaveLayers(self, nOctaveLayers: int) -> None:
+        """Set it, 2 or 3."""
+        self.config = replace(self.config, layers=nOctaveLayers)
+
+    def getUpright(self) -> bool:
+        """Whether the orientation is left out."""
+        return self.config.upright
+
+    def setUpright(self, upright: bool) -> None:
+        """Set it; a whole number is taken as OpenCV does: 0 is False, others are True."""
+        number = isinstance(upright, (int, np.integer, np.bool_))
+        self.config = replace(self.config, upright=bool(upright) if number else upright)
+
+    def getExtended(self) -> bool:
+        """Whether descriptors have 128 numbers: never."""
+        return False
+
+    def setExtended(self, extended: bool) -> None:
+        """Raises ConfigurationError for True."""
+        if extended:
+            raise ConfigurationError("extended: there are no descriptors of 128 numbers; extended=False gives 64")
+
+    def descriptorSize(self) -> int:
+        """Numbers in a descriptor."""
+        return self.config.descriptor
+
+    def defaultNorm(self) -> int:
+        """OpenCV's name for the distance of descriptors: Euclidean."""
+        import cv2
+
+        return int(cv2.NORM_L2)
 
 
 def _mostly_inside(rows: NDArray[np.float64], mask: NDArray) -> NDArray[np.bool_]:

@@ -10,7 +10,6 @@ import pytest
 
 import frontends.surf
 from frontends.surf import Keypoints, Surf
-from frontends.surf.config import SurfConfig
 from slam.errors import ConfigurationError, SequenceError
 from tests.frontends.test_surf import IMAGE
 
@@ -62,24 +61,42 @@ def test_the_arguments_and_defaults_are_opencv_s():
     expected = {"hessianThreshold": 100.0, "nOctaves": 4, "nOctaveLayers": 3, "extended": False, "upright": False}
     assert {name: p.default for name, p in parameters.items()} == expected
     surf = frontends.surf.create(400, 3, 2, False, True)
-    assert isinstance(surf, Surf)
-    assert surf.config == SurfConfig(threshold=400.0, octaves=3, layers=2, upright=True, threads=1)
+    got = surf.getHessianThreshold(), surf.getNOctaves(), surf.getNOctaveLayers(), surf.getExtended(), surf.getUpright()
+    assert got == (400.0, 3, 2, False, True)
+    assert isinstance(surf, Surf) and surf.descriptorSize() == 64
+    assert surf.defaultNorm() == cv2.SIFT_create().defaultNorm()
+
+
+def test_setters_change_what_is_found():
+    surf = frontends.surf.create()
+    many = len(surf.detect(IMAGE))
+    surf.setHessianThreshold(hessianThreshold=5000)
+    surf.setNOctaves(nOctaves=2)
+    surf.setNOctaveLayers(nOctaveLayers=2)
+    surf.setUpright(upright=1)
+    surf.setExtended(extended=False)
+    keypoints, descriptors = surf.detectAndCompute(IMAGE)
+    other, same = Surf(5000, 2, 2).detectAndCompute(IMAGE)
+    assert 0 < len(keypoints) < many
+    assert len(other) == len(keypoints) and np.array_equal(descriptors, same)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("hessianThreshold", -1, "threshold must be"),
-        ("hessianThreshold", "a", "threshold must be"),
-        ("nOctaves", 5, "octaves must be .* from 1 to 4"),
-        ("nOctaveLayers", 4, "layers must be .* from 2 to 3"),
-        ("upright", "no", "upright must be"),
-        ("extended", True, "no descriptors of 128 numbers"),
+        ("HessianThreshold", -1, "threshold must be"),
+        ("HessianThreshold", "a", "threshold must be"),
+        ("NOctaves", 5, "octaves must be .* from 1 to 4"),
+        ("NOctaveLayers", 4, "layers must be .* from 2 to 3"),
+        ("Upright", "no", "upright"),
+        ("Extended", True, "no descriptors of 128 numbers"),
     ],
 )
 def test_what_this_surf_does_not_have_is_refused(name, value, words):
+    surf = frontends.surf.create()
     with pytest.raises(ConfigurationError, match=words):
-        frontends.surf.create(**{name: value})
+        getattr(surf, f"set{name}")(value)
+    assert getattr(surf, f"get{name}")() == getattr(frontends.surf.create(), f"get{name}")()
 
 
 def test_detect_and_compute_takes_opencv_s_arguments():
