@@ -35,17 +35,16 @@ def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
 
 @contextmanager
 def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[FrameResult], None]]:
-    """A progress bar over frames, without an end where `total` is None; it appears with the first one.
+    """One line over frames, without an end where `total` is None; it appears with the first one.
 
-    Kernels that have to be compiled have a bar of their own above it. Their number is that of modules loaded so far.
+    While kernels are compiled the line says so, and how many are done.
     """
     bar = _bar(TextColumn("{task.fields[status]}"), quiet=quiet, get_time=working_time)
-    kernels = bar.add_task("compiling, once on this machine", total=None, status="", visible=False)
     task = bar.add_task(title, total=total, status="", visible=False)
 
     def compiling(done: int, of: int) -> None:
         bar.start()
-        bar.update(kernels, completed=done, total=of, visible=True)
+        bar.update(task, status=f"compiling {done}/{of}, once", visible=True)
 
     def frame(result: FrameResult) -> None:
         bar.start()

@@ -118,6 +118,10 @@ _OF_BODIES = {
 }
 
 
+#: Why no NEES is known: in the map of an earlier run, and elsewhere.
+_IN_MAP = (
+    "covariances are not judged in a prior map: all poses share its errors, which the truth of this run does not tell"
+)
 _NOT_JUDGED = (
     "covariances cannot be judged: they leave none for the motion between two poses, as where a back end claims the "
     "same one for every frame"
@@ -233,7 +237,7 @@ def verdict_of_run(summary: Mapping[str, Any]) -> str:
     """`verdict` on a run by its summary, with what it leaves out; empty where no true path is known."""
     text, honest = verdict(figures(summary)), summary.get("consistency") or {}
     if not text:
-        return _NOT_JUDGED if honest.get("dof") else ""
+        return "" if not honest.get("dof") else _IN_MAP if _at(summary, ("loops", "known")) else _NOT_JUDGED
     if "are too large" in text and honest.get(EXACT):
         text += "; they count errors of the calibration, and this world's cameras have none"
     if left_out := summary["frames"] - _measured(summary):

@@ -21,6 +21,15 @@ STAGE_NAMES = {
 }
 STAGES = tuple(STAGE_NAMES)
 
+#: Colours of bodies (red, green, blue); none is that of a path, a landmark or a loop.
+_BODY_COLOURS = (216, 27, 96), (142, 36, 170), (0, 137, 123), (109, 76, 65), (130, 119, 23)
+
+
+def body_colour(body: int) -> tuple[int, int, int]:
+    """The colour (red, green, blue) of a moving body in images, maps and the viewer, by its id."""
+    return _BODY_COLOURS[(body - 1) % len(_BODY_COLOURS)]
+
+
 #: Frames of coordinates.
 FRAMES = {
     "world": "the left camera's axes in the first frame, x right, y down, z forward; in a prior map, the map's world",
