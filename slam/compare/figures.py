@@ -12,11 +12,6 @@ import numpy as np
 from slam.compare.plan import is_world
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
-from slam.compare.trial import SERIES, SERIES_COLUMNS
-from slam.errors import SlamError
-from slam.evaluation.metrics import chi_square_band
-from slam.files import read_numbers
-from slam.geometry.se3 import Array
 from slam.run.panels import backend_colours
 from slam.run.plots import drawn
 from slam.run.results import BY_KEY
@@ -47,11 +42,6 @@ def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
     if "nees_per_dof" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
         yield "Error over time", text, _svg(drawn(runs, "errors"))
-        text = (
-            "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
-            "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
-        )
-        yield "NEES over time", text, _nees(group)
 
 
 def _example(group: Group) -> dict[str, Run]:
@@ -78,42 +68,6 @@ def _pairs(group: Group) -> str:
     low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
     axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
     return _svg(figure)
-
-
-def _nees(group: Group) -> str:
-    """NEES / 6 over time, mean over the trials whose pose was measured, with the 95 % band of as many trials."""
-    from matplotlib.ticker import LogLocator
-
-    figure, axis = _axes(2.8)
-    fewest = group.trials
-    for (name, runs), colour in zip(group.runs.items(), backend_colours(list(group.runs))):
-        every = [_series(run) for run in runs if run.completed]
-        if not every:
-            continue
-        fewest = min(fewest, len(every))
-        length = min(map(len, every))
-        nees = np.ma.masked_invalid([rows[1:length, 1] for rows in every])
-        t = (every[0][:, 0] - every[0][0, 0])[1:length]
-        axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=colour, lw=1.2, label=name)
-    axis.axhline(1, color="0.3", lw=0.8, ls="--", label="expected")
-    low, high = chi_square_band(6, fewest)
-    band = f"95 % band if consistent, mean of {fewest} trial{'s' if fewest > 1 else ''}"
-    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=band)
-    axis.set_yscale("log")
-    bottom, top = axis.get_ylim()
-    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top > 10 * bottom else (0.6, 0.8, 1, 1.5, 2, 3, 4)))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter("")
-    axis.set(xlabel="time [s]", ylabel="NEES / 6")
-    return _svg(figure)
-
-
-def _series(run: Run) -> Array:
-    """A run's rows of `SERIES_COLUMNS`; raises SlamError where the file cannot be read, or has no row."""
-    rows = read_numbers(run.folder / SERIES, len(SERIES_COLUMNS))
-    if not len(rows):
-        raise SlamError(f"{run.folder / SERIES}: has no row")
-    return rows
 
 
 def _style() -> AbstractContextManager[None]:

@@ -18,7 +18,9 @@ from slam.run.schema import STAGE_NAMES, body_colour
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#00838f", "iekf": "#ad1457"}
+
+#: Dark below, light above: ekf and window often coincide, and both should be seen.
+_BACKENDS = {"ekf": "#0d47a1", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#26c6da", "iekf": "#ad1457"}
 _OTHERS = ("#2e7d32", "#c62828", "#5d4037", "#9e9d24")
 _TRUTH, _BEFORE, _NOT_NOW, _NOW = "0.3", "0.8", "#9fa8da", "#283593"
 _LOOPS = ("o", "k", "loops closed"), ("x", "#c62828", "loops refused")

@@ -6,6 +6,7 @@ A row has the figure's name, unit, place in the summary, and which way is better
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -142,7 +143,7 @@ def facts(summary: Mapping[str, Any]) -> str:
     found = _of_run(summary) if summary else {}
     shown = [m for m in _OF_RUN if m.key in _IN_PICTURE and found.get(m.key)]
     words = [f"{m.label} {_length(found[m.key], m)}".rstrip() for m in shown]
-    return "; ".join([*words, *filter(None, [verdict_of_run(summary)])])
+    return "; ".join([*words, *filter(None, [re.sub(r" \([^)]*\)", "", verdict_of_run(summary))])])
 
 
 def _length(value: float, metric: Metric) -> str:
