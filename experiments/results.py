@@ -226,16 +226,15 @@ def page_head(name: str, quick: bool) -> str:
 
 
 def first_page() -> str:
-    """A screen: the README's table of recordings, whose figures tests compare with the pages; pictures; the pages."""
+    """A screen: what the README says of recordings; pictures; the pages."""
     text = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Results\n")[2].partition("\n## ")[0]
-    table = text.strip().partition("\n\n[NEES]")[0].replace("](docs/", "](")
+    recordings = text.strip().partition("\n\nOn worlds")[0].replace("](docs/", "](")
     captions = {(e.name, name): said for e in EXPERIMENTS for name, said in (e.pictures or {}).items()}
     pictures = [f"![{captions.get(shown, shown[0])}](images/results/{'_'.join(shown)}.png)" for shown in SHOWN]
     pages = [f"- [{title}](results/{name}.md): {question}" for name, (title, question) in PAGES.items()]
-    right = "NEES says whether [covariances](concepts.md#evaluation) are as large as the errors: 6 is right."
     used = ", ".join(f"{package} {version}" for package, version in versions().items())
     made = f"Written by `python experiments/results.py`, with {used}."
-    return "\n\n".join(["# Results", table, right, *pictures, "\n".join(pages), made]) + "\n"
+    return "\n\n".join(["# Results", recordings, *pictures, "\n".join(pages), made]) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
