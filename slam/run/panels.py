@@ -121,8 +121,8 @@ def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
         if len(rows):
             axis.plot(*final[rows[:, 0]].T, mark, ms=6, mfc="none", color=shade, label=label)
     for body, positions in run.bodies.items():
-        colour = np.array(body_colour(int(body))) / 255
-        axis.plot(*positions[:, [0, 2]].T, "-s", ms=5, lw=1.5, markevery=[-1], color=colour, label=f"body {body}")
+        rgb = np.array(body_colour(int(body))) / 255
+        axis.plot(*positions[:, [0, 2]].T, "-s", ms=5, lw=1.5, markevery=[-1], color=rgb, label=f"body {body}")
     if run.truth is not None:
         axis.plot(*transform(place_of_truth(run), run.truth.positions)[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0,
                   label="true path")  # fmt: skip
