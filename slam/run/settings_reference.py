@@ -37,7 +37,7 @@ def settings() -> Iterator[Setting]:
     for f in fields(SystemConfig):
         if f.name not in _PARTS:
             parts = {kind: getattr(config, f.name) for kind, config in configs.items()}
-            yield from (s for s in _of_class(parts, f.name, "") if can_be_set(s.key, ""))
+            yield from (s for s in _of_class(parts, f.name) if can_be_set(s.key))
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
             yield from options_of(section, name)
@@ -58,23 +58,16 @@ def options_of(section: str, name: str) -> Iterator[Setting]:
             yield Setting(key, name, defaults, *documented(described).get(option, ("", "")))
 
 
-def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
+def _of_class(configs: dict[str, Any], section: str) -> Iterator[Setting]:
     """Settings of one configuration class, given its instances by kind of motion."""
     first = next(iter(configs.values()))
     texts = documented(type(first))
     for f in fields(first):
         values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
         if is_dataclass(getattr(first, f.name)):
-            yield from _of_class(values, key, owner)
+            yield from _of_class(values, key)
         else:
-            yield Setting(key.lstrip("."), owner, values, *texts.get(f.name, ("", "")))
-
-
-def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
-    """Unit and meaning of each setting of a configuration below `section`, by key; nothing of another object."""
-    if not is_dataclass(config) or isinstance(config, type):
-        return {}
-    return {s.key: {"unit": s.unit, "meaning": s.text} for s in _of_class({"": config}, section, "") if "." in s.key}
+            yield Setting(key, "", values, *texts.get(f.name, ("", "")))
 
 
 def documented(kind: Any) -> dict[str, tuple[str, str]]:
