@@ -230,8 +230,9 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     others = [f"{over} {number(ratios[over])} times: {word}" for over, word in said.items() if word != said[judged]]
     word = f"are {said[judged]}" if said[judged] != "right" else "hold in part" if others else "hold"
     of = "runs" if runs == 1 else f"means of {runs} runs"
-    times = f"{judged} errors of the pose are {number(ratio)} times what they claim ({low:.2f} to {high:.2f} in 95 % of {of})"
-    return "; ".join([f"covariances {word}: {times}", *others])
+    times = f"{judged} errors of the pose are {number(ratio)} times what they claim"
+    band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
+    return "; ".join([f"covariances {word}: {times} {band}", *others])
 
 
 def verdict_of_run(summary: Mapping[str, Any]) -> str:
