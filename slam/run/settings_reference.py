@@ -51,10 +51,10 @@ def options_of(section: str, name: str) -> Iterator[Setting]:
     """
     known = registry.options_of(registry.resolve(f"{section}s", name), _RIG) or {}
     for option, (default, described) in known.items():
-        key, named = f"{section}.{option}", {section: name}
+        key = f"{section}.{option}"
         if can_be_set(key, name):
-            own = {kind: getattr(SystemConfig.for_kind(kind, **named), section) for kind in KINDS}
-            defaults = {kind: options.get(option, default) for kind, options in own.items()}
+            configs = {kind: SystemConfig.for_kind(kind, name if section == "frontend" else None) for kind in KINDS}
+            defaults = {kind: getattr(config, section).get(option, default) for kind, config in configs.items()}
             yield Setting(key, name, defaults, *documented(described).get(option, ("", "")))
 
 
