@@ -77,7 +77,6 @@ EXPERIMENTS = (
         "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
             "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."
         },
-        left_out=("frames inside", "leaves at", "pixel NIS"),
     ),
     Experiment(
         "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "4"), pictures={
@@ -130,8 +129,6 @@ EXPERIMENTS = (
         "loops", "loops", "Long drives that come back: loops closed",
         arguments=("--paths", "00", "05", "06", "07", "09", "--set", *loops.QUICK),
         pictures={"loops": "From above: true, without loops, and at the end with loops; circles: loops closed."},
-        left_out=("keyframes", "places found again [%]", "final length [%]", "memory [kB a frame]", "median frame [ms]",
-                  "without, scale fitted [m]", "final, scale fitted [m]"),
     ),
     Experiment(
         "faults", "faults", "Blackout, dropped frames, a kidnapped camera",
