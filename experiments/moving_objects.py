@@ -271,11 +271,8 @@ def cyclist_rows(
         for number in sorted({number for cars in labels.values() for number in cars})
     }
     measured, ids, false = {number: set[int]() for number in near}, {number: set[int]() for number in near}, set[int]()
-    unmeasured = count = 0
     for k, result in enumerate(results, first):
         for thing in result.objects:
-            count += 1
-            unmeasured += not thing.estimate.measured
             if thing.estimate.measured:
                 number = nearest_car(labels.get(k, {}), seen_centre(result, thing))
                 if number < 0 or labels[k][number].kind not in ("Cyclist", "Tram"):
@@ -287,7 +284,6 @@ def cyclist_rows(
         {
             "back end": backend, "cyclist": number, f"frames within {NEAR:.0f} m": len(frames),
             "measured": len(measured[number]), "ids": len(ids[number]), "false objects [frames]": len(false),
-            "not measured [rows]": unmeasured, "rows": count,
         }
         for number, frames in near.items() if frames
     ]  # fmt: skip
@@ -331,9 +327,8 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
         true = np.nanmedian([labelled_speed(labels, poses, stamps, car, k) for k, _ in near] or [np.nan])
         rows.append({
             "back end": backend, "object": id, "car": car, "frames": f"{history[0][0]}-{history[-1][0]}",
-            "measured": len(history), "speed within 25 m [m/s]": float(own), "labelled [m/s]": float(true),
+            "measured": len(history), "speed within 25 m [m/s]": float(own),
             "error [%]": float(100 * abs(own / true - 1)), "ATE [m]": None,
-            "objects [ms]": float(np.median([r.milliseconds["objects"] for r in results])),
         })  # fmt: skip
     return rows
 

@@ -38,7 +38,7 @@ from slam.system import StereoSlam
 _DAY = "kitti_raw/2011_09_26/2011_09_26_drive_"
 DRIVES = {"KITTI 06": "kitti_odometry/sequences/06", "raw 0001": f"{_DAY}0001_sync", "raw 0013": f"{_DAY}0013_sync"}
 SPOILT = ("KITTI 06", "raw 0001")  # drives that are run with spoilt images
-FIGURES = (*(f"ATE {name} [m]" for name in ONLINE), "lost")
+FIGURES = tuple(f"ATE {name} [m]" for name in ONLINE)
 
 _FIRST = 5  # frames that may be left out at the beginning
 _FEATURES = 0.2  # by how much the number of features may differ
@@ -161,21 +161,6 @@ def backwards(drive: Sequence, last: int) -> Drive:
     return Drive(drive.kind, drive.rig, turned, frames)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Of one run.
-
-    Attributes:
-        ate: of the poses that were measured [m].
-        frames: number of frames.
-        lost: frames without a measured pose.
-    """
-
-    ate: float
-    frames: int
-    lost: int
-
-
 def frames_of(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -> Iterator[StereoFrame]:
     """The frames of one trial; no frame depends on which others are taken."""
     first = np.random.default_rng(trial).integers(_FIRST)
@@ -201,25 +186,24 @@ def extracted(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -
     return [frontend.extract(frame) for frame in frames_of(sequence, fault, last, trial)]
 
 
-def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str) -> Outcome:
-    """One back end on one trial."""
+def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str) -> float:
+    """One back end on one trial: error of the path [m]."""
     system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, "surf", backend))
     results = [system.process_features(one) for one in features]
     measured = [r.estimate for r in results if r.status in MEASURED]
     path = Trajectory(np.array([e.stamp for e in measured]), np.array([e.T_world_left for e in measured]))
     ate = evaluate(path, sequence).get("ATE RMSE [m]") if len(measured) > 2 else None
-    return Outcome(float("nan") if ate is None else float(ate), len(results), len(results) - len(measured))
+    return float("nan") if ate is None else float(ate)
 
 
 def figures(fault: Fault, sequence: Drive | Sequence, last: int, trials: int) -> list[object]:
     """The figures of a row, in the order of `FIGURES`."""
-    outcomes: dict[str, list[Outcome]] = {backend: [] for backend in ONLINE}
+    ates: dict[str, list[float]] = {backend: [] for backend in ONLINE}
     for trial in range(trials):
         features = extracted(sequence, fault, last, trial)
         for backend in ONLINE:
-            outcomes[backend].append(run(sequence, features, backend))
-    ates = [quartiles([o.ate for o in outcomes[backend]]) for backend in ONLINE]
-    return [*ates, sum(o.lost for backend in ONLINE for o in outcomes[backend])]
+            ates[backend].append(run(sequence, features, backend))
+    return [quartiles(ates[backend]) for backend in ONLINE]
 
 
 def quartiles(values: list[float]) -> str:
