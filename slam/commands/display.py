@@ -79,10 +79,10 @@ def print_conclusions(every: Sequence[Group], caution: str) -> None:
         for text in filter(None, (*wording.sentences(group), wording.failed(group))):
             _say(text)
         table = _table("", group.runs)
-        for row in (wording.row(group, metric) for metric in group.metrics if metric.main):
-            used |= {cell.verdict for cell in row.cells if cell.direction}
-            cells = [f"{mean} [{_COLOURS[c.direction]}]{c.badge}[/]" for (mean, _), c in zip(row.means[1:], row.cells)]
-            table.add_row(escape(row.label), row.means[0][0], *cells)
+        for label, (first, *others) in (wording.row(group, metric) for metric in group.metrics if metric.main):
+            used |= {cell.verdict for cell in others if cell.direction}
+            cells = [f"{cell.mean} [{_COLOURS[cell.direction]}]{cell.badge}[/]" for cell in others]
+            table.add_row(escape(label), first.mean, *cells)
         _console.print(table, highlight=False)
         for text in wording.honesty(group):
             _say(text)
