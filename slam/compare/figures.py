@@ -35,11 +35,8 @@ def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
     known = {metric.key for metric in group.metrics}
     if "ate_online_m" in known and group.trials > 1:
         label = BY_KEY["ate_online_m"].label
-        yield (
-            label,
-            f"{label}, of every trial; lines join the back ends' runs on the same recording.",
-            _svg(_pairs(group)),
-        )
+        text = f"{label}, of every trial; lines join the back ends' runs on the same recording."
+        yield label, text, _svg(_pairs(group))
     yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path"))
     if "nees_per_dof" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
