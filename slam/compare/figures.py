@@ -57,7 +57,8 @@ def _pairs(group: Group) -> Figure:
     from matplotlib.figure import Figure
 
     metric = BY_KEY["ate_online_m"]
-    axis = Figure((_WIDTH, 2.6), layout="constrained").subplots()
+    figure = Figure((_WIDTH, 2.6), layout="constrained")
+    axis = figure.subplots()
     values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
     backends, trials = values.shape
     x = np.arange(trials) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
@@ -71,7 +72,7 @@ def _pairs(group: Group) -> Figure:
     axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
     above = {"loc": "lower left", "bbox_to_anchor": (0, 1.0)}  # where it hides nothing
     axis.legend(frameon=False, fontsize=8, ncols=3 if max(map(len, group.runs)) < _SHORT else 2, **above)
-    return axis.figure
+    return figure
 
 
 def _svg(figure: Figure) -> str:
