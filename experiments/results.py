@@ -72,7 +72,7 @@ EXPERIMENTS = (
     Experiment(
         "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
     ),
-    Experiment("ablation", "recordings", "What each part is worth", left_out=("smaller in", "lost")),
+    Experiment("ablation", "recordings", "What each part is worth"),
     Experiment(
         "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
             "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."
