@@ -9,7 +9,6 @@ pose deviation below 1.5 cm, peak 3 cm, 318 landmarks.
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 from typing import Any
@@ -34,8 +33,8 @@ from slam.run.runner import run
 from slam.sequences import Sequence, open_sequence
 
 HEADER = (
-    "back end", "tracked", "mean error [cm]", "peak [cm]", "end [cm]", "final mean [cm]", "final peak [cm]",
-    "landmarks", "doubled", "right associations [%]", "NIS/dof",
+    "back end", "tracked", "mean error [cm]", "peak [cm]", "final mean [cm]", "final peak [cm]", "landmarks",
+    "right associations [%]",
 )  # fmt: skip
 
 
@@ -54,7 +53,7 @@ class Remembered:
 
 
 class AssociationCheck:
-    """Counts right associations frame by frame, and keeps the last descriptors for the search for doubles.
+    """Counts right associations frame by frame.
 
     Args:
         sequence: a rendered world.
@@ -62,7 +61,6 @@ class AssociationCheck:
 
     def __init__(self, sequence: Any) -> None:
         self._points = SurfacePoints(sequence)
-        self._descriptors: dict[int, np.ndarray] = {}
         self.right = self.wrong = 0
 
     def frame(self, result: FrameResult) -> None:
@@ -72,19 +70,6 @@ class AssociationCheck:
         self.right += int((error < 3).sum())
         self.wrong += int((error >= 3).sum())
         self._points.add(result.index, result.added, uv[result.added_features])
-        new = result.features.descriptors[result.added_features]
-        self._descriptors.update(zip(result.added.tolist(), new))
-
-    def doubled(self, folder: Path) -> int:
-        """Pairs of landmarks nearer than 2 cm whose first descriptors are less than 0.4 apart."""
-        from scipy.spatial import cKDTree
-
-        with (folder / "landmarks.csv").open(encoding="utf-8", newline="") as file:
-            rows = [row for row in csv.DictReader(file) if int(row["id"]) in self._descriptors]
-        positions = np.array([[float(r[c]) for c in "xyz"] for r in rows]).reshape(-1, 3)
-        first = np.array([self._descriptors[int(r["id"])] for r in rows])
-        pairs = cKDTree(positions).query_pairs(0.02, output_type="ndarray")
-        return int((np.linalg.norm(first[pairs[:, 0]] - first[pairs[:, 1]], axis=1) < 0.4).sum())
 
 
 def position_errors(path: Trajectory, truth: Trajectory) -> np.ndarray:
@@ -108,9 +93,8 @@ def row(sequence: Sequence, backend: str, frontend: Remembered, config: SystemCo
     tracked = summary["status"].get("tracked", 0) + summary["status"].get("started", 0)
     right = 100 * check.right / max(check.right + check.wrong, 1)
     return [
-        backend, f"{tracked} of {summary['frames']}", *_mean_and_peak(online), float(online[-1]),
-        *_mean_and_peak(final), summary["landmarks"], check.doubled(out / backend), right,
-        summary["consistency"]["NIS per degree of freedom"],
+        backend, f"{tracked} of {summary['frames']}", *_mean_and_peak(online), *_mean_and_peak(final),
+        summary["landmarks"], right,
     ]  # fmt: skip
 
 

@@ -7,16 +7,15 @@ prior about the true one.
 from __future__ import annotations
 
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 
 import backends
 from experiments.cramer_rao import pose_bounds
 from experiments.simulated_recording import true_recording, with_mismatches
-from slam.data import Observations, Prediction
+from slam.data import Observations
 from slam.evaluation.metrics import nees, pose_residuals
 from slam.geometry import se3
 from slam.geometry.se3 import Array
@@ -41,7 +40,6 @@ class Run:
         final: errors of the whole path at the end (F, 6).
         nees: of the newest pose (F,).
         nis, dof: of the updates (F,), 0 where there was none.
-        pixel: squared distance of one landmark's left pixel from its prediction (F,), two degrees of freedom.
         landmark: mean NEES of the landmarks at the end, three degrees of freedom.
         rejected: share of the observations that were rejected.
     """
@@ -51,7 +49,6 @@ class Run:
     nees: Array
     nis: Array
     dof: Array
-    pixel: Array
     landmark: float
     rejected: float
 
@@ -102,16 +99,15 @@ def drawn_path(T: Array, stamps: Array, models: EstimatorModels, rng: np.random.
     return np.array(poses)
 
 
-def run(recording: Recording, points: Array, name: str, seed: int) -> Run:
+def run(recording: Recording, points: Array, name: str) -> Run:
     """One back end on one recording; `points` (N, 3) are the true landmarks."""
     backend = backends.create(name, recording.rig, models=recording.models)
-    rng, truth = np.random.default_rng([seed, 78]), recording.ground_truth
+    truth = recording.ground_truth
     assert truth is not None
-    poses, covariances, nis, dof, pixel = [], [], [], [], []
+    poses, covariances, nis, dof = [], [], [], []
     rejected = given = 0
     for frame in recording:
-        prediction = backend.predict(frame.stamp)
-        pixel.append(_pixel_distance(prediction, frame.observed, rng))
+        backend.predict(frame.stamp)
         report = backend.update(frame.observed)
         backend.add(frame.added)
         estimate = backend.estimate(landmarks=False)
@@ -125,27 +121,17 @@ def run(recording: Recording, points: Array, name: str, seed: int) -> Run:
     landmark = nees(last.positions - points[last.ids], last.covariances).mean()
     return Run(
         online, pose_residuals(backend.trajectory().poses, truth.poses), nees(online, np.array(covariances)),
-        np.array(nis), np.array(dof), np.array(pixel), float(landmark), rejected / max(1, given),
+        np.array(nis), np.array(dof), float(landmark), rejected / max(1, given),
     )  # fmt: skip
-
-
-def _pixel_distance(prediction: Prediction, seen: Observations, rng: np.random.Generator) -> float:
-    """Squared distance of one landmark's left pixel from its prediction, NaN where none was in view."""
-    _, ours, theirs = np.intersect1d(prediction.ids, seen.ids, return_indices=True)
-    if not len(ours):
-        return np.nan
-    k = rng.integers(len(ours))
-    nu = seen.uv_left[theirs[k]] - prediction.uv_left[ours[k]]
-    return float(nu @ np.linalg.solve(prediction.innovation[ours[k]], nu))
 
 
 def trial(case: str, seed: int, frames: int, wrong: bool) -> Trial:
     """All of one seed."""
     recording, sequence = simulated(case, seed, frames)
     points = sequence.landmarks.positions
-    runs = {name: run(recording, points, name, seed) for name in ONLINE}
+    runs = {name: run(recording, points, name) for name in ONLINE}
     spoilt = with_mismatches(recording, WRONG, seed) if wrong else None
-    runs_spoilt = {} if spoilt is None else {name: run(spoilt, points, name, seed) for name in ONLINE}
+    runs_spoilt = {} if spoilt is None else {name: run(spoilt, points, name) for name in ONLINE}
     seen = [_all_seen(f.observed, f.added) for f in recording]
     truth = sequence.ground_truth
 
@@ -163,43 +149,8 @@ def _all_seen(observed: Observations, added: Observations) -> Observations:
     return Observations(*parts)
 
 
-def trials(case: str, seeds: int, frames: int, wrong: int, kept: Path, resume: bool) -> list[Trial]:
-    """All seeds of a case, two at a time; the first `wrong` of them with wrong matches, too.
-
-    Each is written to the folder `kept` as soon as it is done; to `resume` is to take those that are there.
-    """
-    kept.mkdir(parents=True, exist_ok=True)
-    paths = [kept / f"{case}_{frames}_{seed}{'_wrong' if seed < wrong else ''}.npz" for seed in range(seeds)]
+def trials(case: str, seeds: int, frames: int, wrong: int) -> list[Trial]:
+    """All seeds of a case, two at a time; the first `wrong` of them with wrong matches, too."""
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        jobs = {
-            seed: pool.submit(kept_trial, path, case, seed, frames, seed < wrong)
-            for seed, path in enumerate(paths)
-            if not (resume and path.exists())
-        }
-        for job in jobs.values():
-            job.result()
-    return [read_trial(path) for path in paths]
-
-
-def kept_trial(path: Path, case: str, seed: int, frames: int, wrong: bool) -> None:
-    """`trial`, written to a file: whole or not at all."""
-    done, arrays = trial(case, seed, frames, wrong), {}
-    for kind, runs in (("runs", done.runs), ("spoilt", done.spoilt)):
-        for name, found in runs.items():
-            arrays.update({f"{kind}/{name}/{f.name}": getattr(found, f.name) for f in fields(Run)})
-    bounds = {"checked": done.checked, "online_bound": done.online_bound, "final_bound": done.final_bound}
-    partly = path.with_suffix(".part.npz")
-    np.savez(partly, **arrays, **bounds)
-    partly.replace(path)
-
-
-def read_trial(path: Path) -> Trial:
-    """What `kept_trial` has written."""
-    with np.load(path) as file:
-        arrays = dict(file)
-    runs: dict[str, dict[str, dict[str, np.ndarray]]] = {"runs": {}, "spoilt": {}}
-    for key in [key for key in arrays if "/" in key]:
-        kind, name, what = key.split("/")
-        runs[kind].setdefault(name, {})[what] = arrays.pop(key)
-    made = {kind: {name: Run(**values) for name, values in found.items()} for kind, found in runs.items()}
-    return Trial(made["runs"], made["spoilt"], **arrays)
+        jobs = [pool.submit(trial, case, seed, frames, seed < wrong) for seed in range(seeds)]
+        return [job.result() for job in jobs]

@@ -3,7 +3,7 @@
     python experiments/faults.py [--quick] [--out DIR]
 
 Each fault on the rendered world ``desk``, both back ends. Prints a Markdown table: the sequence of states, the position
-error before and after the fault, how long it took to localize the map again, and the share of right associations.
+error after the fault, how long it took to localize the map again, and the share of right associations.
 Draws the error frame by frame.
 """
 
@@ -32,8 +32,8 @@ from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
 HEADER = (
-    "fault", "back end", "states", "error before [cm]", "mean after [cm]", "peak after [cm]", "end [cm]",
-    "frames until relocalised", "right associations [%]", "added while lost",
+    "fault", "back end", "states", "mean after [cm]", "peak after [cm]", "end [cm]", "frames until relocalised",
+    "right associations [%]",
 )  # fmt: skip
 
 
@@ -98,13 +98,12 @@ def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) 
     system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
     truth = sequence.ground_truth.poses
     world = np.linalg.inv(truth[features[0][0]])
-    points, results, errors, right, total, strays = SurfacePoints(sequence), [], [], 0, 0, 0
+    points, results, errors, right, total = SurfacePoints(sequence), [], [], 0, 0
     for k, seen in features:
         result = system.process_features(seen)
         off = points.errors(k, result.matched, seen.uv_left[result.matched_features])
         right, total = right + int((off < 3).sum()), total + int((~np.isnan(off)).sum())
         points.add(k, result.added, seen.uv_left[result.added_features])
-        strays += len(result.added) if result.status.value == "lost" else 0
         if result.status.value == "started":  # errors count from where the map begins
             world = result.estimate.T_world_left @ np.linalg.inv(truth[k])
         errors.append(100 * float(np.linalg.norm((inverse(world @ truth[k]) @ result.estimate.T_world_left)[:3, 3])))
@@ -112,8 +111,8 @@ def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) 
     found = [i for i in range(fault.over, len(results)) if results[i].status.value == "tracked"]
     after = errors[found[0] :] if found else [float("nan")]
     row = [
-        fault.name, backend, states(results), errors[fault.last_good], float(np.mean(after)), max(after), errors[-1],
-        found[0] - fault.over if found else None, 100 * right / max(total, 1), strays,
+        fault.name, backend, states(results), float(np.mean(after)), max(after), errors[-1],
+        found[0] - fault.over if found else None, 100 * right / max(total, 1),
     ]  # fmt: skip
     return row, errors
 

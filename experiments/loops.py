@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import tracemalloc
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -36,18 +35,15 @@ from slam.system import StereoSlam
 QUICK = ("map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off")  # settings of quick runs
 ROW_TEXTS = 2
 ACCURACY = (
-    "frames", "keyframes", "loops", "false", "refused", "places found again [%]", "ATE without [m]", "online [m]",
-    "final [m]", "final length [%]", "without, scale fitted [m]", "final, scale fitted [m]",
+    "frames", "loops", "false", "refused", "ATE without [m]", "online [m]", "final [m]",
 )  # fmt: skip
 TRUST = (
     "error at the last loop [m]", "its 3σ [m]", "NEES before loops", "NEES after the last",
-    "longest frame with a loop [ms]", "median frame [ms]", "memory [kB a frame]",
+    "longest frame with a loop [ms]",
 )  # fmt: skip
 HEADER = ("path", "back end", *ACCURACY, *TRUST)
 
 _FAR = 40.0  # from which a place can be seen again, at most [m]
-_NEAR, _TURN = 5.0, np.deg2rad(20.0)  # within which a place counts as driven again
-_AWAY = 100  # frames that lie between both times at least
 
 
 @dataclass
@@ -59,14 +55,12 @@ class Drive:
         atlas: at the end.
         final: the path as estimated at the end.
         truth: in the axes of its first pose (F, 4, 4).
-        memory: bytes that each frame leaves in the system.
     """
 
     results: list[FrameResult] = field(default_factory=list)
     atlas: Atlas = field(default_factory=Atlas)
     final: Trajectory = field(default_factory=Trajectory.empty)
     truth: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    memory: float = 0.0
 
     @property
     def online(self) -> np.ndarray:
@@ -79,7 +73,7 @@ class Drive:
         return np.array([inverse(r.T_map_odom) @ r.estimate.T_world_left for r in self.results])
 
 
-def drive(name: str, backend: str, settings: list[str], images: bool = False, memory: bool = False) -> Drive:
+def drive(name: str, backend: str, settings: list[str], images: bool = False) -> Drive:
     """Drive along a world's path, from its features, or from images.
 
     Args:
@@ -87,7 +81,6 @@ def drive(name: str, backend: str, settings: list[str], images: bool = False, me
         backend: its name.
         settings: as of the command.
         images: take them; else the features that a world gives.
-        memory: measure it, which takes time.
     """
     sequence = open_sequence(name)
     frontend = "surf" if images else None
@@ -95,29 +88,13 @@ def drive(name: str, backend: str, settings: list[str], images: bool = False, me
     system = StereoSlam(sequence.rig, frontend, backend, config=config)
     out, count = Drive(), len(sequence)
     frames = iter(sequence) if images else None
-    begin = 0
-    if memory:
-        tracemalloc.start()
     for k in range(count):
         one = system.process_features(sequence.observations(k)) if frames is None else system.process(next(frames))
         out.results.append(_light(one))
-        if memory and k == count // 10:
-            begin = _kept()
-    if memory:
-        out.memory = (_kept() - begin) / max(count - count // 10, 1)
-        tracemalloc.stop()
     assert sequence.ground_truth is not None
     truth = sequence.ground_truth.poses[:count]
     out.atlas, out.final, out.truth = system.atlas, system.trajectory(), inverse(truth[0]) @ truth
     return out
-
-
-def _kept() -> int:
-    """Bytes that the package holds, without what worlds keep to make recordings of."""
-    root = str(Path(__file__).resolve().parents[1])
-    mine = [tracemalloc.Filter(True, f"{root}/{room}/*") for room in ("slam", "backends")]
-    snapshot = tracemalloc.take_snapshot().filter_traces([*mine, tracemalloc.Filter(False, f"{root}/slam/worlds/*")])
-    return sum(trace.size for trace in snapshot.traces)
 
 
 def _light(result: FrameResult) -> FrameResult:
@@ -126,16 +103,11 @@ def _light(result: FrameResult) -> FrameResult:
     return replace(result, features=none, matched=result.matched[:0], matched_features=result.matched_features[:0])
 
 
-def ate(poses: np.ndarray, truth: np.ndarray, with_scale: bool = False) -> float:
+def ate(poses: np.ndarray, truth: np.ndarray) -> float:
     """Root mean square error of the positions after alignment [m]."""
     p, q = poses[:, :3, 3], truth[:, :3, 3]
-    error = align_positions(p, q, with_scale).apply(p) - q
+    error = align_positions(p, q).apply(p) - q
     return float(np.sqrt((error**2).sum(axis=1).mean()))
-
-
-def length_error(poses: np.ndarray, truth: np.ndarray) -> float:
-    """By how much a path is too long [%]."""
-    return 100 * (1 / align_positions(poses[:, :3, 3], truth[:, :3, 3], with_scale=True).scale - 1)
 
 
 def false_loops(run: Drive) -> int:
@@ -147,24 +119,6 @@ def false_loops(run: Drive) -> int:
         error = log(inverse(true) @ loop.T_first_second)
         count += bool(np.linalg.norm(true[:3, 3]) > _FAR or np.linalg.norm(error[3:]) > 0.1 * _FAR)
     return count
-
-
-def found_again(run: Drive) -> float:
-    """Share of the places driven again, in stretches, that a loop holds on to [%]; NaN where there are none."""
-    frames = np.array([k.frame for k in run.atlas.keyframes])
-    T = run.truth[frames]
-    again = np.zeros(len(frames), bool)
-    for i, k in enumerate(frames):
-        old = frames < k - _AWAY
-        near = np.linalg.norm(T[old, :3, 3] - T[i, :3, 3], axis=1) < _NEAR
-        facing = np.arccos(np.clip(0.5 * (np.einsum("nij,ij->n", T[old, :3, :3], T[i, :3, :3]) - 1), -1, 1)) < _TURN
-        again[i] = (near & facing).any()
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], again.astype(int), [0]])))
-    stretches = [(a, b) for a, b in zip(edges[::2], edges[1::2]) if b - a >= 3]
-    closed = np.array([loop.second for loop in run.atlas.loops], int)
-    held = [b - a for a, b in stretches if ((closed >= a - 3) & (closed < b + 3)).any()]
-    whole = sum(b - a for a, b in stretches)
-    return 100.0 * sum(held) / whole if whole else float("nan")
 
 
 def nees(run: Drive, first: int, stop: int) -> float:
@@ -185,17 +139,13 @@ def row(name: str, backend: str, run: Drive) -> list[str]:
     sigma = 3 * np.sqrt(np.trace(e.covariance[3:, 3:]))
     without, final = run.odometry, run.final.poses
     figures = [ate(poses, run.truth) for poses in (without, run.online, final)]
-    fitted = [ate(poses, run.truth, with_scale=True) for poses in (without, final)]
     times = np.array([sum(r.milliseconds.values()) for r in run.results])
     slowest = times[closed].max(initial=0.0) if closed else float("nan")
     s = run.atlas.summary()
     return [
-        name, backend, str(len(run.results)), str(s["keyframes"]), str(s["closed"]), str(false_loops(run)),
-        str(s["refused"]), f"{found_again(run):.0f}", *(f"{x:.2f}" for x in figures),
-        f"{length_error(final, run.truth):+.2f}", *(f"{x:.2f}" for x in fitted),
-        f"{np.linalg.norm(error[3:]):.2f}", f"{sigma:.2f}", f"{nees(run, 1, first):.1f}",
-        f"{nees(run, last, len(run.results)):.1f}", f"{slowest:.0f}", f"{np.median(times):.0f}",
-        f"{run.memory / 1e3:.1f}" if run.memory else "–",
+        name, backend, str(len(run.results)), str(s["closed"]), str(false_loops(run)), str(s["refused"]),
+        *(f"{x:.2f}" for x in (*figures, np.linalg.norm(error[3:]), sigma)), f"{nees(run, 1, first):.1f}",
+        f"{nees(run, last, len(run.results)):.1f}", f"{slowest:.0f}",
     ]  # fmt: skip
 
 
@@ -246,14 +196,13 @@ def main() -> None:
     parser = script_options(__file__, __doc__)
     parser.add_argument("--paths", nargs="*", default=["06"])
     parser.add_argument("--backend", nargs="*", default=list(ONLINE))
-    parser.add_argument("--memory", action="store_true", help="measure it; takes twice the time")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--option", nargs="*", default=[])
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     quick = list(QUICK) if given.quick else []
     runs = {
-        (name, backend): drive(sequence, backend, [*quick, *given.set], memory=given.memory)
+        (name, backend): drive(sequence, backend, [*quick, *given.set])
         for name, sequence in worlds(given).items()
         for backend in (given.backend[:1] if given.quick else given.backend)
     }

@@ -15,7 +15,7 @@ from slam import registry
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.objects import ObjectScore, labels_in_images, score_for
-from slam.evaluation.summary import consistency, evaluate
+from slam.evaluation.summary import evaluate
 from slam.geometry.trajectory import Trajectory
 
 
@@ -66,14 +66,13 @@ def path_of(results: list[FrameResult]) -> Trajectory:
 
 def camera_figures(sequence: Any, results: list[FrameResult]) -> dict[str, float]:
     path = path_of(results)
-    truth = consistency(path, np.array([r.estimate.covariance for r in results]), sequence)
-    return {"ATE [mm]": 1e3 * evaluate(path, sequence)["ATE RMSE [m]"], "camera NEES": truth["mean NEES"]}
+    return {"ATE [mm]": 1e3 * evaluate(path, sequence)["ATE RMSE [m]"]}
 
 
 def scored_run(
     name: str, backend: str, images: bool, frames: int, *settings: str
 ) -> tuple[dict[str, Any], ObjectScore]:
-    """One run of a world: the score's figures, the camera's, and the detector's time; and the score."""
+    """One run of a world: the score's figures and the camera's; and the score."""
     sequence = slam.open_sequence(f"synthetic:{name}")
     score = score_for(sequence) or ObjectScore(
         np.zeros((0, len(sequence), 4, 4)), sequence.stamps, sequence.ground_truth.poses, sequence.rig.left.fu
@@ -88,10 +87,9 @@ def scored_run(
         "world": name.rstrip("?"),
         "back end": backend,
         **camera_figures(sequence, results),
-        **summary["features"],
+        "F1": summary["features"]["F1"],
         "counted right": summary["counted right"],
         "false objects [frames]": summary["false objects"],
-        "objects [ms]": float(np.median([r.milliseconds["objects"] for r in results])),
         "bodies": summary["bodies"],
     }
     return figures, score
@@ -100,14 +98,12 @@ def scored_run(
 def body_row(world: str, backend: str, number: str, body: dict[str, Any]) -> dict[str, Any]:
     """A table's row of one body's figures."""
     found = {"rotation median [deg]": None, "translation median [m]": None}
-    me, absolute = body.get("ME") or found, body.get("absolute") or found
+    me = body.get("ME") or found
     return {
         "world": world, "back end": backend, "body": number,
-        "frames in view": body["frames in view"], "coverage": body["coverage"],
+        "coverage": body["coverage"],
         "ids": len(body["ids"]), "delay [frames]": body.get("delay [frames]"),
         "ME [deg]": me["rotation median [deg]"], "ME [mm]": millimetres(me["translation median [m]"]),
-        "absolute [deg]": absolute["rotation median [deg]"],
-        "absolute [mm]": millimetres(absolute["translation median [m]"]),
         "NEES": body.get("mean NEES"),
     }  # fmt: skip
 
@@ -136,12 +132,11 @@ def worlds_together(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         found.setdefault(row["world"].partition("seed=")[0].rstrip("?&"), []).append(row)
-    medians = ("ATE [mm]", "camera NEES", "false moving per 1000 still", "counted right", "objects [ms]")
+    medians = ("ATE [mm]", "counted right")
     return [
         {
             "world": world, "seeds": len(runs), **{c: float(np.median([run[c] for run in runs])) for c in medians},
             "false objects": sum(len(run["false objects [frames]"]) for run in runs),
-            "longest [frames]": max((k for run in runs for k in run["false objects [frames]"]), default=0),
         }
         for world, runs in found.items()
     ]  # fmt: skip

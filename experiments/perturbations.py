@@ -24,7 +24,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import recordings, script_options
-from experiments.tables import markdown, write_json
+from experiments.tables import show
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures, StereoFrame
@@ -38,7 +38,7 @@ from slam.system import StereoSlam
 _DAY = "kitti_raw/2011_09_26/2011_09_26_drive_"
 DRIVES = {"KITTI 06": "kitti_odometry/sequences/06", "raw 0001": f"{_DAY}0001_sync", "raw 0013": f"{_DAY}0013_sync"}
 SPOILT = ("KITTI 06", "raw 0001")  # drives that are run with spoilt images
-FIGURES = (*(f"ATE {name} [m]" for name in ONLINE), "lost")
+HEADER = ("images", "drive", *(f"ATE {name} [m]" for name in ONLINE))
 
 _FIRST = 5  # frames that may be left out at the beginning
 _FEATURES = 0.2  # by how much the number of features may differ
@@ -161,21 +161,6 @@ def backwards(drive: Sequence, last: int) -> Drive:
     return Drive(drive.kind, drive.rig, turned, frames)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Of one run.
-
-    Attributes:
-        ate: of the poses that were measured [m].
-        frames: number of frames.
-        lost: frames without a measured pose.
-    """
-
-    ate: float
-    frames: int
-    lost: int
-
-
 def frames_of(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -> Iterator[StereoFrame]:
     """The frames of one trial; no frame depends on which others are taken."""
     first = np.random.default_rng(trial).integers(_FIRST)
@@ -201,25 +186,24 @@ def extracted(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -
     return [frontend.extract(frame) for frame in frames_of(sequence, fault, last, trial)]
 
 
-def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str) -> Outcome:
-    """One back end on one trial."""
+def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str) -> float:
+    """One back end on one trial: error of the path [m]."""
     system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, "surf", backend))
     results = [system.process_features(one) for one in features]
     measured = [r.estimate for r in results if r.status in MEASURED]
     path = Trajectory(np.array([e.stamp for e in measured]), np.array([e.T_world_left for e in measured]))
     ate = evaluate(path, sequence).get("ATE RMSE [m]") if len(measured) > 2 else None
-    return Outcome(float("nan") if ate is None else float(ate), len(results), len(results) - len(measured))
+    return float("nan") if ate is None else float(ate)
 
 
 def figures(fault: Fault, sequence: Drive | Sequence, last: int, trials: int) -> list[object]:
-    """The figures of a row, in the order of `FIGURES`."""
-    outcomes: dict[str, list[Outcome]] = {backend: [] for backend in ONLINE}
+    """The figures of a row, behind image and drive, in the order of `HEADER`."""
+    ates: dict[str, list[float]] = {backend: [] for backend in ONLINE}
     for trial in range(trials):
         features = extracted(sequence, fault, last, trial)
         for backend in ONLINE:
-            outcomes[backend].append(run(sequence, features, backend))
-    ates = [quartiles([o.ate for o in outcomes[backend]]) for backend in ONLINE]
-    return [*ates, sum(o.lost for backend in ONLINE for o in outcomes[backend])]
+            ates[backend].append(run(sequence, features, backend))
+    return [quartiles(ates[backend]) for backend in ONLINE]
 
 
 def quartiles(values: list[float]) -> str:
@@ -232,22 +216,20 @@ def quartiles(values: list[float]) -> str:
     return f"{middle:.3f}{missing}" if len(values) == 1 else f"{middle:.3f} ({low:.3f}–{high:.3f}){missing}"
 
 
-def table(
+def rows_of(
     faults: tuple[Fault, ...],
     places: dict[str, Path],
     last: int,
     trials: int,
-    out: Path,
     opened: Callable[[Path], Drive | Sequence] = open_sequence,
-) -> str:
-    """Run all faults on all drives; the table, which is written to `out` row by row."""
-    header, rows = ("images", "drive", *FIGURES), []
+) -> list[list[object]]:
+    """Rows of `HEADER`: all faults on all drives."""
+    rows: list[list[object]] = []
     for fault in faults:
         for name, folder in places.items():
             rows.append([fault.name, name, *figures(fault, opened(folder), last, trials)])
             print(rows[-1], file=sys.stderr, flush=True)
-            write_json(out, header, rows)
-    return markdown(header, rows, 2)
+    return rows
 
 
 def main() -> int:
@@ -263,17 +245,17 @@ def main() -> int:
     if arguments.quick:
         faults, trials, frames = (FAULTS[0], FAULTS[4]), 1, 15
         found = dict(list(found.items())[:1])
-    print(f"Medians and quartiles of {trials} runs of the first {frames} frames, the images as they are:\n")
-    print(table((NONE,), found, frames, trials, arguments.out / "drives.json"))
-    for way, opened in (
-        ("in a mirror", lambda folder: mirrored(open_sequence(folder))),
-        ("backwards", lambda folder: backwards(open_sequence(folder), frames)),
-    ):
-        print(f"\nThe same {way}:\n")
-        print(table((NONE,), found, frames, trials, arguments.out / f"{way.replace(' ', '_')}.json", opened))
+    ways: dict[str, Callable[[Path], Drive | Sequence]] = {
+        "as they are": open_sequence,
+        "in a mirror": lambda folder: mirrored(open_sequence(folder)),
+        "backwards": lambda folder: backwards(open_sequence(folder), frames),
+    }
+    whole = [rows_of((replace(NONE, name=way),), found, frames, trials, opened) for way, opened in ways.items()]
+    print(f"Medians and quartiles of {trials} runs of the first {frames} frames:\n")
+    show(arguments.out / "drives.json", HEADER, [row for rows in whole for row in rows], 2)
     spoilt_drives = {name: folder for name, folder in found.items() if name in SPOILT}
     print("\nThe drives as they are, with spoilt images:\n")
-    print(table(faults, spoilt_drives, frames, trials, arguments.out / "spoilt.json"))
+    show(arguments.out / "spoilt.json", HEADER, rows_of(faults, spoilt_drives, frames, trials), 2)
     return 0
 
 

@@ -121,7 +121,8 @@ class SystemConfig:
     def with_settings(self, settings: Sequence[str] | Mapping[str, Any]) -> SystemConfig:
         """A copy with settings applied: ``{"map.max_landmarks": 300}``, or ``["map.max_landmarks=300"]``.
 
-        Values in texts are JSON (``true``, ``3.5``, ``[1, 2]``) or plain words.
+        Values in texts are JSON (``true``, ``3.5``, ``[1, 2]``) or plain words. Names of options of front end and back
+        end are checked where these are made.
 
         Raises:
             ConfigurationError: not of that form, an unknown key, a value of the wrong type or out of range.

@@ -361,7 +361,8 @@ class FrameResult:
 
     def __repr__(self) -> str:
         why = f" ({self.reason})" if self.reason else ""
-        landmarks = f"{len(self.matched)} of {self.predicted} landmarks matched"
+        expected = f" of {self.predicted}" if len(self.matched) <= self.predicted else ""  # none before a map is found
+        landmarks = f"{len(self.matched)}{expected} landmarks matched"
         change = f"{len(self.added)} added, {len(self.erased)} erased, {self.map_size} in the map"
         objects = f", {count(len(self.objects), 'moving object')}" if self.objects else ""
         return f"FrameResult({self.index}, {self.status.value}{why}, {landmarks}, {change}{objects})"

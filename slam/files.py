@@ -17,18 +17,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.errors import SequenceError, SlamError
-
-Array = NDArray[np.float64]
 
 _MEBI = 2**20
 
 #: Most bytes of a text file: tables of stamps and poses, calibrations.
 TEXT_LIMIT = 128 * _MEBI
 _JSON_LIMIT = 16 * _MEBI
-_LARGEST = 1e15  # number in a table: stamps in nanoseconds are larger, but no table of ours has them
 
 _inputs: ContextVar[list[Path] | None] = ContextVar("inputs", default=None)
 
@@ -93,23 +89,6 @@ def read_object(path: str | Path) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise SlamError(f"{path}: must hold an object, not {type(tree).__name__}")
     return tree
-
-
-def read_numbers(path: str | Path, columns: int) -> Array:
-    """The rows of a CSV file below its header (N, columns), NaN for an empty cell.
-
-    Raises:
-        SlamError: the file cannot be read, or a row has another number of cells, or one that is no number up to
-            `_LARGEST`.
-    """
-    try:
-        rows = [[float(cell or "nan") for cell in line.split(",")] for line in read_text(path).splitlines()[1:]]
-        table = np.array(rows, float).reshape(len(rows), columns)
-    except ValueError as fault:
-        raise SlamError(f"{path}: no table of {columns} columns of numbers: {fault}") from fault
-    if (np.abs(table) > _LARGEST).any():
-        raise SlamError(f"{path}: a number is far too large")
-    return table
 
 
 def require_content(path: Path) -> None:

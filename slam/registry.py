@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -117,27 +118,47 @@ def create(role: str, name: str, rig: Any, /, **options: Any) -> Any:
         del options["models"]
     try:
         created = made(rig, **options)
-    except SlamError:
-        raise
     except (Exception, SystemExit) as error:  # whatever a foreign class does
-        wrong = _unknown_option(made, options) if isinstance(error, TypeError) else ""
+        wrong = _unknown_option(made, rig, options) if isinstance(error, (TypeError, ConfigurationError)) else ""
+        if isinstance(error, SlamError) and not wrong:
+            raise
         raise ConfigurationError(f"{what}{wrong or f' cannot be created: {cause(error)}'}") from error
     return require_methods(role, created, repr(name))
 
 
-def _unknown_option(made: Any, options: Mapping[str, Any]) -> str:
-    """What is said of the first option that a class does not take; empty where it takes all, or does not say."""
+def options_of(made: Any, rig: Any) -> dict[str, tuple[Any, Any]] | None:
+    """Options of a back end's or front end's class: by name the default, and what has them in its docstring.
+
+    They are the arguments of its constructor but the rig, ``models``, and functions. Where that takes any others, they
+    are also the arguments of the constructors that it inherits from, and the fields of its ``config``. None where a
+    class takes any and does not say which.
+    """
+    found: dict[str, tuple[Any, Any]] = {}
     try:
-        known = signature(made).parameters
-    except (TypeError, ValueError):
+        bases = [base for base in made.__mro__[:-1] if "__init__" in vars(base)] if isinstance(made, type) else [made]
+        for one in bases:
+            parameters = list(signature(one).parameters.values())[1:]
+            named = (p for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY))
+            values = {p.name: None if p.default is Parameter.empty else p.default for p in named if p.name != "models"}
+            found = {name: (value, one) for name, value in values.items() if not callable(value)} | found
+            if all(p.kind is not Parameter.VAR_KEYWORD for p in parameters):
+                return found
+        config = made(rig).config
+        return found | {f.name: (getattr(config, f.name), type(config)) for f in fields(config)}
+    except (Exception, SystemExit):  # noqa: BLE001 (whatever a foreign class does)
+        return None
+
+
+def _unknown_option(made: Any, rig: Any, options: Mapping[str, Any]) -> str:
+    """What is said of the first option that a class does not take; empty where it takes all, or does not say."""
+    known = options_of(made, rig)
+    if known is None:
         return ""
-    wrong = next((option for option in options if option not in known), None)
-    if wrong is None or any(parameter.kind is Parameter.VAR_KEYWORD for parameter in known.values()):
-        return ""
-    own = [option for option in list(known)[1:] if option != "models"]  # the first one is the rig
-    if wrong == "models":
+    if wrong := next((option for option in options if option not in known and option != "models"), None):
+        return f": {unknown('option', wrong, known)}" if known else f" has no options, got {wrong!r}"
+    if "models" in options and "models" not in signature(made).parameters:
         return " cannot be created: it does not take the argument models"
-    return f": {unknown('option', wrong, own)}" if own else f" has no options, got {wrong!r}"
+    return ""
 
 
 def require_methods(role: str, part: Any, name: str = "") -> Any:

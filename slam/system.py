@@ -105,6 +105,8 @@ class StereoSlam:
             frontend = registry.create("frontends", frontend, rig, **c.frontend)
         self._rectification = inside = Rectification(rig)
         inner = replace(c, models=inside.models(c.models))
+        if c.backend and not isinstance(backend, str):
+            raise ConfigurationError(f"backend.{next(iter(c.backend))}: an object is made with its options beforehand")
         if isinstance(backend, str):
             backend = registry.create("backends", backend, inside.rig, models=inner.models, **c.backend)
         self.frontend: Frontend | None = registry.require_methods("frontends", frontend)

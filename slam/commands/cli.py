@@ -165,14 +165,14 @@ def run_command(
         written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
         require_outputs(written, [*inputs, *options.inputs], overwrite)
         gathered = RunRecord()  # its time of compiling begins here
+        tell = stack.enter_context(progress(*shown_as))
         if options.config.objects.mode != "off":
-            with progress(None, "", quiet):
-                compile_kernels(options.backend, options.frontend)
+            compile_kernels(options.backend, options.frontend)
         seen = watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
-        end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress(*shown_as)), folder, until))
+        end_of_frame = stack.enter_context(whole_frames(tell, folder, until))
         summary = run(opened, options, end_of_frame, watches=seen, until=until, record=gathered)
     finish(summary, written, picture, quiet)
 
@@ -341,7 +341,7 @@ def warm_up_command(quiet: _Quiet = False) -> None:
     from slam.run.warm_up import compile_kernels, warm_up
     from slam.runtime.compilation import compile_clock
 
-    with progress(None, "", quiet):
+    with progress(None, "kernels", quiet):
         compile_kernels(ONLINE[-1])
         warm_up()
     seconds = compile_clock.seconds()

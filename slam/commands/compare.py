@@ -7,15 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from slam.compare.plan import CLOSED_LOOP, Plan, Trial, Variant, is_world, parse_variant
+from slam import registry
+from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import write_report
 from slam.compare.sweep import Run, check, is_done, run_alone, sweep
 from slam.compare.tables import groups, most_tests, write_tables
 from slam.compare.trial import COMPLETED, RESULT
 from slam.compare.wording import caution
 from slam.config import SystemConfig
-from slam.errors import ConfigurationError
+from slam.errors import ConfigurationError, UnknownNameError
 from slam.files import read_object
+from slam.naming import unknown
 from slam.runtime.threads import available_cores
 from slam.sequences.faults import said_before
 from slam.settings import require_settable
@@ -29,11 +31,15 @@ def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Seq
 
     Raises:
         ConfigurationError: a variant is not of its form, or has a setting that users cannot set.
+        UnknownNameError: there is no such front end.
     """
     every = [Variant(name, name, tuple(settings)) for name in frontends]
     every += [parse_variant(text, tuple(settings)) for text in variants]
     every = every or [Variant("surf", "surf", tuple(settings))]
+    known = [*registry.names("frontends"), SIMULATED]
     for variant in every:
+        if variant.frontend not in known and ":" not in variant.frontend:
+            raise UnknownNameError(f"{unknown('front end', variant.frontend, known)}; or one of your own: module:Class")
         require_settable(variant.settings, SystemConfig().to_json(), variant.frontend)
     return tuple(every)
 

@@ -49,11 +49,10 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
         print(
             f"{len(ONLINE)} runs of {frames} frames: about {seconds:.0f} s on two idle cores, 40 s more the first time"
         )
-    with progress(None, "", quiet):
-        compile_kernels(ONLINE[-1])
     for backend in ONLINE:
         config = SystemConfig.for_kind(sequence.kind, "surf", backend)
         with progress(len(sequence), f"aisle · {backend}", quiet) as tell:
+            compile_kernels(ONLINE[-1])
 
             def seen(result: FrameResult, tell: Callable[[FrameResult], None] = tell) -> None:
                 tell(result)

@@ -35,17 +35,16 @@ def _bar(*columns: ProgressColumn, quiet: bool, **options: Any) -> RichProgress:
 
 @contextmanager
 def progress(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[FrameResult], None]]:
-    """A progress bar over frames, without an end where `total` is None; it appears with the first one.
+    """One line over frames, without an end where `total` is None; it appears with the first one.
 
-    Kernels that have to be compiled have a bar of their own above it. Their number is that of modules loaded so far.
+    While kernels are compiled the line says so, and how many are done.
     """
     bar = _bar(TextColumn("{task.fields[status]}"), quiet=quiet, get_time=working_time)
-    kernels = bar.add_task("compiling, once on this machine", total=None, status="", visible=False)
     task = bar.add_task(title, total=total, status="", visible=False)
 
     def compiling(done: int, of: int) -> None:
         bar.start()
-        bar.update(kernels, completed=done, total=of, visible=True)
+        bar.update(task, status=f"compiling {done}/{of}, once", visible=True)
 
     def frame(result: FrameResult) -> None:
         bar.start()
@@ -80,10 +79,10 @@ def print_conclusions(every: Sequence[Group], caution: str) -> None:
         for text in filter(None, (*wording.sentences(group), wording.failed(group))):
             _say(text)
         table = _table("", group.runs)
-        for row in (wording.row(group, metric) for metric in group.metrics if metric.main):
-            used |= {cell.verdict for cell in row.cells if cell.direction}
-            cells = [f"{mean} [{_COLOURS[c.direction]}]{c.badge}[/]" for (mean, _), c in zip(row.means[1:], row.cells)]
-            table.add_row(escape(row.label), row.means[0][0], *cells)
+        for label, (first, *others) in (wording.row(group, metric) for metric in group.metrics if metric.main):
+            used |= {cell.verdict for cell in others if cell.direction}
+            cells = [f"{cell.mean} [{_COLOURS[cell.direction]}]{cell.badge}[/]" for cell in others]
+            table.add_row(escape(label), first.mean, *cells)
         _console.print(table, highlight=False)
         for text in wording.honesty(group):
             _say(text)

@@ -116,18 +116,19 @@ def frame_count(sequence: StereoSequence, start: int, stop: int | None) -> int |
 def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, quiet: bool) -> None:
     """Leave the picture of a run and print its table, its files, and a line where many frames were not tracked.
 
-    The first of `written` is its folder. The exit status is 1 where no frame was tracked.
+    The first of `written` is its folder. The exit status is 1 where no frame was tracked, or none was run.
     """
-    folder = written[0].path
+    folder, drawn = written[0].path, "path_length_m" in summary  # where a frame has a pose
     if not summary["frames"]:
         print(f"slam: the run ended before its first frame; files: {folder}", file=sys.stderr)
-        return
-    if picture:
+        raise typer.Exit(1)
+    if picture and drawn:
         leave_picture(folder)
     if not quiet:
         print_summary([summary], [output.path for output in written])
     if summary["tracking"]:
-        print(f"slam: {summary['tracking']}", file=sys.stderr)
+        no_picture = "; no picture: no frame has a pose" if picture and not drawn else ""
+        print(f"slam: {summary['tracking']}{no_picture}", file=sys.stderr)
     if nothing_tracked(summary):
         raise typer.Exit(1)
 

@@ -8,10 +8,11 @@ from shutil import get_terminal_size
 from textwrap import wrap
 from typing import Any
 
+from slam import registry
 from slam.config import SystemConfig
 from slam.errors import UnknownNameError
 from slam.naming import unknown
-from slam.run.settings_reference import Setting, documented, settings
+from slam.run.settings_reference import Setting, documented, options_of, settings
 
 _WIDEST = 100  # columns
 
@@ -27,7 +28,15 @@ def print_settings(wanted: str | None) -> None:
 
 def listing(wanted: str | None, width: int) -> Iterator[str]:
     """The lines of `print_settings`, of at most `width` characters."""
-    every = list(settings())
+    if wanted is not None and ":" in wanted:  # a class of one's own
+        part = registry.resolve("backends", wanted)
+        every = list(options_of("frontend" if hasattr(part, "extract") else "backend", wanted))
+        if not every:
+            raise UnknownNameError(
+                f"{wanted} names no options: neither its constructor has any, nor a dataclass in its `config`"
+            )
+    else:
+        every = list(settings())
     chosen = [s for s in every if wanted is None or wanted in (s.key, s.owner) or s.key.startswith(f"{wanted}.")]
     if not chosen:
         names = dict.fromkeys(name for s in every for name in (s.key.partition(".")[0], s.owner) if name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,23 +11,17 @@ import numpy as np
 from slam.compare.plan import is_world
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
-from slam.compare.trial import SERIES, SERIES_COLUMNS
-from slam.errors import SlamError
-from slam.evaluation.metrics import chi_square_band
-from slam.files import read_numbers
-from slam.geometry.se3 import Array
 from slam.run.panels import backend_colours
 from slam.run.plots import drawn
 from slam.run.results import BY_KEY
 from slam.run.run_data import RunData
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _MOST_TICKS = 15
 _SHORT = 20  # letters of names that stand side by side
-_WIDTH = 132.0  # [mm] about that of a phone: text stays readable where the picture fills the screen
+_WIDTH = 5.2  # [in] about that of a phone: text stays readable where the picture fills the screen
 
 
 def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
@@ -42,16 +35,12 @@ def pictures(group: Group) -> Iterator[tuple[str, str, str]]:
     known = {metric.key for metric in group.metrics}
     if "ate_online_m" in known and group.trials > 1:
         label = BY_KEY["ate_online_m"].label
-        yield label, f"{label}, of every trial; lines join the back ends' runs on the same recording.", _pairs(group)
+        text = f"{label}, of every trial; lines join the back ends' runs on the same recording."
+        yield label, text, _svg(_pairs(group))
     yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path"))
     if "nees_per_dof" in known:
         text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
         yield "Error over time", text, _svg(drawn(runs, "errors"))
-        text = (
-            "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
-            "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
-        )
-        yield "NEES over time", text, _nees(group)
 
 
 def _example(group: Group) -> dict[str, Run]:
@@ -63,10 +52,13 @@ def _example(group: Group) -> dict[str, Run]:
     return {backend: run for backend, run in firsts.items() if run is not None}
 
 
-def _pairs(group: Group) -> str:
+def _pairs(group: Group) -> Figure:
     """Each trial's errors, those of the back ends side by side and joined: whether differences are of one sign."""
+    from matplotlib.figure import Figure
+
     metric = BY_KEY["ate_online_m"]
-    figure, axis = _axes(2.6)
+    figure = Figure((_WIDTH, 2.6), layout="constrained")
+    axis = figure.subplots()
     values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
     backends, trials = values.shape
     x = np.arange(trials) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
@@ -75,73 +67,19 @@ def _pairs(group: Group) -> str:
         axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
     axis.set(xlim=(-0.5, trials - 0.5), xticks=range(0, trials, -(-trials // _MOST_TICKS)))
     axis.set(xlabel="seed", ylabel=metric.title)
+    axis.spines[["top", "right"]].set_visible(False)
     low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
     axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
-    return _svg(figure)
-
-
-def _nees(group: Group) -> str:
-    """NEES / 6 over time, mean over the trials whose pose was measured, with the 95 % band of as many trials."""
-    from matplotlib.ticker import LogLocator
-
-    figure, axis = _axes(2.8)
-    fewest = group.trials
-    for (name, runs), colour in zip(group.runs.items(), backend_colours(list(group.runs))):
-        every = [_series(run) for run in runs if run.completed]
-        if not every:
-            continue
-        fewest = min(fewest, len(every))
-        length = min(map(len, every))
-        nees = np.ma.masked_invalid([rows[1:length, 1] for rows in every])
-        t = (every[0][:, 0] - every[0][0, 0])[1:length]
-        axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=colour, lw=1.2, label=name)
-    axis.axhline(1, color="0.3", lw=0.8, ls="--", label="expected")
-    low, high = chi_square_band(6, fewest)
-    band = f"95 % band if consistent, mean of {fewest} trial{'s' if fewest > 1 else ''}"
-    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=band)
-    axis.set_yscale("log")
-    bottom, top = axis.get_ylim()
-    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top > 10 * bottom else (0.6, 0.8, 1, 1.5, 2, 3, 4)))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter("")
-    axis.set(xlabel="time [s]", ylabel="NEES / 6")
-    return _svg(figure)
-
-
-def _series(run: Run) -> Array:
-    """A run's rows of `SERIES_COLUMNS`; raises SlamError where the file cannot be read, or has no row."""
-    rows = read_numbers(run.folder / SERIES, len(SERIES_COLUMNS))
-    if not len(rows):
-        raise SlamError(f"{run.folder / SERIES}: has no row")
-    return rows
-
-
-def _style() -> AbstractContextManager[None]:
-    from matplotlib import rc_context
-
-    return rc_context(
-        {"svg.fonttype": "none", "svg.hashsalt": "slam", "font.size": 9, "font.family": "sans-serif",
-         "axes.spines.top": False, "axes.spines.right": False}
-    )  # fmt: skip
-
-
-def _axes(height: float) -> tuple[Figure, Axes]:
-    """A figure of one panel, apart from pyplot's global state."""
-    from matplotlib.figure import Figure
-
-    with _style():
-        figure = Figure((_WIDTH / 25.4, height), layout="constrained")
-        return figure, figure.subplots()
+    above = {"loc": "lower left", "bbox_to_anchor": (0, 1.0)}  # where it hides nothing
+    axis.legend(frameon=False, fontsize=8, ncols=3 if max(map(len, group.runs)) < _SHORT else 2, **above)
+    return figure
 
 
 def _svg(figure: Figure) -> str:
-    """A picture as SVG, the same for the same data; its legend is above its panel, where it hides nothing."""
+    """A picture as SVG, the same for the same data."""
+    from matplotlib import rc_context
+
     text = io.StringIO()
-    with _style():
-        axis = figure.axes[0]
-        names = axis.get_legend_handles_labels()[1]
-        if names and axis.get_legend() is None:
-            columns = 3 if max(map(len, names)) < _SHORT else 2
-            axis.legend(frameon=False, fontsize=8, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1.0))
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "slam"}):
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()

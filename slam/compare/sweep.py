@@ -88,7 +88,7 @@ def sweep(
     told = on_done or (lambda trial: None)
     with naming_folder(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_json(out / SWEEP, {"plan": asdict(plan), "versions": running_code()})
+    write_json(out / SWEEP, {"trials": [asdict(trial) for trial in plan.every], "versions": running_code()})
     for mode in plan.modes:  # a replay needs the closed loop
         left = []
         for trial in plan.trials_of(mode):
@@ -215,26 +215,16 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
     goes_on = not overwrite and (out / SWEEP).is_file()
     if goes_on:
         held = read_object(out / SWEEP)
-        before = held.get("versions")
-        if not isinstance(before, dict):
+        before, trials = held.get("versions"), held.get("trials")
+        if not isinstance(before, dict) or not isinstance(trials, list):
             raise SlamError(f"{out / SWEEP}: not that of a comparison")
         changed = changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code())
         if changed:
             raise SlamError(f"{out}: begun with {changed[0]}: runs cannot be compared; give another --out")
-        if not _has_all_of(plan, held.get("plan")):
+        if not set(map(json.dumps, trials)) <= {json.dumps(asdict(trial)) for trial in plan.every}:
             raise SlamError(f"{out}: holds a comparison of more or other runs; give another --out, or --overwrite")
     require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)
     return frames
-
-
-def _has_all_of(plan: Plan, before: object) -> bool:
-    """Whether all runs of an earlier plan, in plain types, are among those of this one: its report may be replaced."""
-    now = json.loads(json.dumps(asdict(plan)))
-    if not isinstance(before, dict) or any(before.get(key) != now[key] for key in ("start", "stop", "replay")):
-        return False
-    parts = [(before.get(key), now[key]) for key in ("sequences", "backends", "variants")]
-    held = all(isinstance(old, list) and all(one in new for one in old) for old, new in parts)
-    return held and isinstance(before.get("trials"), int) and before["trials"] <= plan.trials
 
 
 def read_run(trial: Trial, out: Path) -> Run:

@@ -17,15 +17,14 @@ from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
 from slam.errors import SlamError, text_of
 from slam.evaluation.association_truth import SurfacePoints
-from slam.evaluation.consistency import stretch_nees
 from slam.evaluation.summary import with_truth
-from slam.files import read_text, remove_file, write_text
+from slam.files import read_text, remove_file
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.geometry.stamps import frame_range, pair
-from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.run.options import RunOptions
-from slam.run.outputs import csv_rows, naming_folder, write_json
+from slam.run.outputs import naming_folder, write_json
 from slam.run.recording import load_recording
 from slam.run.results import figures
 from slam.run.runner import run, run_recording
@@ -34,11 +33,8 @@ from slam.sequences import Sequence, open_sequence
 from slam.sequences.faults import said_before
 from slam.worlds import WorldSequence
 
-RESULT, SERIES, RECORDING = "result.json", "series.csv", "recording.npz"
+RESULT, RECORDING = "result.json", "recording.npz"
 COMPLETED = "completed"
-
-#: Columns of `SERIES`: time of a frame [s], and NEES of its pose since the start; NaN where it was not measured.
-SERIES_COLUMNS = ("stamp", "nees")
 
 #: Settings under which a front end has one thread; what it finds does not depend on it.
 _ONE_THREAD = {"surf": ["frontend.threads=1"]}
@@ -167,7 +163,6 @@ def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, flo
     times = summary.get("milliseconds", {})
     milliseconds = {stage: value for stage, value in times.get("median", {}).items() if value}
     milliseconds |= {"total": times["median_total"]} if times else {}
-    write_text(out / SERIES, csv_rows([SERIES_COLUMNS, *nees_series(record, sequence).tolist()]))
     return metrics, milliseconds
 
 
@@ -225,20 +220,3 @@ class MapRecord:
         ids = np.array([int(row["id"]) for row in rows], np.int64)
         errors = np.linalg.norm(positions @ R.T + t - self._truth.positions(ids), axis=1)
         return np.asarray(errors[np.isfinite(errors)])
-
-
-def nees_series(record: RunRecord, sequence: Sequence) -> Array:
-    """`SERIES_COLUMNS` of every frame that has a pose (N, 2), relative to the first measured pose."""
-    online, measured = record.trajectory, np.array(record.measured, bool)
-    rows = np.column_stack([online.stamps, np.full(len(online), np.nan)])
-    pairs = with_truth(online.select(measured), sequence) if len(online) else None
-    if pairs is None:
-        return rows
-    own, true = pairs
-    at = np.searchsorted(online.stamps, own.stamps)
-    if at[0] == np.flatnonzero(measured)[0]:
-        noise = getattr(sequence, "truth_noise", TruthNoise())
-        first, others = np.zeros(len(at) - 1, np.intp), np.arange(1, len(at))
-        covariances, common = np.array(record.covariances)[at], [record.common[row] for row in at]
-        rows[at[1:], 1] = stretch_nees(own, true, covariances, noise, first, others, common)
-    return rows

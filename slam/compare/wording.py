@@ -24,14 +24,17 @@ _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
 
 @dataclass(frozen=True)
 class Cell:
-    """One back end against the reference in one figure, in words."""
+    """One back end in one figure, in words: the mean over its trials, and how it lies against the reference."""
 
-    verdict: str  # how sure
-    direction: str  # "better", "worse"; empty where neither
     mean: str
-    interval: str
-    p: str
-    p_holm: str
+    sd: str
+    failed: int  # runs, where the figure counts them
+    verdict: str = ""  # how sure; this and what follows is empty for the reference
+    direction: str = ""  # "better", "worse"; empty where neither
+    difference: str = ""
+    interval: str = ""
+    p: str = ""
+    p_holm: str = ""
 
     @property
     def badge(self) -> str:
@@ -39,34 +42,28 @@ class Cell:
         return f"{self.direction}: {self.verdict}" if self.direction else self.verdict
 
 
-@dataclass(frozen=True)
-class Row:
-    """A figure of all back ends: mean and standard deviation of each, and the others against the first."""
-
-    label: str
-    means: list[tuple[str, str]]
-    cells: list[Cell]
-    failed: list[int]  # runs of each back end, where the row counts them
+def row(group: Group, metric: Metric) -> tuple[str, list[Cell]]:
+    """A row of a group's table: its label, and a cell for each back end, the reference first."""
+    against = group.differences(metric)
+    label = metric.label if metric is COMPLETED else metric.title
+    return label, [Cell(*_mean(group, backend, metric), *_verdict(against.get(backend))) for backend in group.runs]
 
 
-def row(group: Group, metric: Metric) -> Row:
-    """A row of a group's table."""
-    failed, label = [0] * len(group.runs), metric.title
-    means = []
-    for backend in group.runs:
-        mean, sd = (metric.scale * value for value in mean_and_sd(group.finite(backend, metric.key)))
-        means.append((shown(mean), f"± {shown(sd, mean)}" if np.isfinite(mean + sd) else ""))
+def _mean(group: Group, backend: str, metric: Metric) -> tuple[str, str, int]:
     if metric is COMPLETED:
-        failed, label = list(map(group.failures, group.runs)), metric.label
-        means = [(f"{group.trials - count} of {group.trials}", "") for count in failed]
-    return Row(label, means, list(map(_cell, group.differences(metric).values())), failed)
+        failed = group.failures(backend)
+        return f"{group.trials - failed} of {group.trials}", "", failed
+    mean, sd = (metric.scale * value for value in mean_and_sd(group.finite(backend, metric.key)))
+    return shown(mean), f"± {shown(sd, mean)}" if np.isfinite(mean + sd) else "", 0
 
 
-def _cell(d: Difference) -> Cell:
+def _verdict(d: Difference | None) -> tuple[str, ...]:
+    if d is None:
+        return ()
     direction = "" if d.better is None or d.verdict not in STRENGTH else "better" if d.better else "worse"
     p, p_holm = (shown_p(p) if d.varies else "–" for p in (d.p, d.p_holm))
-    equal = direction and _is_trifle(d)
-    return Cell("less than 1 %" if equal else d.verdict.value, "" if equal else direction, *_difference(d), p, p_holm)
+    said = ("less than 1 %", "") if direction and _is_trifle(d) else (d.verdict.value, direction)
+    return *said, *_difference(d), p, p_holm
 
 
 def sentences(group: Group) -> list[str]:
@@ -139,7 +136,7 @@ def measurements(mode: str, reference: str) -> str:
     """Which measurements the back ends were given, for captions."""
     if mode == REPLAY:
         return f"Replay: all back ends are given the measurements of {reference}'s closed loop"
-    return "Closed loop: each back end steers its own data association"
+    return "Closed loop: each back end's predictions choose its matches"
 
 
 # ------------------------------------------------------------------------------------------- numbers for people

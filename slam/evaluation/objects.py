@@ -145,8 +145,7 @@ class ObjectScore:
         flagged[result.moving_features] = True
         started = np.array([False] + [frame >= k for k in self.moves_from])
         moving = (labels > 0) & started[np.maximum(labels, 0)] & result.features.has_stereo
-        still = labels == 0
-        rows = {"right": flagged & moving, "missed": ~flagged & moving, "wrong": flagged & still, "still": still}
+        rows = {"right": flagged & moving, "missed": ~flagged & moving, "wrong": flagged & (labels == 0)}
         self._count.update({name: int(found.sum()) for name, found in rows.items()})
         named = set()
         for thing in result.objects:
@@ -161,7 +160,7 @@ class ObjectScore:
         for body in in_view:
             self._covered[body].append(body in truths)
         counted = sorted(truth for truth in truths if truth == 0 or truth in in_view)
-        self._count.update({"frames": 1, "counted right": counted == in_view, "false frames": 0 in truths})
+        self._count.update({"frames": 1, "counted right": counted == in_view})
 
     def summary(self) -> dict[str, Any]:
         """All figures; see docs/objects.md."""
@@ -173,9 +172,7 @@ class ObjectScore:
                 "precision": precision,
                 "recall": recall,
                 "F1": 2 * precision * recall / max(precision + recall, 1e-12),
-                "false moving per 1000 still": 1e3 * count["wrong"] / max(count["still"], 1),
             },
-            "false movers per frame": count["false frames"] / max(count["frames"], 1),
             "counted right": count["counted right"] / max(count["frames"], 1),
             "bodies": {str(b): self.body(b) for b in range(1, len(self.bodies) + 1)},
             "false objects": [len(life.frames) for life in self.lives.values() if life.truth == 0],
@@ -195,13 +192,9 @@ class ObjectScore:
         if len(rows) < 3:
             return figures
         true = self._world @ self.bodies[body - 1][frames]
-        both = rows[1:][(np.diff(rows) == 1) & (np.diff(frames[rows]) == 1)]
-        E = [motion_errors(own[[k - 1, k]], true[[k - 1, k]]) for k in both]
-        translations, rotations = (np.array([getattr(e, name)[0] for e in E]) for name in ("translation", "rotation"))
-        values = self._nees(body, life)
-        figures["ME"] = _summed(PathErrors(translations, rotations))
-        figures["relative, 10 frames"] = _summed(motion_errors(own, true, 10)) if len(own) > 10 else {}
-        figures["absolute"] = _summed(absolute_pose_errors(own[rows], true[rows]))
+        steps = rows[1:][(np.diff(rows) == 1) & (np.diff(frames[rows]) == 1)] - 1
+        errors, values = motion_errors(own, true), self._nees(body, life)
+        figures["ME"] = _summed(PathErrors(errors.translation[steps], errors.rotation[steps]))
         figures["mean NEES"], figures["dof"] = float(np.mean(values)) if len(values) else None, 6.0
         return figures
 

@@ -19,10 +19,10 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import MovingObject
 from slam.outputs import Output
+from slam.run.schema import body_colour
 
 _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR, as all colours here
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
-_BODIES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))
 _OLD, _NOW, _PATH, _INK = (200, 200, 200), (200, 130, 30), (0, 110, 240), (90, 90, 90)  # of the map
 _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
 _FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size
@@ -35,9 +35,10 @@ _AHEAD = 0.3  # of the map behind the camera
 _REACH = 2.5  # widths of the map in distances of the first landmarks
 
 
-def body_colour(number: int) -> tuple[int, int, int]:
-    """The colour (BGR) of a moving body in images, by its number."""
-    return _BODIES[(number - 1) % len(_BODIES)]
+def _bgr(body: int) -> tuple[int, int, int]:
+    """The colour of a moving body, by its id."""
+    red, green, blue = body_colour(body)
+    return blue, green, red
 
 
 def _extent(body: MovingObject) -> Array:
@@ -78,7 +79,7 @@ def with_legend(picture: np.ndarray, bodies: Sequence[MovingObject] = ()) -> np.
 
     bar = np.full((_LEGEND, picture.shape[1], 3), 255, np.uint8)
     marks = [(_BEACON, "landmark", 0), (_NEW, "new landmark", 0), (_MOVING, "feature that moves", 0)]
-    marks += [(body_colour(body.id), f"body {body.id}", 2) for body in bodies] or [(body_colour(1), "body", 2)]
+    marks += [(_bgr(body.id), f"body {body.id}", 2) for body in bodies] or [(_bgr(1), "body", 2)]
     at, middle = 12, _LEGEND // 2
     for colour, text, width in [*marks, (marks[-1][0], "body, not seen", 1)]:
         (room, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
@@ -103,7 +104,7 @@ def _draw_object(picture: np.ndarray, thing: MovingObject, result: FrameResult, 
     lower, upper = _extent(thing)
     corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
     measured, length = thing.estimate.measured, 0.6 * max(float((upper - lower).max()), 1e-3)
-    lines = [(corners[a], corners[b], body_colour(thing.id), 1 + measured) for a, b in _EDGES]
+    lines = [(corners[a], corners[b], _bgr(thing.id), 1 + measured) for a, b in _EDGES]
     lines += [(np.zeros(3), length * axis, colour, 4) for axis, colour in zip(np.eye(3), _AXES if measured else ())]
     for begin, end, colour, thickness in lines:
         uv = rig.left.project(transform(T_left_object, np.linspace(begin, end, _PARTS)))
@@ -130,7 +131,7 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
     x = min(max(left, 0), max(picture.shape[1] - width, 0))
     y = min(max(top, height), picture.shape[0] - base)
     cv2.rectangle(picture, (x, y - height), (x + width, y + base), _RING, cv2.FILLED)
-    cv2.putText(picture, text, (x, y), _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
+    cv2.putText(picture, text, (x, y), _FONT, _TEXT, _bgr(thing.id), 1, cv2.LINE_AA)
 
 
 def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
@@ -178,7 +179,7 @@ class GrowingMap:
         cv2.polylines(picture, [path], False, _PATH, 2, cv2.LINE_AA)
         cv2.circle(picture, path[-1].tolist(), 5, _PATH, -1, cv2.LINE_AA)
         for body in result.objects:
-            colour, extent = body_colour(body.id), _extent(body)
+            colour, extent = _bgr(body.id), _extent(body)
             corners = np.array([[extent[i, 0], 0, extent[j, 2]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
             outline = pixels(transform(body.estimate.T_world_object, corners))
             cv2.polylines(picture, [outline], True, colour, 2, cv2.LINE_AA)

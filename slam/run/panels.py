@@ -13,15 +13,16 @@ import numpy as np
 
 from slam.geometry.se3 import Array, inverse, transform
 from slam.run.run_data import RunData, place_of_truth, pose_errors, well_known
-from slam.run.schema import STAGE_NAMES
+from slam.run.schema import STAGE_NAMES, body_colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#00838f", "iekf": "#ad1457"}
+
+#: Dark below, light above: ekf and window often coincide, and both should be seen.
+_BACKENDS = {"ekf": "#0d47a1", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#26c6da", "iekf": "#ad1457"}
 _OTHERS = ("#2e7d32", "#c62828", "#5d4037", "#9e9d24")
 _TRUTH, _BEFORE, _NOT_NOW, _NOW = "0.3", "0.8", "#9fa8da", "#283593"
-_BODIES = ("#c2185b", "#6a1b9a", "#5d4037", "#00695c")
 _LOOPS = ("o", "k", "loops closed"), ("x", "#c62828", "loops refused")
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _NAME = 2.0  # [in] room for a mark and its name
@@ -119,8 +120,9 @@ def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
     for rows, (mark, shade, label) in zip((run.loops, run.refused), _LOOPS):
         if len(rows):
             axis.plot(*final[rows[:, 0]].T, mark, ms=6, mfc="none", color=shade, label=label)
-    for (body, positions), shade in zip(run.bodies.items(), cycle(_BODIES)):
-        axis.plot(*positions[:, [0, 2]].T, "-s", ms=5, lw=1.5, markevery=[-1], color=shade, label=f"body {body}")
+    for body, positions in run.bodies.items():
+        rgb = np.array(body_colour(int(body))) / 255
+        axis.plot(*positions[:, [0, 2]].T, "-s", ms=5, lw=1.5, markevery=[-1], color=rgb, label=f"body {body}")
     if run.truth is not None:
         axis.plot(*transform(place_of_truth(run), run.truth.positions)[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0,
                   label="true path")  # fmt: skip

@@ -6,6 +6,7 @@ A row has the figure's name, unit, place in the summary, and which way is better
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -118,6 +119,10 @@ _OF_BODIES = {
 }
 
 
+#: Why no NEES is known: in the map of an earlier run, and elsewhere.
+_IN_MAP = (
+    "covariances are not judged in a prior map: all poses share its errors, which the truth of this run does not tell"
+)
 _NOT_JUDGED = (
     "covariances cannot be judged: they leave none for the motion between two poses, as where a back end claims the "
     "same one for every frame"
@@ -138,7 +143,7 @@ def facts(summary: Mapping[str, Any]) -> str:
     found = _of_run(summary) if summary else {}
     shown = [m for m in _OF_RUN if m.key in _IN_PICTURE and found.get(m.key)]
     words = [f"{m.label} {_length(found[m.key], m)}".rstrip() for m in shown]
-    return "; ".join([*words, *filter(None, [verdict_of_run(summary)])])
+    return "; ".join([*words, *filter(None, [re.sub(r" \([^)]*\)", "", verdict_of_run(summary))])])
 
 
 def _length(value: float, metric: Metric) -> str:
@@ -225,15 +230,16 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     others = [f"{over} {number(ratios[over])} times: {word}" for over, word in said.items() if word != said[judged]]
     word = f"are {said[judged]}" if said[judged] != "right" else "hold in part" if others else "hold"
     of = "runs" if runs == 1 else f"means of {runs} runs"
-    times = f"{judged} errors are {number(ratio)} times what they claim ({low:.2f} to {high:.2f} in 95 % of {of})"
-    return "; ".join([f"covariances {word}: {times}", *others])
+    times = f"{judged} errors of the pose are {number(ratio)} times what they claim"
+    band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
+    return "; ".join([f"covariances {word}: {times} {band}", *others])
 
 
 def verdict_of_run(summary: Mapping[str, Any]) -> str:
     """`verdict` on a run by its summary, with what it leaves out; empty where no true path is known."""
     text, honest = verdict(figures(summary)), summary.get("consistency") or {}
     if not text:
-        return _NOT_JUDGED if honest.get("dof") else ""
+        return "" if not honest.get("dof") else _IN_MAP if _at(summary, ("loops", "known")) else _NOT_JUDGED
     if "are too large" in text and honest.get(EXACT):
         text += "; they count errors of the calibration, and this world's cameras have none"
     if left_out := summary["frames"] - _measured(summary):

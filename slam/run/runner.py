@@ -184,7 +184,7 @@ class _Run:
         with RunFiles(out) as files:
             write_json(out / "config.json", origin(self.options) | names | self._config(frontend, backend))
             with self._each():
-                write_json(out / "schema.json", schema(self.options.config, frontend, backend))
+                write_json(out / "schema.json", schema())
             try:
                 for number, result in results:
                     record.add(number, result)

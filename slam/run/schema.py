@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from slam.config import SystemConfig
-from slam.run.settings_reference import descriptions
-
 #: Stages of a step, in their order, and what each does: columns ``ms_…`` of frames.csv.
 STAGE_NAMES = {
     "read": "reading images",
@@ -20,6 +17,15 @@ STAGE_NAMES = {
     "atlas": "places and loops",
 }
 STAGES = tuple(STAGE_NAMES)
+
+#: Colours of bodies (red, green, blue); none is that of a path, a landmark or a loop.
+_BODY_COLOURS = (216, 27, 96), (142, 36, 170), (0, 137, 123), (109, 76, 65), (130, 119, 23)
+
+
+def body_colour(body: int) -> tuple[int, int, int]:
+    """The colour (red, green, blue) of a moving body in images, maps and the viewer, by its id."""
+    return _BODY_COLOURS[(body - 1) % len(_BODY_COLOURS)]
+
 
 #: Frames of coordinates.
 FRAMES = {
@@ -122,7 +128,7 @@ FILES = {
     "objects.csv": "a row per frame and moving body",
     "summary.json": "counts, accuracy and consistency where the truth is known, timings; written last",
     "config.json": "what was run, with all settings; `slam run --config` repeats it",
-    "schema.json": "columns and settings with units and meanings",
+    "schema.json": "columns with units and meanings",
     "summary.png": "a picture of the run",
 }
 
@@ -132,12 +138,9 @@ def header(table: tuple[Column, ...]) -> tuple[str, ...]:
     return tuple(column.name for column in table)
 
 
-def schema(config: SystemConfig, frontend: object, backend: object) -> dict[str, Any]:
-    """The contents of ``schema.json`` for a run with these settings, front end and back end."""
-    settings = descriptions(config, "")
-    for section, part in (("frontend", frontend), ("backend", backend)):
-        settings |= descriptions(getattr(part, "config", None), section)
+def schema() -> dict[str, Any]:
+    """The contents of ``schema.json``."""
     files: dict[str, dict[str, Any]] = {name: {"meaning": text} for name, text in FILES.items()}
     for name, table in TABLES.items():
         files[name]["columns"] = [{"name": c.name, "unit": c.unit, "meaning": c.text} for c in table]
-    return {"files": files, "frames": FRAMES, "settings": settings}
+    return {"files": files, "frames": FRAMES}

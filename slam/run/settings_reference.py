@@ -16,6 +16,7 @@ from slam.settings import can_be_set
 
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
 _UNIT = re.compile(r"\[((?:px|m|rad|s|degrees|grey levels)(?:[²³]|/s²?|/√s)*(?: / √s)?)\]")
+_RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
 _PARTS = ("frontend", "backend")  # sections whose settings are those of a class chosen by name
 
 
@@ -36,43 +37,47 @@ def settings() -> Iterator[Setting]:
     for f in fields(SystemConfig):
         if f.name not in _PARTS:
             parts = {kind: getattr(config, f.name) for kind, config in configs.items()}
-            yield from (s for s in _of_class(parts, f.name, "") if can_be_set(s.key, ""))
-    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
+            yield from (s for s in _of_class(parts, f.name) if can_be_set(s.key))
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
-            named: dict[str, Any] = {section: name}
-            parts = {}
-            for kind in KINDS:
-                options = getattr(SystemConfig.for_kind(kind, **named), section)
-                parts[kind] = getattr(registry.create(f"{section}s", name, rig, **options), "config", None)
-            if all(map(is_dataclass, parts.values())):
-                yield from (s for s in _of_class(parts, section, name) if can_be_set(s.key, name))
+            yield from options_of(section, name)
 
 
-def _of_class(configs: dict[str, Any], section: str, owner: str) -> Iterator[Setting]:
+def options_of(section: str, name: str) -> Iterator[Setting]:
+    """Options that a user can set of a front end (`section` is ``"frontend"``) or back end by its name.
+
+    Raises:
+        UnknownNameError: it cannot be loaded.
+    """
+    known = registry.options_of(registry.resolve(f"{section}s", name), _RIG) or {}
+    for option, (default, described) in known.items():
+        key = f"{section}.{option}"
+        if can_be_set(key, name):
+            configs = {kind: SystemConfig.for_kind(kind, name if section == "frontend" else None) for kind in KINDS}
+            defaults = {kind: getattr(config, section).get(option, default) for kind, config in configs.items()}
+            yield Setting(key, name, defaults, *documented(described).get(option, ("", "")))
+
+
+def _of_class(configs: dict[str, Any], section: str) -> Iterator[Setting]:
     """Settings of one configuration class, given its instances by kind of motion."""
     first = next(iter(configs.values()))
     texts = documented(type(first))
     for f in fields(first):
         values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
         if is_dataclass(getattr(first, f.name)):
-            yield from _of_class(values, key, owner)
+            yield from _of_class(values, key)
         else:
-            yield Setting(key.lstrip("."), owner, values, *texts.get(f.name, ("", "")))
+            yield Setting(key, "", values, *texts.get(f.name, ("", "")))
 
 
-def descriptions(config: object, section: str) -> dict[str, dict[str, str]]:
-    """Unit and meaning of each setting of a configuration below `section`, by key; nothing of another object."""
-    if not is_dataclass(config) or isinstance(config, type):
-        return {}
-    return {s.key: {"unit": s.unit, "meaning": s.text} for s in _of_class({"": config}, section, "") if "." in s.key}
+def documented(kind: Any) -> dict[str, tuple[str, str]]:
+    """Unit and meaning of each field of a class, from the ``Attributes:`` of its docstring and of its bases'.
 
-
-def documented(kind: type) -> dict[str, tuple[str, str]]:
-    """Unit and meaning of each field of a class, from the ``Attributes:`` of its docstring and of its bases'."""
+    Of arguments of a constructor or function, from ``Args:``.
+    """
     found: dict[str, tuple[str, str]] = {}
-    for base in reversed(kind.__mro__):
-        section = re.search(r"^Attributes:\n((?: {4}.*\n?|\n)*)", cleandoc(base.__doc__ or ""), re.M)
+    for base in reversed(getattr(kind, "__mro__", (kind,))):
+        section = re.search(r"^(?:Attributes|Args):\n((?: {4}.*\n?|\n)*)", cleandoc(base.__doc__ or ""), re.M)
         for names, text in _ENTRY.findall(section[1] if section else ""):
             plain = " ".join(text.split())
             units, each = _UNIT.findall(plain), names.split(", ")

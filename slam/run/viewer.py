@@ -22,6 +22,7 @@ from slam.geometry.se3 import Array, inverse, quaternion
 from slam.geometry.trajectory import Trajectory
 from slam.outputs import Output, require_outputs
 from slam.run.run_data import RunData, read_objects
+from slam.run.schema import body_colour
 from slam.system import StereoSlam
 
 LIVE = "live"
@@ -82,7 +83,9 @@ class Viewer:
         for moving in result.objects:
             place, box = f"/objects/{moving.id}", moving.extent
             self.log(place, self._transform(moving.estimate.T_world_object))
-            boxes = rr.Boxes3D(centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=_MOVING)
+            boxes = rr.Boxes3D(
+                centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=body_colour(moving.id)
+            )
             self.log(f"{place}/box", boxes)
         loops = [(loop.first, loop.second) for loop in system.atlas.loops]
         if loops and result.keyframe:
@@ -141,7 +144,8 @@ def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
             viewer.show_pose(number, float(stamp), pose)
             for seen, name, position in objects:
                 if abs(seen - stamp) < 1e-6:
-                    viewer.log(f"/objects/{name}", viewer.rr.Points3D([position], colors=_MOVING, radii=0.03))
+                    mark = viewer.rr.Points3D([position], colors=body_colour(int(name)), radii=0.03)
+                    viewer.log(f"/objects/{name}", mark)
         viewer.show_map(run.positions, run.covariances, run.seen_last)
 
 

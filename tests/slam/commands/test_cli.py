@@ -7,7 +7,10 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import typer
 
+from slam.commands.run import finish
+from slam.outputs import Output
 from slam.sequences import open_sequence
 from slam.worlds.export import write_euroc
 
@@ -87,3 +90,20 @@ def test_wrong_variables_of_libraries_end_in_one_line_or_do_no_harm(tmp_path):
     done = in_a_new_process(*run, env={**os.environ, "MPLBACKEND": "nonsense"})
     assert done.returncode == 0, done.stderr
     assert list((tmp_path / "out").glob("*.png"))
+
+
+def test_a_run_without_any_pose_says_why_there_is_no_picture(capsys, tmp_path):
+    """It warned that this was not the folder of a finished run."""
+    summary = {
+        "sequence": "s",
+        "backend": "ekf",
+        "frames": 2,
+        "status": {"lost": 2},
+        "tracking": "no frame was tracked",
+    }
+    with pytest.raises(typer.Exit) as ended:
+        finish(summary, [Output(tmp_path, "--out", [])], picture=True, quiet=True)
+    assert ended.value.exit_code == 1
+    assert capsys.readouterr().err == "slam: no frame was tracked; no picture: no frame has a pose\n"
+    with pytest.raises(typer.Exit):
+        finish(summary | {"frames": 0}, [Output(tmp_path, "--out", [])], picture=True, quiet=True)

@@ -104,6 +104,35 @@ def test_options_of_front_ends_and_back_ends_are_there(every, role):
         assert {s.key for s in every if s.owner == name and s.key.startswith(role)} == wanted
 
 
+OWN = """
+from dataclasses import dataclass
+from backends.ekf import EkfBackend
+class Near(EkfBackend):
+    def __init__(self, rig, models=None, least=2.0, **options):
+        super().__init__(rig, **options)
+class Plain:
+    def __init__(self, rig, models=None): pass
+"""
+
+
+def test_options_of_a_class_of_one_s_own_are_listed_and_named_in_errors(tmp_path, monkeypatch):
+    """They were in neither, nor was a wrong one refused that was given with an object."""
+    (tmp_path / "own_options.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    shown = "\n".join(listing("own_options:Near", 80))
+    assert "backend.least = 2.0" in shown and "backend.iterations = 5\n      most linearisations" in shown
+    with pytest.raises(
+        ConfigurationError, match=r"unknown option 'leest' \(did you mean 'least'\?\); known: least, pap"
+    ):
+        registry.create("backends", "own_options:Near", RIG, leest=3.0)
+    with pytest.raises(SlamError, match="names no options"):
+        list(listing("own_options:Plain", 80))
+    config = SystemConfig().with_settings({"backend.leest": 3.0})
+    with pytest.raises(ConfigurationError, match=r"backend\.leest: an object is made with its options"):
+        slam.StereoSlam(RIG, backend=registry.create("backends", "ekf", RIG.rectified.rig), config=config)
+
+
 def test_an_unknown_section(read):
     with pytest.raises(SlamError, match="did you mean 'map'"):
         list(listing("mapp", 80))

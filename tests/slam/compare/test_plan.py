@@ -10,7 +10,7 @@ from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
 from slam.compare.statistics import fewest
 from slam.compare.tables import most_tests
 from slam.compare.wording import caution
-from slam.errors import ConfigurationError
+from slam.errors import ConfigurationError, UnknownNameError
 
 WORLDS = ("synthetic:aisle?frames=30", "synthetic:box")
 
@@ -43,6 +43,11 @@ def test_trials_are_paired_and_have_folders_of_their_own():
 def test_bad_plans(arguments, word):
     with pytest.raises(ConfigurationError, match=word):
         Plan(*arguments)
+
+
+def test_a_mistyped_front_end_is_answered_with_all_of_them():
+    with pytest.raises(UnknownNameError, match=r"'simulatd' \(did you mean 'simulated'\?\); known: surf, simulated"):
+        variants_of(["simulatd"], [], [])
 
 
 def test_no_more_workers_than_anybody_has(tmp_path):

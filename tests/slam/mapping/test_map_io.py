@@ -171,6 +171,7 @@ def test_a_second_run_elsewhere_in_the_map_is_in_the_maps_world(backend):
         truth = start @ T
         result = system.process_features(cloud.features(truth, k / 30, 0.3)[0])
         assert result.status is FrameStatus.TRACKED and result.located
+        assert "of 0 landmarks" not in repr(result)  # where the camera is found, nothing was predicted
         errors.append(np.linalg.norm(result.estimate.T_world_left[:3, 3] - truth[:3, 3]))
     assert max(errors) < 0.02  # of points 2 to 6 m away, 0.3 px
     assert len(system.trajectory()) == 30  # the frame before the camera was found has no pose

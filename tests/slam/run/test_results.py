@@ -17,12 +17,16 @@ TEN, ONE, START, HUNDRED = "nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof"
     ("found", "runs", "words"),
     [
         ({}, 1, ""),
-        ({START: 1.0}, 1, "hold: from the start errors are 1 times what they claim (0.45 to 1.55 in 95 % of runs)"),
-        ({START: 1.6}, 12, "are too small: from the start errors are 1.26 times what they claim (0.84 to 1.16 in 95 %"),
-        ({START: 0.1}, 1, "are too large: from the start errors are 0.316 times"),
-        ({TEN: 1.2, START: 0.9}, 1, "hold: over 10 m errors are 1.1 times"),
-        ({TEN: 1.2, START: 40.0}, 1, "hold in part: over 10 m errors are 1.1 times"),
-        ({ONE: 4.0, START: 1.0}, 1, "are too small: over 1 m errors are 2 times"),
+        ({START: 1.0}, 1, "hold: from the start errors of the pose are 1 times what they claim (0.45 to 1.55 in 95 %"),
+        (
+            {START: 1.6},
+            12,
+            "are too small: from the start errors of the pose are 1.26 times what they claim (0.84 to 1.16",
+        ),
+        ({START: 0.1}, 1, "are too large: from the start errors of the pose are 0.316 times"),
+        ({TEN: 1.2, START: 0.9}, 1, "hold: over 10 m errors of the pose are 1.1 times"),
+        ({TEN: 1.2, START: 40.0}, 1, "hold in part: over 10 m errors of the pose are 1.1 times"),
+        ({ONE: 4.0, START: 1.0}, 1, "are too small: over 1 m errors of the pose are 2 times"),
     ],
 )
 def test_the_verdict_is_by_the_best_figure_and_its_band(found, runs, words):
@@ -73,6 +77,7 @@ def test_covariances_that_cannot_be_judged_say_so(nees):
     """A back end that claims the same covariance in every frame had no verdict, and no word why."""
     tree = summary(1.0) | {"consistency": {"mean NEES": nees, "dof": 6.0, "no covariance over 1 m": 1.0}}
     assert "cannot be judged" in verdict_of_run(tree) and "claims the same one for every frame" in verdict_of_run(tree)
+    assert "not judged in a prior map" in verdict_of_run(tree | {"loops": {"known": 5}})
     assert verdict_of_run(tree | {"consistency": {}}) == ""  # without a true path
 
 
