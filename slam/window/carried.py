@@ -6,19 +6,19 @@ import numpy as np
 
 from slam.kernels.se3 import adjoint, between
 from slam.kernels.velocities import add_velocity_rows, velocity_change
-from slam.runtime.compilation import helper, kernel
+from slam.runtime.compilation import helper
 
 
-@kernel
-def carried_rows(poses, column, cameras, covariance, triple, interval, mean, variance, H, b):
+@helper
+def add_carried(poses, column, carried, H, b):
     """Add constant velocity of a body, disturbed, whose window's poses are those of a camera in the body.
 
     With Y_k of `poses` (K, 4, 4) and X_k of `cameras` (K, 4, 4), T_world_left, the body is at ``B_k = X_k Y_k⁻¹``. The
     change of its velocity is noise with `variance` (V, 6), besides the error of the cameras, whose joint `covariance`
     (6 K, 6 K) counts in each row by itself: errors of successive rows hang together, but little of what they are is
-    the camera's. `triple` (V, 3), `interval` (V, 2): see `slam.window.kernels.motion_rows`; `mean` (V, 6) is of the
-    velocity where the first pose is −1. Returns the sum of squares.
+    the camera's. Arrays are those of `slam.window.problem.Carried`. Returns the sum of squares.
     """
+    cameras, covariance, triple, interval, mean, variance = carried
     count = len(poses)
     bodies, Ad = np.zeros((count, 4, 4)), np.empty((count, 6, 6))
     back, one = np.empty((3, 4)), np.zeros((4, 4))
