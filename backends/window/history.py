@@ -138,8 +138,20 @@ def state_corrected(
             by_rig[:, -1:] -= (prior.information[:, : change.size] @ change.ravel())[:, None]
         prior = replace(prior, origin=prior.origin + change, by_rig=by_rig)
     rows = replace(s.rows, z=stereo.corrected("window", s.rows.z, correct))
-    past = s.past.displaced(marks.serial, position - marks.position) if len(marks) else s.past
+    displacement = position - marks.position
+
+    def shift(own: Array) -> Array:
+        """By how much landmarks (S,) of these serial numbers are displaced, those that are no more by nothing."""
+        at = np.searchsorted(marks.serial, own).clip(0, len(marks) - 1)
+        return np.where((marks.serial[at] == own)[:, None], displacement[at], 0.0)
+
+    past = s.past
+    if len(marks):  # as if they had stood there before
+        past = tuple(
+            replace(one, points=one.points + shift(one.serials), positions=one.positions + shift(one.stayed))
+            for one in past
+        )
     by_rig = marks.by_rig.copy()
     if not whole:
-        by_rig[:, :, -1:] -= (position - marks.position)[:, :, None]
+        by_rig[:, :, -1:] -= displacement[:, :, None]
     return replace(s, rows=rows, landmarks=replace(marks, position=position, by_rig=by_rig), prior=prior, past=past)

@@ -22,7 +22,7 @@ def point_relations(T, points, place, E, pose_of, cross, first, order, column, i
     factor, `P_poses` (6 F, 6 F) the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse`
     is by `eliminate`.
     """
-    n, size, at = len(X), len(P_poses), newest - prior
+    size, at = len(P_poses), newest - prior
     camera, world = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 3))
     own, by = np.empty((3, 3)), np.zeros((3, 6))
     blocks = _covariances(X, prior, newest)
@@ -102,8 +102,8 @@ def _covariances(X, unknown, newest):
 
 @kernel
 def rig_columns(
-    camera, poses, column, points, place, E, rows, field, prior, by_first, members, unknown, pose_of, cross, first, order,
-    inverse, n,
+    camera, poses, column, points, place, E, rows, field, prior, by_first, members, unknown, pose_of, cross, first,
+    order, inverse, n,
 ):  # fmt: skip
     """How ``H x = b`` depends on m errors of the rig, which displace measurements by `field` (M, 3, m): B (n, m).
 

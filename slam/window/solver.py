@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -89,7 +89,9 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
         centre: the pose from which inverse distances of points outside the prior count.
         whole: with H; without it, H is left undefined, and only a factor of other equations may be used.
     """
-    own = (np.zeros((0, 3)), np.zeros((0, 3, 3))) if w.mean is None or w.information is None else (w.mean, w.information)
+    own = (
+        (np.zeros((0, 3)), np.zeros((0, 3, 3))) if w.mean is None or w.information is None else (w.mean, w.information)
+    )
     return NormalEquations(w, *kernels.normal_equations(
         w.stereo.intrinsics, w.poses, w.column, w.points, w.place, w.basis, centre, w.rows.arrays, w.places.arrays, own,
         w.motion.arrays, w.carried.arrays, w.prior.arrays, w.pose_of, *w.by_point, whole, w.unknowns,
@@ -205,7 +207,7 @@ def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:
 
 
 def _upper_inverse(U: Array) -> Array:
-    """Inverse of an upper triangular matrix (n, n), by halves: products of matrices take a fraction of LAPACK's time."""
+    """Inverse of an upper triangular matrix (n, n), by halves: products take a fraction of the time of LAPACK's own."""
     n = len(U)
     if n <= _WHOLE:
         return np.asarray(dtrtri(U, lower=0)[0] if n else U)
