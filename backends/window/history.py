@@ -10,6 +10,7 @@ import numpy as np
 
 from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
+from slam.data import IdArray
 from slam.geometry.se3 import Array
 from slam.window import chart_kernels
 from slam.window.stereo import RectifiedStereo
@@ -140,7 +141,7 @@ def state_corrected(
     rows = replace(s.rows, z=stereo.corrected("window", s.rows.z, correct))
     displacement = position - marks.position
 
-    def shift(own: Array) -> Array:
+    def shift(own: IdArray) -> Array:
         """By how much landmarks (S,) of these serial numbers are displaced, those that are no more by nothing."""
         at = np.searchsorted(marks.serial, own).clip(0, len(marks) - 1)
         return np.where((marks.serial[at] == own)[:, None], displacement[at], 0.0)

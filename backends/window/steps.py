@@ -202,7 +202,7 @@ def _seen_from_newest(s: WindowState, rows: IndexArray, by_motion: Array = _STIL
     They are for a known last solved pose, from which the camera has moved by what has the covariance (6, 6) given.
     """
     marks = s.landmarks
-    return seen(s.poses[-1], s.poses[s.solved], marks.position[rows], marks.local[rows], by_motion)  # type: ignore[no-any-return]
+    return seen(s.poses[-1], s.poses[s.solved], marks.position[rows], marks.local[rows], by_motion)
 
 
 def _with(s: WindowState, new: WindowLandmarks) -> WindowState:

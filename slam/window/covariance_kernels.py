@@ -27,7 +27,7 @@ def point_relations(T, points, place, E, pose_of, cross, first, order, column, i
     own, by = np.empty((3, 3)), np.zeros((3, 6))
     blocks = _covariances(X, prior, newest)
     A, AP = np.zeros((3, size)), np.zeros((3, size))
-    q, D, G, tmp = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 3))
+    q, D, G, M = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6))
     for p in range(len(points)):
         d = place[p]
         if d >= 0:
@@ -72,16 +72,14 @@ def point_relations(T, points, place, E, pose_of, cross, first, order, column, i
         G[1, 0], G[2, 0], G[2, 1] = q[2], -q[1], q[0]
         G[0, 3] = G[1, 4] = G[2, 5] = -1.0
         for i in range(3):
-            for j in range(3):
-                tmp[i, j] = 0.0
-                for a in range(6):
-                    for k in range(3):
-                        tmp[i, j] += D[i, k] * by[k, a] * G[j, a]
-                    for k in range(6):
-                        tmp[i, j] += 0.5 * G[i, a] * P_poses[at + a, at + k] * G[j, k]
+            for j in range(6):
+                M[i, j] = row_times(D, i, by[:, j])
+                for k in range(6):
+                    M[i, j] += 0.5 * G[i, k] * P_poses[at + k, at + j]
         for i in range(3):
             for j in range(3):
-                camera[p, i, j] += tmp[i, j] + tmp[j, i]
+                for k in range(6):
+                    camera[p, i, j] += M[i, k] * G[j, k] + G[i, k] * M[j, k]
     return camera, world
 
 

@@ -12,30 +12,35 @@ from slam.window import chart_kernels, covariance_kernels
 from slam.window.problem import RelativePrior, Window
 from slam.window.solver import linearised
 
+_LEAST = 0.1  # numerics: share of its inverse distance that a point keeps at least in a step, as in `displace`
+
 
 @dataclass(frozen=True, eq=False)
 class Conditional:
     """Where what left stands, given what stayed: ``x = mean − gain y``, to first order.
 
     x and y are the changes since it left: first of points, in their charts' coordinates, then of poses as tangent
-    vectors.
-
-    Attributes:
-        mean: (g,).
-        gain: (g, s).
-        left, stayed: derivatives (G, 3, 3) and (S, 3, 3) of the points in the world by those coordinates.
+    vectors. Points change by inverse distance, not by distance: far ones may move by a multiple of what they were off.
     """
 
-    mean: Array
-    gain: Array
-    left: Array
-    stayed: Array
+    mean: Array  # (g,)
+    gain: Array  # (g, s)
+    left: Array  # derivatives (G, 3, 3) of the points that left, in the world, by those coordinates
+    stayed: Array  # likewise (S, 3, 3) of those that stayed
 
     def of(self, stayed: Array, poses: Array) -> tuple[Array, Array]:
         """Changes of points that left (G, 3) [m] and of the pose (6,), by those of points (S, 3) and poses (P, 6)."""
-        y = np.linalg.solve(self.stayed, stayed[:, :, None])
+        s = np.linalg.solve(self.stayed, stayed[:, :, None])[:, :, 0]
+        y = s / np.maximum(1.0 - _distance(self.stayed) * s[:, 2:], _LEAST)  # the inverse of `chart_kernels.displace`
         x = self.mean - self.gain @ np.concatenate([y.ravel(), poses.ravel()])
-        return (self.left @ x[:-6].reshape(-1, 3, 1))[:, :, 0], x[-6:]
+        d = x[:-6].reshape(-1, 3)
+        moved = (self.left @ d[:, :, None])[:, :, 0] / np.maximum(1.0 + _distance(self.left) * d[:, 2:], _LEAST)
+        return moved, x[-6:]
+
+
+def _distance(E: Array) -> Array:
+    """Distances (N, 1) of points from their charts' centres, by their derivatives (N, 3, 3)."""
+    return np.asarray(np.linalg.norm(E[:, :, 0], axis=1)[:, None])
 
 
 def marginalised(

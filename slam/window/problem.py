@@ -16,12 +16,18 @@ KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
 
 @dataclass(frozen=True, eq=False)
 class Rows(Table):
-    """Measurements of points from poses, a row each."""
+    """Measurements of points from poses, a row each.
 
-    pose: IndexArray  # indices of the pose (M,)
-    point: IndexArray  # and of the point (M,)
-    z: Array  # as `RectifiedStereo.measure` gives them (M, 3) = (uL, vL, uR); uR is NaN where there is no right pixel
-    weight: Array  # 1 / σ (M,) [1/px]; 0 for a row that does not count
+    Attributes:
+        pose, point: indices of the pose and the point (M,).
+        z: as `RectifiedStereo.measure` gives them (M, 3) = (uL, vL, uR); uR is NaN where there is no right pixel.
+        weight: 1 / σ (M,) [1/px]; 0 for a row that does not count.
+    """
+
+    pose: IndexArray
+    point: IndexArray
+    z: Array
+    weight: Array
 
     @classmethod
     def none(cls) -> Rows:
@@ -133,21 +139,36 @@ class RelativePrior:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A few poses, many points, and what is known of them."""
+    """A few poses, many points, and what is known of them.
 
-    stereo: RectifiedStereo  # the rectified rig that measures
-    poses: Array  # T_world_left (K, 4, 4)
-    points: Array  # in world coordinates (N, 3) [m]
-    rows: Rows  # measurements
-    free: np.ndarray | None = None  # which poses are unknown (K,); None for all. Those of the prior must be
-    known: np.ndarray | None = None  # which points are exact (N,); None for none
-    mean: Array | None = None  # independent priors of points in world coordinates (N, 3); None for no point
-    information: Array | None = None  # their information (N, 3, 3) [1/m²], zero for none
-    places: Places = field(default_factory=Places.none)  # points that are known relative to a pose
-    motion: Motion = field(default_factory=Motion.none)  # constant velocity between successive poses
-    carried: Carried = field(default_factory=Carried.none)  # constant velocity of what the points belong to
-    prior: RelativePrior = field(default_factory=RelativePrior.none)  # of the first poses and of some points together
-    # points that are unknowns beside those of the prior (J,), instead of being eliminated
+    Attributes:
+        stereo: the rectified rig that measures.
+        poses: T_world_left (K, 4, 4).
+        points: in world coordinates (N, 3) [m]; those that nothing measures take no part.
+        rows: measurements.
+        free: which poses are unknown (K,); None for all. Those of the prior must be.
+        known: which points are exact (N,); None for none.
+        mean, information: independent priors of points in world coordinates (N, 3), (N, 3, 3) [1/m²], zero for none;
+            None for no point.
+        places: points that are known relative to a pose.
+        motion: constant velocity between successive poses.
+        carried: constant velocity of what the points belong to.
+        prior: what is known of the first poses and of some points together.
+        joining: points that are unknowns beside those of the prior (J,), instead of being eliminated.
+    """
+
+    stereo: RectifiedStereo
+    poses: Array
+    points: Array
+    rows: Rows
+    free: np.ndarray | None = None
+    known: np.ndarray | None = None
+    mean: Array | None = None
+    information: Array | None = None
+    places: Places = field(default_factory=Places.none)
+    motion: Motion = field(default_factory=Motion.none)
+    carried: Carried = field(default_factory=Carried.none)
+    prior: RelativePrior = field(default_factory=RelativePrior.none)
     joining: IndexArray = field(default_factory=lambda: np.zeros(0, np.intp))
 
     @cached_property

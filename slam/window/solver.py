@@ -100,12 +100,19 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A solved window."""
+    """A solved window.
 
-    window: Window  # poses and points as found
-    equations: NormalEquations  # linearised next to the solution
-    cost: float  # at the solution
-    converged: bool = True  # False where the steps ran out, or none of them lessened the cost
+    Attributes:
+        window: poses and points as found.
+        equations: linearised next to the solution.
+        cost: at the solution.
+        converged: False where the steps ran out, or none of them lessened the cost.
+    """
+
+    window: Window
+    equations: NormalEquations
+    cost: float
+    converged: bool = True
 
     @cached_property
     def inverse_factor(self) -> Array:
@@ -129,7 +136,7 @@ class Solution:
         """
         w, e = self.window, self.equations
         B, own = e.by_rig(field)
-        X = np.ascontiguousarray(dpotrs(e.factor, B, lower=0)[0]) if B.size else B
+        X = self.inverse_factor.T @ (self.inverse_factor @ B)
         points = covariance_kernels.rig_points(
             w.column, w.place, e.E, w.pose_of, e.cross, *w.by_point, e.inverse, own, X
         )

@@ -8,7 +8,7 @@ import pytest
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.window import chart_kernels, solver
-from slam.window.marginal import marginalised
+from slam.window.marginal import Conditional, marginalised
 from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.solver import linearised
 from slam.window.stereo import RectifiedStereo
@@ -237,6 +237,15 @@ def test_what_left_follows_what_stayed():
     poses = np.array([se3.log(se3.inverse(T) @ M @ T) for T in w.poses[others]])
     x = conditional.of(points, poses)[1]
     np.testing.assert_allclose(w.poses[1] @ se3.exp(x), M @ w.poses[1], atol=1e-6)
+
+
+def test_a_point_that_has_moved_far_counts_by_its_inverse_distance():
+    """By its distance, what left would follow it by a hundred times as much, and the next one by as much again."""
+    E = np.diag([5.0, 5.0, -25.0])[None]  # of a point 5 m ahead
+    gain = np.zeros((9, 9))
+    gain[2, 2] = 1.0
+    moved, _ = Conditional(np.zeros(9), gain, E, E).of(np.array([[0.0, 0.0, 495.0]]), np.zeros((1, 6)))
+    np.testing.assert_allclose(moved, [[0.0, 0.0, 1 / (2 / 5 - 1 / 500) - 5]])
 
 
 def test_the_prior_does_not_mind_where_all_stands():
