@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from backends.window.config import WindowConfig
-from backends.window.state import Left, WindowState
+from backends.window.state import Left, WindowConfig, WindowState
 from slam.data import BoolArray
 from slam.geometry.arrays import among
 from slam.window.marginal import marginalised

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.window.config import WindowConfig
 from backends.window.slide import problem, slid
-from backends.window.state import WindowLandmarks, WindowState
+from backends.window.state import WindowConfig, WindowLandmarks, WindowState
 from slam.chi_square import chi_square_limits
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.kernels import seen
