@@ -122,7 +122,11 @@ def state_corrected(
     past = s.past
     if len(marks):  # as if they had stood there before
         past = tuple(
-            replace(one, points=one.points + shift(one.serials), positions=one.positions + shift(one.stayed))
+            replace(
+                one,
+                points=one.points + shift(one.serials),
+                stayed_points=one.stayed_points + shift(one.stayed_serials),
+            )
             for one in past
         )
     by_rig = marks.by_rig.copy()

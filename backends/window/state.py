@@ -20,7 +20,7 @@ class WindowConfig:
     """Options of `WindowBackend`.
 
     Attributes:
-        poses: number of poses whose measurements are kept and linearised again with every frame.
+        poses: most poses whose measurements are kept and linearised again with every frame; of as many, two leave.
         reference: frames after which another pose becomes the one that the marginal prior is relative to.
         lag: least number of poses that are revised with what later frames measure; older ones are final.
         landmarks: most landmarks that keep their covariance with the poses once the first pose that saw them has left.
@@ -61,17 +61,17 @@ class WindowLandmarks(LandmarkRows):
 
 @dataclass(frozen=True, eq=False)
 class Left:
-    """A pose that left the window, and landmarks that left the prior with it, given all that stayed."""
+    """Poses that left the window at once, and landmarks that left the prior with them, given all that stayed."""
 
-    frame: int  # number of its frame, and T_world_left (4, 4) then
-    pose: Array
+    frames: IndexArray  # numbers of their frames (Q,), and T_world_left (Q, 4, 4) then
+    poses: Array
     serials: IdArray  # of landmarks that left (G,), and positions then (G, 3)
     points: Array
-    frames: IndexArray  # of poses that stayed (K,), (K, 4, 4)
-    poses: Array
-    stayed: IdArray  # of landmarks that stayed (D,), (D, 3)
-    positions: Array
-    conditional: Conditional  # changes of the pose and of landmarks that left, by those of what stayed
+    stayed_frames: IndexArray  # of poses that stayed (P,), (P, 4, 4)
+    stayed_poses: Array
+    stayed_serials: IdArray  # of landmarks that stayed (D,), (D, 3)
+    stayed_points: Array
+    conditional: Conditional  # changes of what left by those of what stayed
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +119,10 @@ class WindowState:
         known = dict(zip(self.frames.tolist(), self.poses))
         where = dict(zip(marks.serial[members].tolist(), marks.position[members]))
         for one in reversed(self.past):
-            now = np.array([where[serial] for serial in one.stayed.tolist()]).reshape(-1, 3)
-            poses = np.array([known[frame] for frame in one.frames.tolist()])
-            moved, pose = one.conditional.of(now - one.positions, log(inverse(one.poses) @ poses))
-            known[one.frame] = one.pose @ exp(pose)
+            now = np.array([where[serial] for serial in one.stayed_serials.tolist()]).reshape(-1, 3)
+            poses = np.array([known[frame] for frame in one.stayed_frames.tolist()])
+            moved, turned = one.conditional.of(now - one.stayed_points, log(inverse(one.stayed_poses) @ poses))
+            known.update(zip(one.frames.tolist(), one.poses @ exp(turned)))
             where.update(zip(one.serials.tolist(), one.points + moved))
         return known
 
@@ -134,8 +134,12 @@ def settle(before: WindowState, after: WindowState, lag: int) -> tuple[WindowSta
     """
     if after.begun != before.begun:  # the problem was begun anew: what was before is final
         return after, before.revised_poses()
-    surplus = len(after.past) - lag
+    surplus = sum(len(one.frames) for one in after.past) - lag
     if surplus <= lag // 2:
         return after, {}
-    poses = after.revised_poses()
-    return replace(after, past=after.past[surplus:]), {one.frame: poses[one.frame] for one in after.past[:surplus]}
+    cut, poses = 0, after.revised_poses()
+    final: list[int] = []
+    while len(final) < surplus:
+        final += after.past[cut].frames.tolist()
+        cut += 1
+    return replace(after, past=after.past[cut:]), {frame: poses[frame] for frame in final}

@@ -16,13 +16,12 @@ from slam.window import chart_kernels, motion, pose_only
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.problem import Motion, Places, RelativePrior, Rows
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
-from slam.window.solver import CLOSE, Solution, solve
+from slam.window.solver import Solution, solve
 from slam.window.stereo import RectifiedMeasurement
 
-#: numerics: share of its noise that a row's residual has at least, to be tested at the first solution. Where a row
-#: alone tells something of the pose, its residual and the variance of that are nearly 0, and what the solution leaves
-#: of them would decide: then it is solved to the last digits.
-_TESTED, _CLOSER = 0.01, 1e-8
+#: numerics: share of its noise that a row's residual has at least, to be tested. Where a row alone tells something of
+#: the pose, its residual and the variance of that are nearly 0, and what the solution leaves of them would decide.
+_TESTED = 0.01
 _SOLVED_AGAIN = 2  # numerics: how often an update is solved again without observations that disagree with the others
 _STILL = np.zeros((6, 6))
 
@@ -164,7 +163,10 @@ class Steps(RectifiedMeasurement):
         s = replace(s, poses=poses, rows=before.joined(self._rows(s, points[used], z[used])))
         w = problem(s, self.stereo)
         for again in range(_SOLVED_AGAIN + 1):
-            solution, covariances, distances = self._tested(replace(w, rows=s.rows), points[used], z[used])
+            solution = solve(replace(w, rows=s.rows))
+            covariances = solution.point_covariances(len(poses) - 1)
+            its = covariances[0][points[used]]
+            distances = solution.left_out_distances(-1, points[used], z[used], its, self.models.pixel_sigma, _TESTED)
             bad = distances > limits[used]
             if not bad.any() or again == _SOLVED_AGAIN:
                 break
@@ -176,16 +178,6 @@ class Steps(RectifiedMeasurement):
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
         s = _after(s, solution, covariances, solution.by_rig(self.field(s.rows.z)), points[used])
         return s, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], nis, int(np.isfinite(z[used]).sum()))
-
-    def _tested(self, w, at: IndexArray, z: Array) -> tuple[Solution, tuple[Array, Array], Array]:  # type: ignore[no-untyped-def]
-        """The solution, covariances of its points, and how far those `at` (M,) are from their measurements z (M, 3)."""
-        for close, least in ((CLOSE, _TESTED), (_CLOSER, 0.0)):
-            solution = solve(w, close)
-            w, covariances = solution.window, solution.point_covariances(len(w.poses) - 1)
-            distances = solution.left_out_distances(-1, at, z, covariances[0][at], self.models.pixel_sigma, least)
-            if np.isfinite(distances).all():
-                break
-        return solution, covariances, distances
 
 
 def _lost(s: WindowState) -> bool:

@@ -373,7 +373,7 @@ def left_out_distances(camera, T, points, z, covariances, sigma, least, T_then, 
 
     With r the residual, ``rᵀ (σ² 1 − J C Jᵀ)⁻¹ r``, C the point's covariance (3, 3) in the newest camera T, in which
     the row itself takes part, and J as linearised for C, at `T_then` and `points_then`: elsewhere the difference need
-    not be positive. ∞ where the point is not in front of the camera, or where a residual has less than the share
+    not be positive. ∞ where the point is not in front of the camera; 0 where a residual has less than the share
     `least` of the row's noise.
     """
     out, q, r, D = np.empty(len(points)), np.empty(3), np.empty(3), np.empty((3, 3))
@@ -398,5 +398,5 @@ def left_out_distances(camera, T, points, z, covariances, sigma, least, T_then, 
         for i in range(3):
             total += r[i] * row_times(inverse, i, r)
         tested = min(S[0, 0], S[1, 1], S[2, 2]) >= least * sigma * sigma
-        out[m] = total if tested and total >= 0.0 else np.inf
+        out[m] = 0.0 if not tested else total if total >= 0.0 else np.inf
     return out

@@ -164,7 +164,7 @@ class Solution:
             z: the rows' measurements (M, 3), uR NaN where missing.
             local: covariances of these points in the pose's coordinates (M, 3, 3), see `point_covariances`.
             sigma: noise of the rows [px].
-            least: share of its noise that a row's residual must have to be tested; ∞ where it has less.
+            least: share of its noise that a row's residual must have to be tested; the distance is 0 where it has less.
         """
         w, then, first = self.window, self.equations.window, self.window.by_point[0]
         distances = kernels.left_out_distances(
