@@ -1,4 +1,4 @@
-"""The motion of what the points of a window belong to, where that is a body carried past a camera that is known."""
+"""The motion of the camera, and of a body that is carried past a camera that is known: constant velocity, disturbed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,23 @@ import numpy as np
 from slam.kernels.se3 import adjoint, between
 from slam.kernels.velocities import add_velocity_rows, velocity_change
 from slam.runtime.compilation import helper
+
+
+@helper
+def add_motion(poses, column, motion, H, b):
+    """Add constant velocity, disturbed: successive velocities differ by noise. Returns the sum of squares."""
+    triple, interval, weight = motion
+    cost, J, r = 0.0, np.empty((6, 18)), np.empty(6)
+    for m in range(len(triple)):
+        i0, i1, i2 = triple[m]
+        velocity_change(poses, i0, i1, i2, interval[m, 0], interval[m, 1], r, J)
+        for i in range(6):
+            r[i] *= weight[m, i]
+            cost += r[i] * r[i]
+            for j in range(18):
+                J[i, j] *= weight[m, i]
+        add_velocity_rows(J, r, triple[m], column, H, b)
+    return cost
 
 
 @helper

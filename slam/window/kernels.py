@@ -19,9 +19,8 @@ import numpy as np
 from slam.kernels.linear import invert_symmetric, row_times, turn
 from slam.kernels.se3 import adjoint, between, log, move, transform_back
 from slam.kernels.stereo import by_pose, residual
-from slam.kernels.velocities import add_velocity_rows, velocity_change
 from slam.runtime.compilation import helper, kernel
-from slam.window.carried import add_carried
+from slam.window.carried import add_carried, add_motion
 from slam.window.chart_kernels import chart, charts, displace
 
 #: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
@@ -55,7 +54,7 @@ def normal_equations(
     )
     if len(own[0]):
         cost += _add_own_priors(points, place, E, own[0], own[1], information, gradient)
-    cost += _add_motion(poses, column, motion, H, b)
+    cost += add_motion(poses, column, motion, H, b)
     if len(carried[2]):
         cost += add_carried(poses, column, carried, H, b)
     inverse = _eliminate(column, place, pose_of, cross, first, order, information, gradient, whole, H, b)
@@ -318,23 +317,6 @@ def by_point(point, count):
         order[at[point[m]]] = m
         at[point[m]] += 1
     return first, order
-
-
-@helper
-def _add_motion(poses, column, motion, H, b):
-    """Add constant velocity, disturbed: successive velocities differ by noise. Returns the sum of squares."""
-    triple, interval, weight = motion
-    cost, J, r = 0.0, np.empty((6, 18)), np.empty(6)
-    for m in range(len(triple)):
-        i0, i1, i2 = triple[m]
-        velocity_change(poses, i0, i1, i2, interval[m, 0], interval[m, 1], r, J)
-        for i in range(6):
-            r[i] *= weight[m, i]
-            cost += r[i] * r[i]
-            for j in range(18):
-                J[i, j] *= weight[m, i]
-        add_velocity_rows(J, r, triple[m], column, H, b)
-    return cost
 
 
 @kernel
