@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from backends.window.config import WindowConfig
-from backends.window.history import Call, History, state_corrected
-from backends.window.state import WindowState, settle
+from backends.window.history import History, state_corrected
+from backends.window.state import WindowConfig, WindowState, settle
 from backends.window.steps import Steps
 from slam.bounds import from_options
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
@@ -53,7 +52,7 @@ class WindowBackend:
         self._state = WindowState.empty(np.zeros((6, 0)))
         self._stamps: list[float] = []
         self._final: list[Array] = []  # poses by frame; those of the window and of its past are in the state
-        self._history = History.of(self._state)
+        self._history = History(((self._state, ()),))
         self._revised = -1  # number of the newest frame when measurements were revised last, −1 for never
         self._path: tuple[WindowState, Trajectory] | None = None  # the last answer, and the state that it is of
 
@@ -176,7 +175,7 @@ class WindowBackend:
             raise MeasurementError(f"window: {TOO_LATE}")
         first = np.zeros((6, field(np.zeros((0, 3))).shape[2])) if pose is None else pose
         self._steps, self._state = replace(self._steps, field=field), WindowState.empty(first)
-        self._history = History.of(self._state)
+        self._history = History(((self._state, ()),))
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
@@ -188,7 +187,7 @@ class WindowBackend:
     @property
     def revises_path(self) -> bool:
         """See `slam.interfaces.RevisingBackend`: True while the first frame's measurements are still known."""
-        return not len(self._history.start.frames)
+        return self._history.begins < 0
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
@@ -211,4 +210,4 @@ class WindowBackend:
 
     def _done(self, s: WindowState, step: str, *arguments: Any) -> None:
         """Take over the state after a step, and remember the step."""
-        self._history, self._state = self._history.then(Call(step, arguments), s, self.config.lag), s
+        self._history, self._state = self._history.then((step, arguments), s, self.config.lag), s

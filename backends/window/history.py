@@ -10,75 +10,38 @@ import numpy as np
 
 from backends.window.state import WindowState, settle
 from backends.window.steps import Steps
+from slam.data import IdArray
 from slam.geometry.se3 import Array
 from slam.window import chart_kernels
 from slam.window.stereo import RectifiedStereo
 
 _EVERY = 25  # cost: frames between two states from which the calls can be repeated
 
-
-@dataclass(frozen=True, eq=False)
-class Call:
-    """A call that changed the state: a method of `Steps`, and its arguments."""
-
-    step: str
-    arguments: tuple[Any, ...]
-
-    @property
-    def measured(self) -> Array:
-        """The call's measurements (M, 3); most calls have none."""
-        return np.asarray(self.arguments[1]) if self.step in ("updated", "added") else np.zeros((0, 3))
-
-    def with_measured(self, z: Array) -> Call:
-        """With corrected measurements (M, 3)."""
-        if not len(z):
-            return self
-        ids, before, *rest = self.arguments
-        if self.step == "added":  # what has no depth any more was placed as it was
-            z = np.where((z[:, 0] > z[:, 2])[:, None], z, before)
-        return Call(self.step, (ids, z, *rest))
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Some successive calls, and the state before them."""
-
-    state: WindowState
-    calls: tuple[Call, ...] = ()
+#: A method of `Steps`, and its arguments; those of measurements begin with ids and measurements (M, 3).
+Call = tuple[str, tuple[Any, ...]]
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """The calls since a state, in parts."""
+    """The calls since a state, in parts, each with the state before it."""
 
-    parts: tuple[Part, ...]  # at least one
+    parts: tuple[tuple[WindowState, tuple[Call, ...]], ...]  # at least one
     anchored: bool = False  # whether landmarks were ever known in the world: then the path may not be moved in it
-
-    @classmethod
-    def of(cls, s: WindowState) -> History:
-        """From a state on."""
-        return cls((Part(s),))
-
-    @property
-    def start(self) -> WindowState:
-        """The state before the first call."""
-        return self.parts[0].state
 
     @property
     def begins(self) -> int:
         """Number of the newest frame before the first call, −1 for none."""
-        return int(self.start.frames[-1]) if len(self.start.frames) else -1
+        return _newest(self.parts[0][0])
 
     def then(self, call: Call, after: WindowState, lag: int) -> History:
         """With one more call, after which the state is `after`; without calls that are more than `lag` frames old."""
-        last, parts = self.parts[-1], self.parts[:-1]
-        parts = (*parts, replace(last, calls=(*last.calls, call)))
-        begun = last.state.frames[-1] if len(last.state.frames) else -1
-        if call.step == "predicted" and after.frames[-1] >= begun + _EVERY:
-            parts = (*parts, Part(after))
-            while len(parts) > 2 and after.frames[-1] - parts[1].state.frames[-1] >= lag:
-                parts = parts[1:]
-        return History(parts, self.anchored or call.step == "inserted")
+        *parts, (state, calls) = self.parts
+        parts.append((state, (*calls, call)))
+        if call[0] == "predicted" and _newest(after) >= _newest(state) + _EVERY:
+            parts.append((after, ()))
+            while len(parts) > 2 and _newest(after) - _newest(parts[1][0]) >= lag:
+                del parts[0]
+        return History(tuple(parts), self.anchored or call[0] == "inserted")
 
     def corrected(self, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> History:
         """With corrected measurements; landmarks of the state before them move to where they are seen at from now on.
@@ -86,25 +49,36 @@ class History:
         Raises:
             MeasurementError: a corrected measurement is not finite.
         """
-        measured = [call.measured for part in self.parts for call in part.calls]
-        ends = np.cumsum([len(z) for z in measured])[:-1]
-        rows = iter(np.split(stereo.corrected("window", np.concatenate(measured), correct), ends) if measured else ())
+        measured = [call[1][1] for _, calls in self.parts for call in calls if call[0] in ("updated", "added")]
+        z = stereo.corrected("window", np.concatenate([np.zeros((0, 3)), *measured]), correct)
+        rows = iter(np.split(z, np.cumsum([len(before) for before in measured])))
+
+        def again(call: Call) -> Call:
+            if call[0] not in ("updated", "added"):
+                return call
+            (ids, before, *rest), z = call[1], next(rows)
+            if call[0] == "added":  # what has no depth any more was placed as it was
+                z = np.where((z[:, 0] > z[:, 2])[:, None], z, before)
+            return call[0], (ids, z, *rest)
+
         return replace(self, parts=tuple(
-            Part(state_corrected(part.state, stereo, correct), tuple(c.with_measured(next(rows)) for c in part.calls))
-            for part in self.parts
+            (state_corrected(state, stereo, correct), tuple(map(again, calls))) for state, calls in self.parts
         ))  # fmt: skip
 
     def repeated(self, steps: Steps, final: Sequence[Array]) -> tuple[WindowState, list[Array]]:
         """The state after all calls, and all frames' final poses."""
-        s, final = self.start, list(final)
-        for part in self.parts:
-            for call in part.calls:
-                before, s = s, getattr(steps, call.step)(s, *call.arguments)
-                s = s[0] if isinstance(s, tuple) else s
-                s, settled = settle(before, s, steps.config.lag)
-                for frame, T in settled.items():
-                    final[frame] = T
+        s, final = self.parts[0][0], list(final)
+        for name, arguments in (call for _, calls in self.parts for call in calls):
+            before, s = s, getattr(steps, name)(s, *arguments)
+            s, settled = settle(before, s[0] if isinstance(s, tuple) else s, steps.config.lag)
+            for frame, T in settled.items():
+                final[frame] = T
         return s, final
+
+
+def _newest(s: WindowState) -> int:
+    """Number of the newest frame, −1 for none."""
+    return int(s.frames[-1]) if len(s.frames) else -1
 
 
 def state_corrected(
@@ -138,8 +112,24 @@ def state_corrected(
             by_rig[:, -1:] -= (prior.information[:, : change.size] @ change.ravel())[:, None]
         prior = replace(prior, origin=prior.origin + change, by_rig=by_rig)
     rows = replace(s.rows, z=stereo.corrected("window", s.rows.z, correct))
-    past = s.past.displaced(marks.serial, position - marks.position) if len(marks) else s.past
+    displacement = position - marks.position
+
+    def shift(own: IdArray) -> Array:
+        """By how much landmarks (S,) of these serial numbers are displaced, those that are no more by nothing."""
+        at = np.searchsorted(marks.serial, own).clip(0, len(marks) - 1)
+        return np.where((marks.serial[at] == own)[:, None], displacement[at], 0.0)
+
+    past = s.past
+    if len(marks):  # as if they had stood there before
+        past = tuple(
+            replace(
+                one,
+                points=one.points + shift(one.serials),
+                stayed_points=one.stayed_points + shift(one.stayed_serials),
+            )
+            for one in past
+        )
     by_rig = marks.by_rig.copy()
     if not whole:
-        by_rig[:, :, -1:] -= (position - marks.position)[:, :, None]
+        by_rig[:, :, -1:] -= displacement[:, :, None]
     return replace(s, rows=rows, landmarks=replace(marks, position=position, by_rig=by_rig), prior=prior, past=past)

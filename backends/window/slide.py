@@ -1,4 +1,4 @@
-"""The window moves on: one of its poses leaves, and what it has measured becomes part of the prior."""
+"""The window moves on: poses leave, and what they have measured becomes part of the prior."""
 
 from __future__ import annotations
 
@@ -6,84 +6,84 @@ from dataclasses import replace
 
 import numpy as np
 
-from backends.window.config import WindowConfig
-from backends.window.past import Left
-from backends.window.problem import motion_between, problem
-from backends.window.state import WindowState
-from slam.data import BoolArray, IndexArray
-from slam.geometry.se3 import Array
-from slam.models import EstimatorModels
-from slam.window.marginal import Conditional, marginalised
+from backends.window.state import Left, WindowConfig, WindowState
+from slam.data import BoolArray
+from slam.geometry.arrays import among
+from slam.window.marginal import marginalised
+from slam.window.problem import Window
 from slam.window.stereo import Field, RectifiedStereo
 
 
-def slid(
-    s: WindowState, stereo: RectifiedStereo, models: EstimatorModels, config: WindowConfig, field: Field
-) -> WindowState:
-    """The state with one pose less.
+def problem(s: WindowState, stereo: RectifiedStereo) -> Window:
+    """The state as a problem for the solver; landmarks without measurements take no part."""
+    marks = s.landmarks
+    return Window(
+        stereo, s.poses, marks.position, s.rows, mean=marks.mean, information=marks.information, places=s.places,
+        motion=s.motion, prior=s.prior,
+    )  # fmt: skip
 
-    The oldest pose is the one that the prior is relative to, and stays for some frames; the next one leaves. Landmarks
-    that it has measured join the prior, if they are still measured: they keep their covariance with all the others.
+
+def slid(s: WindowState, stereo: RectifiedStereo, config: WindowConfig, field: Field) -> WindowState:
+    """The state with two poses less at once, which takes hardly longer than one.
+
+    The oldest pose is the one that the prior is relative to, and stays for some frames; the next ones leave. Landmarks
+    that they have measured join the prior, if they are still measured: they keep their covariance with all the others.
     Those that nothing will measure again leave with all their measurements, and so do landmarks beyond the prior's
     limit, which are then estimated afresh.
 
     Raises:
         numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
     """
-    leaving = 0 if s.frames[-1] - s.frames[0] > config.reference else 1
-    leaving += leaving == s.solved  # landmarks are known relative to that one
+    K, oldest = len(s.frames), 0 if s.frames[-1] - s.frames[0] > config.reference else 1
+    # landmarks are known relative to the pose that was solved for; the last two poses say how the camera moves
+    leaving = [k for k in range(oldest, K - 1) if k != s.solved][: min(2, K - 2)]
+    gone = among(K, np.array(leaving))
     marks, rows, places, count = s.landmarks, s.rows, s.places, len(s.landmarks)
-    here, there = np.zeros(count, bool), np.zeros(count, bool)
-    here[rows.point[rows.pose == leaving]] = True
-    here[places.point[places.pose == leaving]] = True
-    there[rows.point[rows.pose != leaving]] = True
-    known = np.zeros(count, bool)
-    known[places.point[places.pose == leaving]] = True
-    known |= marks.information[:, 0, 0] > 0
+    its_rows, its_places = gone[rows.pose], gone[places.pose]
+    known = among(count, places.point[its_places])
+    sights = np.bincount(rows.point[its_rows], minlength=count)
+    here = known | (sights > 0)
+    there, member = among(count, rows.point[~its_rows]), among(count, s.prior.points)
     alive = marks.ids >= 0
-    member = np.zeros(count, bool)
-    member[s.prior.points] = True
 
-    joins = here & ~member & alive & (there | known)
-    ends = (member & ~alive) | (here & ~member & ~alive & (there | known))
+    new = here & ~member & (there | known | (marks.information[:, 0, 0] > 0))
+    joins, ends = new & alive, (new | member) & ~alive | here & ~member & ~new & (sights > 1)
     surplus = int((member & alive).sum() + joins.sum()) - config.landmarks
     if surplus > 0:
         ends, joins = _without_oldest(surplus, s, member & alive, joins, ends, there)
-    absorbed_row = (rows.pose == leaving) & (member | joins)[rows.point] | ends[rows.point]
-    absorbed_place = (places.pose == leaving) | ends[places.point]
-    motion = motion_between(s, models)
-    motion = motion.select((motion.poses == leaving).any(axis=1))
-
-    w, active = problem(s, stereo, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
-    keeps = (member | joins | ends)[active]
+    taken_rows = its_rows & (member | joins)[rows.point] | ends[rows.point]
+    taken_places = its_places | ends[places.point]
+    moves = (gone[s.motion.poses] & (s.motion.poses >= 0)).any(axis=1)
     w = replace(
-        w, information=np.where(keeps[:, None, None], marks.information[active], 0.0),
-        joining=np.flatnonzero(joins[active]),
+        problem(s, stereo), rows=rows.select(taken_rows), places=places.select(taken_places),
+        motion=s.motion.select(moves), joining=np.flatnonzero(joins),
+        information=np.where((member | joins | ends)[:, None, None], marks.information, 0.0),
     )  # fmt: skip
-    ending = ends[s.prior.points]
+    ending, stays = ends[s.prior.points], ~gone
     prior, conditional, cost = marginalised(w, leaving, ending, field(w.rows.z))
-    past = s.past.with_one(_left(s, leaving, active[prior.points], s.prior.points[ending], conditional))
-    stays = ~absorbed_row & (rows.pose != leaving)
-    free = marks.information.copy()
-    free[joins | ends] = 0.0
-    s = replace(
-        s, frames=np.delete(s.frames, leaving), stamps=np.delete(s.stamps, leaving),
-        rests=np.delete(s.rests, leaving),
-        poses=np.delete(s.poses, leaving, axis=0), covariance=_without(s.covariance, leaving),
-        by_rig=np.delete(s.by_rig, 6 * leaving + np.arange(6), axis=0),
-        rows=_earlier(rows.select(stays), leaving), places=_earlier(places.select(~absorbed_place), leaving),
-        prior=replace(prior, points=active[prior.points]), cost=s.cost - cost, past=past,
-        landmarks=replace(marks, information=free), solved=s.solved - (s.solved > leaving),
+    end, stay = s.prior.points[ending], prior.points
+    left = Left(
+        s.frames[gone], s.poses[gone], marks.serial[end], marks.position[end], s.frames[stays], s.poses[stays],
+        marks.serial[stay], marks.position[stay], conditional,
     )  # fmt: skip
-    return _compact(s)
-
-
-def _left(s: WindowState, leaving: int, stayed: IndexArray, ended: IndexArray, conditional: Conditional) -> Left:
-    """The record of what leaves."""
-    marks, stay = s.landmarks, np.arange(len(s.frames)) != leaving
-    return Left(
-        int(s.frames[leaving]), s.poses[leaving], marks.serial[ended], marks.position[ended], s.frames[stay],
-        s.poses[stay], marks.serial[stayed], marks.position[stayed], conditional,
+    rows, places = rows.select(~taken_rows & ~its_rows), places.select(~taken_places)
+    motion = s.motion.select(~moves)
+    index = np.arange(count)
+    used = alive | among(count, np.concatenate([rows.point, places.point, stay]))
+    free = marks.information
+    if (joins | ends).any():
+        free = np.where((joins | ends)[:, None, None], 0.0, free)
+    marks = replace(marks, information=free)
+    if not used.all():  # landmarks that were removed take no part any more
+        index, marks = np.cumsum(used) - 1, marks.select(used)
+    each, place = np.repeat(stays, 6), np.cumsum(stays) - 1
+    return replace(
+        s, frames=s.frames[stays], stamps=s.stamps[stays], poses=s.poses[stays], covariance=s.covariance[each][:, each],
+        by_rig=s.by_rig[each], solved=int(place[s.solved]), cost=s.cost - cost, past=(*s.past, left),
+        rows=replace(rows, pose=place[rows.pose], point=index[rows.point]),
+        places=replace(places, pose=place[places.pose], point=index[places.point]),
+        motion=replace(motion, poses=np.where(motion.poses < 0, -1, place[motion.poses])),
+        prior=replace(prior, points=index[stay]), landmarks=marks,
     )  # fmt: skip
 
 
@@ -92,7 +92,7 @@ def _without_oldest(
 ) -> tuple[BoolArray, BoolArray]:
     """More landmarks end, and fewer join: members out of view that were measured longest ago, then those that join.
 
-    Of those, one that is known in the world does not end: it stays known, and what the pose measured of it is dropped.
+    Of those, one that is known in the world does not end: it stays known, and what the poses measured of it is dropped.
     """
     ends, joins = ends.copy(), joins.copy()
     out_of_view = np.flatnonzero(members & ~there)
@@ -103,28 +103,3 @@ def _without_oldest(
         last = np.flatnonzero(joins)[::-1][:surplus]
         joins[last], ends[last] = False, s.landmarks.information[last, 0, 0] == 0
     return ends, joins
-
-
-def _earlier(rows, leaving):  # type: ignore[no-untyped-def]
-    """Rows or places of a window without one pose."""
-    return replace(rows, pose=rows.pose - (rows.pose > leaving))
-
-
-def _without(P: Array, leaving: int) -> Array:
-    keep = np.ones(len(P), bool)
-    keep[6 * leaving : 6 * leaving + 6] = False
-    return P[np.ix_(keep, keep)]
-
-
-def _compact(s: WindowState) -> WindowState:
-    """Without landmarks that were removed and take no part any more."""
-    marks = s.landmarks
-    used = marks.ids >= 0
-    used[s.rows.point], used[s.places.point], used[s.prior.points] = True, True, True
-    if used.all():
-        return s
-    index = np.cumsum(used) - 1
-    return replace(
-        s, landmarks=marks.select(used), rows=replace(s.rows, point=index[s.rows.point]),
-        places=replace(s.places, point=index[s.places.point]), prior=replace(s.prior, points=index[s.prior.points]),
-    )  # fmt: skip

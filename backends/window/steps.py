@@ -6,26 +6,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.window.config import WindowConfig
-from backends.window.past import Past
-from backends.window.problem import problem
-from backends.window.slide import slid
-from backends.window.state import WindowLandmarks, WindowState, between
+from backends.window.slide import problem, slid
+from backends.window.state import WindowConfig, WindowLandmarks, WindowState
 from slam.chi_square import chi_square_limits
-from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
+from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
+from slam.geometry.kernels import seen
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window import chart_kernels, motion, pose_only
 from slam.window.gating import MIN_CONSENSUS
-from slam.window.problem import Places, RelativePrior, Rows, Window
+from slam.window.problem import Motion, Places, RelativePrior, Rows
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
-from slam.window.solver import CLOSE, Solution, solve
+from slam.window.solver import Solution, solve
 from slam.window.stereo import RectifiedMeasurement
 
-#: numerics: share of its noise that a row's residual has at least, to be tested at the first solution. Where a row
-#: alone tells something of the pose, its residual and the variance of that are nearly 0, and what the solution leaves
-#: of them would decide: then it is solved to the last digits.
-_TESTED, _CLOSER = 0.01, 1e-8
+#: numerics: share of its noise that a row's residual has at least, to be tested. Where a row alone tells something of
+#: the pose, its residual and the variance of that are nearly 0, and what the solution leaves of them would decide.
+_TESTED = 0.01
 _SOLVED_AGAIN = 2  # numerics: how often an update is solved again without observations that disagree with the others
+_STILL = np.zeros((6, 6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,42 +40,42 @@ class Steps(RectifiedMeasurement):
         if not len(s.frames):
             T = self.models.initial_pose
             sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
-            P, one = np.diag(sigmas**2), np.array([stamp])
-            prior = RelativePrior.of_pose(T, P, s.by_rig)
-            return replace(
-                s, frames=np.zeros(1, np.int64), stamps=one, rests=np.zeros(1, bool), poses=T[None],
-                covariance=P, prior=prior,
-            )  # fmt: skip
+            P, prior = np.diag(sigmas**2), RelativePrior.of_pose(T, np.diag(sigmas**2), s.by_rig)
+            first = np.zeros(1, np.int64)
+            return replace(s, frames=first, stamps=np.array([stamp]), poses=T[None], covariance=P, prior=prior)
         if len(s.frames) >= self.config.poses:
             try:
-                s = slid(s, self.stereo, self.models, self.config, self.field)
+                s = slid(s, self.stereo, self.config, self.field)
             except np.linalg.LinAlgError:  # covariances that differ by more than their digits, as after long gaps
                 s = _begun_anew(s, s.poses[-1], s.covariance[-6:, -6:])
-        K, t = len(s.frames), s.stamps
-        before = None if s.frames[-1] == s.begun else min(t[-1] - t[-2], motion.LONGEST)
+        K, t, begins = len(s.frames), s.stamps, s.frames[-1] == s.begun
+        before = None if begins else min(t[-1] - t[-2], motion.LONGEST)
         dt = min(stamp - t[-1], motion.LONGEST)
-        T, by_last, noise, _ = motion.predicted(self.models, s.poses[-2:], before, dt, rests)
+        T, by_last, noise, unknown = motion.predicted(self.models, s.poses[-2:], before, dt, rests)
         J = np.zeros((6, 6 * K))
         J[:, -12:] = by_last[:, -6 * K :]
         cross = J @ s.covariance
         own = cross @ J.T + noise
         P = np.block([[s.covariance, cross.T], [cross, 0.5 * (own + own.T)]])
+        moves = s.motion
+        if begins or rests or s.frames[-1] == s.frames[-2] + 1:  # else the velocity before has left the window
+            one = np.array([[-1 if unknown else K - 2, K - 1, K]])
+            sigma = np.full(6, motion.STANDS / dt) if rests else motion.velocity_sigmas(self.models, dt, unknown)
+            moves = moves.joined(Motion(one, np.array([[before or 1.0, dt]]), 1 / sigma[None]))
         return replace(
-            s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp),
-            rests=np.append(s.rests, rests),
+            s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp), motion=moves,
             poses=np.concatenate([s.poses, T[None]]), covariance=P, measured=False,
             by_rig=np.concatenate([s.by_rig, J @ s.by_rig]),
         )  # fmt: skip
 
     def in_view(self, s: WindowState) -> tuple[IndexArray, Array, Array, Array]:
         """Landmarks in the angle of view (paper A, Fig. 3), their pixels, and innovation covariances (M, 2, 2)."""
-        marks, rows = s.landmarks, s.landmarks.order
-        rows = rows[self.visible(s.poses[-1], marks.position[rows])]
-        local, own = seen_from_newest(s, rows)
-        by_pose = points_by_pose(local)
-        in_world = (marks.information[rows, 0, 0] > 0)[:, None, None]
-        by_motion = np.where(in_world, s.covariance[-6:, -6:], between(s, s.solved))
-        C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
+        marks, T = s.landmarks, s.poses[-1]
+        rows = marks.order[self.visible(T, marks.position[marks.order])]
+        local, C = _seen_from_newest(s, rows, s.relative(s.solved))
+        in_world = marks.information[rows, 0, 0] > 0
+        if in_world.any():
+            C[in_world] = _seen_from_newest(s, rows[in_world], s.covariance[-6:, -6:])[1]
         return rows, *self.pixels(local, C)
 
     def updated(self, s: WindowState, ids: IdArray, z: Array, guess: Array | None) -> tuple[WindowState, UpdateReport]:
@@ -90,10 +88,9 @@ class Steps(RectifiedMeasurement):
             s = replace(s, contradicted=found.contradicted)
             if not found.used.any():
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
-            s, used, nis = self._solved(s, found, points, z)
+            return self._solved(s, found, points, ids, z)
         except np.linalg.LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"window: the pose cannot be solved for: {error}")
-        return s, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], nis, int(np.isfinite(z[used]).sum()))
 
     def added(self, s: WindowState, ids: IdArray, z: Array) -> WindowState:
         """With new landmarks at their first sight z (M, 3) in the newest pose (paper A, Eqs. 8 and 10).
@@ -121,11 +118,10 @@ class Steps(RectifiedMeasurement):
         R = (s.poses[s.solved] if len(s.poses) else self.models.initial_pose)[:3, :3]
         information = np.linalg.inv(covariances)
         information = 0.5 * (information + np.swapaxes(information, 1, 2))
-        new = WindowLandmarks(
+        return _with(s, WindowLandmarks(
             ids, s.serials + np.arange(len(ids)), positions, R.T @ covariances @ R, covariances, np.full(len(ids), -1),
             positions, information, np.zeros((len(ids), 3, s.by_rig.shape[1])),
-        )  # fmt: skip
-        return _with(s, new)
+        ))  # fmt: skip
 
     def placed(self, s: WindowState, ids: IdArray, local: Array, covariances: Array) -> WindowState:
         """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
@@ -137,17 +133,16 @@ class Steps(RectifiedMeasurement):
 
     def _rows(self, s: WindowState, points: IndexArray, z: Array) -> Rows:
         """Measurements from the newest pose."""
-        return Rows(
-            np.full(len(points), len(s.frames) - 1), points, z, np.full(len(points), 1 / self.models.pixel_sigma)
-        )
+        n = len(points)
+        return Rows(np.full(n, len(s.frames) - 1), points, z, np.full(n, 1 / self.models.pixel_sigma))
 
     def _agreement(self, s: WindowState, points: IndexArray, z: Array, guess: Array | None) -> Agreement:
         """Initial value of the newest pose, and which measurements agree with it."""
         T, position = s.poses[-1], s.landmarks.position[points]
-        local, own = seen_from_newest(s, points)
+        local, own = _seen_from_newest(s, points)
         noise = pose_only.residual_noise(self.stereo, self.models.pixel_sigma, local, own, z)
         in_world = (s.landmarks.information[points, 0, 0] > 0).any() or s.solved == len(s.frames) - 1
-        information = np.linalg.inv(s.covariance[-6:, -6:] if in_world else between(s, s.solved))
+        information = np.linalg.inv(s.covariance[-6:, -6:] if in_world else s.relative(s.solved))
         one = pose_only.PoseProblem(self.stereo, position, z, noise, T, information, self.models.gate_probability)
 
         def search() -> Array | None:
@@ -156,40 +151,33 @@ class Steps(RectifiedMeasurement):
         return agreement(one, T if guess is None else guess, search, s.contradicted, _lost(s))
 
     def _solved(
-        self, s: WindowState, found: Agreement, points: IndexArray, z: Array
-    ) -> tuple[WindowState, BoolArray, float]:
-        """The state after an update, which observations were used, and their NIS."""
-        used, T = found.used.copy(), found.T
+        self, s: WindowState, found: Agreement, points: IndexArray, ids: IdArray, z: Array
+    ) -> tuple[WindowState, UpdateReport]:
+        """The state after an update with what agrees, solved again without rows that disagree with all others."""
+        used, before = found.used.copy(), s.rows
         if found.jump is not None:
             s = _restarted(s, found.T, points)
-        s = replace(s, poses=np.concatenate([s.poses[:-1], T[None]]))
+            before = s.rows
+        poses = np.concatenate([s.poses[:-1], found.T[None]])
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
-        rows = s.rows.joined(self._rows(s, points[used], z[used]))
-        w, active = problem(replace(s, rows=rows), self.stereo, self.models)
+        s = replace(s, poses=poses, rows=before.joined(self._rows(s, points[used], z[used])))
+        w = problem(s, self.stereo)
         for again in range(_SOLVED_AGAIN + 1):
-            solution, known, distances = self._tested(w, np.searchsorted(active, points[used]), z[used])
+            solution = solve(replace(w, rows=s.rows))
+            covariances = solution.point_covariances(len(poses) - 1)
+            its = covariances[0][points[used]]
+            distances = solution.left_out_distances(-1, points[used], z[used], its, self.models.pixel_sigma, _TESTED)
             bad = distances > limits[used]
             if not bad.any() or again == _SOLVED_AGAIN:
                 break
-            keep = np.append(np.ones(len(s.rows), bool), ~bad)
-            w = replace(solution.window, rows=solution.window.rows.select(keep))
             used[np.flatnonzero(used)[bad]] = False
             if not used.any():
                 raise np.linalg.LinAlgError("no observation agrees with the others")
-        s = replace(s, rows=s.rows.joined(self._rows(s, points[used], z[used])))
-        relations = *known, solution.by_rig(self.field(solution.window.rows.z))
+            s = replace(s, rows=before.joined(self._rows(s, points[used], z[used])))
+            w = solution.window
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
-        return _after(s, solution, active, relations, points[used]), used, nis
-
-    def _tested(self, w: Window, at: IndexArray, z: Array) -> tuple[Solution, tuple[Array, Array], Array]:
-        """The solution, covariances of its points, and how far those `at` (M,) are from their measurements z (M, 3)."""
-        for close, least in ((CLOSE, _TESTED), (_CLOSER, 0.0)):
-            solution = solve(w, close)
-            w, covariances = solution.window, solution.point_covariances(len(w.poses) - 1)
-            distances = solution.left_out_distances(-1, at, z, covariances[0][at], self.models.pixel_sigma, least)
-            if np.isfinite(distances).all():
-                break
-        return solution, covariances, distances
+        s = _after(s, solution, covariances, solution.by_rig(self.field(s.rows.z)), points[used])
+        return s, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], nis, int(np.isfinite(z[used]).sum()))
 
 
 def _lost(s: WindowState) -> bool:
@@ -199,11 +187,13 @@ def _lost(s: WindowState) -> bool:
     return bool(enough and unknown_turn(s.covariance[i : i + 6, i : i + 6]))
 
 
-def seen_from_newest(s: WindowState, rows: IndexArray) -> tuple[Array, Array]:
-    """Landmarks in the newest camera's coordinates (M, 3), and covariances (M, 3, 3) for a known last solved pose."""
-    T, marks = s.poses[-1], s.landmarks
-    turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
-    return (marks.position[rows] - T[:3, 3]) @ T[:3, :3], turn @ marks.local[rows] @ turn.T
+def _seen_from_newest(s: WindowState, rows: IndexArray, by_motion: Array = _STILL) -> tuple[Array, Array]:
+    """Landmarks in the newest camera's coordinates (M, 3), and covariances (M, 3, 3) there.
+
+    They are for a known last solved pose, from which the camera has moved by what has the covariance (6, 6) given.
+    """
+    marks = s.landmarks
+    return seen(s.poses[-1], s.poses[s.solved], marks.position[rows], marks.local[rows], by_motion)
 
 
 def _with(s: WindowState, new: WindowLandmarks) -> WindowState:
@@ -237,41 +227,38 @@ def _places(s: WindowState, points: IndexArray, local: Array, covariances: Array
 
 def _begun_anew(s: WindowState, T: Array, P: Array) -> WindowState:
     """A window of the newest pose alone, which is T (4, 4) with covariance P (6, 6); landmarks stay as they are."""
-    turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
-    return replace(
-        s, frames=s.frames[-1:], stamps=s.stamps[-1:], rests=s.rests[-1:], poses=T[None], covariance=P, solved=0,
-        begun=int(s.frames[-1]),
-        by_rig=s.by_rig[-6:],
-        rows=Rows.none(), places=Places.none(), cost=0.0, past=Past(),
-        prior=RelativePrior.of_pose(T, P, s.by_rig[-6:]),
+    turn, by_rig = T[:3, :3].T @ s.poses[s.solved][:3, :3], s.by_rig[-6:]
+    return WindowState(
+        s.frames[-1:], s.stamps[-1:], T[None], P, by_rig, begun=int(s.frames[-1]),
+        prior=RelativePrior.of_pose(T, P, by_rig), serials=s.serials, measured=s.measured, contradicted=s.contradicted,
         landmarks=replace(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
     )  # fmt: skip
 
 
 def _restarted(s: WindowState, T: Array, points: IndexArray) -> WindowState:
     """A window of one pose T (4, 4), where the landmarks say; they are placed relative to it."""
-    local, own = seen_from_newest(replace(s, poses=np.concatenate([s.poses[:-1], T[None]])), points)
+    local, own = _seen_from_newest(replace(s, poses=np.concatenate([s.poses[:-1], T[None]])), points)
     one = _begun_anew(s, T, world_covariance(s.covariance[-6:, -6:]))
     return replace(one, places=_places(one, points, local, own))
 
 
 def _after(
-    s: WindowState, solution: Solution, points: IndexArray, relations: tuple[Array, Array, tuple[Array, Array]],
-    seen: IndexArray,
+    s: WindowState, solution: Solution, covariances: tuple[Array, Array], by_rig: tuple[Array, Array],
+    measured: IndexArray,
 ) -> WindowState:  # fmt: skip
     """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
-    marks, w, (local, world, (poses_by_rig, points_by_rig)) = s.landmarks, solution.window, relations
-    there = replace(s, poses=w.poses, covariance=solution.pose_covariance, by_rig=poses_by_rig)
-    definite = (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
-    known = points[definite]
-    others = np.delete(np.arange(len(marks)), known)
-    h, rest = seen_from_newest(there, others)
-    by_pose = points_by_pose(h)
-    position, whole, last, own = marks.position.copy(), marks.world.copy(), marks.last.copy(), marks.local.copy()
-    position[points], last[seen] = w.points, s.frames[-1]
-    own[others] = rest + by_pose @ between(there, s.solved) @ np.swapaxes(by_pose, 1, 2)
-    own[known], whole[known] = local[definite], world[definite]
-    by_rig = marks.by_rig.copy()
-    by_rig[points] = points_by_rig
-    marks = replace(marks, position=position, local=own, world=whole, last=last, by_rig=by_rig)
+    marks, w, (local, world) = s.landmarks, solution.window, covariances
+    first, _ = w.by_point
+    part = (w.place >= 0) | (first[1:] > first[:-1])
+    there = replace(s, poses=w.poses, covariance=solution.pose_covariance, by_rig=by_rig[0])
+    known = part & (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
+    others, last = np.flatnonzero(~known), marks.last.copy()
+    if len(others):
+        local[others] = _seen_from_newest(there, others, there.relative(s.solved))[1]
+        world[others] = marks.world[others]
+    last[measured] = s.frames[-1]
+    marks = replace(
+        marks, position=w.points, local=local, world=world, last=last,
+        by_rig=np.where(part[:, None, None], by_rig[1], marks.by_rig),
+    )  # fmt: skip
     return replace(there, cost=solution.cost, solved=len(s.frames) - 1, landmarks=marks)

@@ -63,6 +63,11 @@ class Table:
         """All arrays."""
         return [getattr(self, name) for name in self.__dataclass_fields__]
 
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """The same, as compiled code takes them."""
+        return tuple(self.columns)
+
     def __len__(self) -> int:
         return len(getattr(self, next(iter(self.__dataclass_fields__))))
 

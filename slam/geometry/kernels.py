@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import factorise, solve_factorised, squared_distance, whitener
-from slam.kernels.se3 import move, transform_back
+from slam.kernels.linear import assign, factorise, solve_factorised, squared_distance, trace, turn, whitener
+from slam.kernels.se3 import between, move, transform_back
 from slam.kernels.stereo import by_pose, offsets, residual
 from slam.runtime.compilation import helper, kernel
 
@@ -218,4 +218,81 @@ def whiteners(covariances):
     out = np.empty(covariances.shape)
     for i in range(len(covariances)):
         whitener(covariances[i], out[i])
+    return out
+
+
+# --- landmarks as a camera expects them ---
+
+
+@kernel
+def seen(T, before, points, covariances, motion):
+    """Points (M, 3) in the coordinates of a camera T (4, 4), and their covariances (M, 3, 3) there.
+
+    `covariances` are those in the coordinates of the camera `before` (4, 4), from which T has moved by what is known
+    with the covariance `motion` (6, 6).
+    """
+    local, out = np.empty(points.shape), np.empty(covariances.shape)
+    R, G, GM = np.empty((3, 4)), np.zeros((3, 6)), np.empty((3, 6))
+    between(T, before, R)
+    for m in range(len(points)):
+        transform_back(T, points[m], local[m])
+        turn(R, covariances[m], out[m])
+        x, y, z = local[m]
+        G[0, 1], G[0, 2], G[1, 2] = -z, y, -x
+        G[1, 0], G[2, 0], G[2, 1] = z, -y, x
+        G[0, 3] = G[1, 4] = G[2, 5] = -1.0
+        for i in range(3):
+            for j in range(6):
+                GM[i, j] = 0.0
+                for k in range(6):
+                    GM[i, j] += G[i, k] * motion[k, j]
+        for i in range(3):
+            for j in range(3):
+                for k in range(6):
+                    out[m, i, j] += GM[i, k] * G[j, k]
+    return local, out
+
+
+@kernel
+def predicted_pixels(camera, local, covariances, sigma, most):
+    """Left and right pixels (M, 2) of points (M, 3) in the camera, and innovation covariances (M, 2, 2) of the left.
+
+    After a long gap variances are so large that their digits do not hold the noise `sigma` of a pixel: where rounding
+    has left less than that, or a correlation beyond `most`, there is the least that is definite.
+    """
+    count = len(local)
+    left, right, S = np.empty((count, 2)), np.empty((count, 2)), np.empty((count, 2, 2))
+    for m in range(count):
+        u, v, right_u, inverse = offsets(camera, local[m, 0], local[m, 1], local[m, 2])
+        left[m, 0], left[m, 1], right[m, 0] = u + camera[2], v + camera[3], right_u + camera[5]
+        right[m, 1] = left[m, 1]
+        C, a, b, c, d = covariances[m], camera[0] * inverse, camera[1] * inverse, -u * inverse, -v * inverse
+        uu = a * a * C[0, 0] + 2.0 * a * c * C[0, 2] + c * c * C[2, 2]
+        vv = b * b * C[1, 1] + 2.0 * b * d * C[1, 2] + d * d * C[2, 2]
+        uv = a * b * C[0, 1] + a * d * C[0, 2] + c * b * C[1, 2] + c * d * C[2, 2]
+        uu, vv = max(uu, 0.0) + sigma * sigma, max(vv, 0.0) + sigma * sigma
+        limit = most * np.sqrt(uu * vv)
+        S[m, 0, 0], S[m, 1, 1], S[m, 0, 1] = uu, vv, min(max(uv, -limit), limit)
+        S[m, 1, 0] = S[m, 0, 1]
+    return left, right, S
+
+
+@kernel
+def residual_noise(camera, local, covariances, z, sigma):
+    """Covariances (M, 3, 3) [px²] of residuals for a known pose: see `slam.window.pose_only.residual_noise`."""
+    out, other, r = np.empty(covariances.shape), np.empty((3, 3)), np.empty(3)
+    J, point = np.empty((3, 3)), np.empty(3)
+    for m in range(len(local)):
+        residual(camera, local[m], z[m], r, J)
+        turn(J, covariances[m], out[m])
+        x, y = (z[m, 0] - camera[2]) / camera[0], (z[m, 1] - camera[3]) / camera[1]
+        depth = -camera[6] / (x - (z[m, 2] - camera[5]) / camera[4])
+        if depth > 0.0 and np.isfinite(depth):
+            point[0], point[1], point[2] = x * depth, y * depth, depth
+            residual(camera, point, z[m], r, J)
+            turn(J, covariances[m], other)
+            if 0.0 < trace(other) < trace(out[m]):
+                assign(other, out[m])
+        for i in range(3):
+            out[m, i, i] += sigma * sigma
     return out

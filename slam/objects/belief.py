@@ -181,7 +181,7 @@ def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Carried, drift: float) 
         stereo, w.poses, w.points, rows.select(taken), places=places.select(there), carried=w.carried, prior=b.prior,
         joining=np.flatnonzero(joins),
     )  # fmt: skip
-    prior, _, _ = marginalised(w, 0, ends[b.prior.points])
+    prior, _, _ = marginalised(w, [0], ends[b.prior.points])
     prior, turned = _drifted(prior, b, drift)
     rows, places = rows.select(~taken & (rows.pose > 0)), places.select(~there & (places.pose > 0))
     keep = member & alive | joins

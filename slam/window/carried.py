@@ -1,4 +1,4 @@
-"""The motion of what the points of a window belong to, where that is a body carried past a camera that is known."""
+"""The motion of the camera, and of a body that is carried past a camera that is known: constant velocity, disturbed."""
 
 from __future__ import annotations
 
@@ -6,19 +6,36 @@ import numpy as np
 
 from slam.kernels.se3 import adjoint, between
 from slam.kernels.velocities import add_velocity_rows, velocity_change
-from slam.runtime.compilation import helper, kernel
+from slam.runtime.compilation import helper
 
 
-@kernel
-def carried_rows(poses, column, cameras, covariance, triple, interval, mean, variance, H, b):
+@helper
+def add_motion(poses, column, motion, H, b):
+    """Add constant velocity, disturbed: successive velocities differ by noise. Returns the sum of squares."""
+    triple, interval, weight = motion
+    cost, J, r = 0.0, np.empty((6, 18)), np.empty(6)
+    for m in range(len(triple)):
+        i0, i1, i2 = triple[m]
+        velocity_change(poses, i0, i1, i2, interval[m, 0], interval[m, 1], r, J)
+        for i in range(6):
+            r[i] *= weight[m, i]
+            cost += r[i] * r[i]
+            for j in range(18):
+                J[i, j] *= weight[m, i]
+        add_velocity_rows(J, r, triple[m], column, H, b)
+    return cost
+
+
+@helper
+def add_carried(poses, column, carried, H, b):
     """Add constant velocity of a body, disturbed, whose window's poses are those of a camera in the body.
 
     With Y_k of `poses` (K, 4, 4) and X_k of `cameras` (K, 4, 4), T_world_left, the body is at ``B_k = X_k Y_k⁻¹``. The
     change of its velocity is noise with `variance` (V, 6), besides the error of the cameras, whose joint `covariance`
     (6 K, 6 K) counts in each row by itself: errors of successive rows hang together, but little of what they are is
-    the camera's. `triple` (V, 3), `interval` (V, 2): see `slam.window.kernels.motion_rows`; `mean` (V, 6) is of the
-    velocity where the first pose is −1. Returns the sum of squares.
+    the camera's. Arrays are those of `slam.window.problem.Carried`. Returns the sum of squares.
     """
+    cameras, covariance, triple, interval, mean, variance = carried
     count = len(poses)
     bodies, Ad = np.zeros((count, 4, 4)), np.empty((count, 6, 6))
     back, one = np.empty((3, 4)), np.zeros((4, 4))

@@ -16,18 +16,18 @@ from slam.runtime.compilation import helper, kernel
 NEAR = 1e-6  # numerics: no distance below this [m] is inverted
 
 
-@kernel
-def charts(poses, centre, points, place, basis, reference):
+@helper
+def charts(poses, centre, points, place, basis):
     """Derivatives E (N, 3, 3) of all points by their charts' coordinates (α, β, ρ).
 
-    A point of the prior has the prior's chart, centred at the pose `reference`; any other has one about its own
+    A point of the prior has the prior's chart, centred at the first pose; any other has one about its own
     direction from the pose `centre`.
     """
     E, e = np.empty((len(points), 3, 3)), np.empty((3, 3))
     s, q, n = np.empty(3), np.empty(3), np.empty(3)
     for m in range(len(points)):
         if place[m] >= 0:
-            T, B = poses[reference], basis[place[m]]
+            T, B = poses[0], basis[place[m]]
             transform_back(T, points[m], q)
             for i in range(3):
                 s[i] = B[0, i] * q[0] + B[1, i] * q[1] + B[2, i] * q[2]

@@ -15,40 +15,32 @@ from slam.window.kernels import ELIMINATED, KNOWN
 
 
 @kernel
-def point_relations(T, points, place, E, pose, cross, first, order, column, inverse, X, P_poses, newest, prior):
+def point_relations(T, points, place, E, pose_of, cross, first, order, column, inverse, X, P_poses, newest, prior):
     """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each.
 
     T's unknowns begin at `newest`, −1 where it is fixed; `X` (n, n) is ``L⁻¹`` of the normal equations' Cholesky
     factor, `P_poses` (6 F, 6 F) the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse`
     is by `eliminate`.
     """
-    n, size, at = len(X), len(P_poses), newest - prior
+    size, at = len(P_poses), newest - prior
     camera, world = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 3))
     own, by = np.empty((3, 3)), np.zeros((3, 6))
+    blocks = _covariances(X, prior, newest)
     A, AP = np.zeros((3, size)), np.zeros((3, size))
-    q, D, G, tmp = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 3))
+    q, D, G, M = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6))
     for p in range(len(points)):
         d = place[p]
         if d >= 0:
-            for i in range(3):
-                for j in range(i + 1):
-                    total = 0.0
-                    for row in range(3 * d + i, n):
-                        total += X[row, 3 * d + i] * X[row, 3 * d + j]
-                    own[i, j] = own[j, i] = total
-                for j in range(6 if newest >= 0 else 0):
-                    total = 0.0
-                    for row in range(newest + j, n):
-                        total += X[row, 3 * d + i] * X[row, newest + j]
-                    by[i, j] = total
+            assign(blocks[d, :, :3], own)
+            assign(blocks[d, :, 3:], by)
         elif d == ELIMINATED and inverse[p, 0, 0] > 0.0:
             for i in range(3):
                 for a in range(size):
                     A[i, a] = AP[i, a] = 0.0
             for o in range(first[p], first[p + 1]):
                 m = order[o]
-                to = column[pose[m]] - prior
-                for i in range(3 if column[pose[m]] >= 0 else 0):
+                to = column[pose_of[m]] - prior
+                for i in range(3 if to >= 0 else 0):
                     for j in range(6):
                         for a in range(3):
                             A[i, to + j] -= inverse[p, i, a] * cross[m, j, a]
@@ -80,30 +72,51 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
         G[1, 0], G[2, 0], G[2, 1] = q[2], -q[1], q[0]
         G[0, 3] = G[1, 4] = G[2, 5] = -1.0
         for i in range(3):
-            for j in range(3):
-                tmp[i, j] = 0.0
-                for a in range(6):
-                    for k in range(3):
-                        tmp[i, j] += D[i, k] * by[k, a] * G[j, a]
-                    for k in range(6):
-                        tmp[i, j] += 0.5 * G[i, a] * P_poses[at + a, at + k] * G[j, k]
+            for j in range(6):
+                M[i, j] = row_times(D, i, by[:, j])
+                for k in range(6):
+                    M[i, j] += 0.5 * G[i, k] * P_poses[at + k, at + j]
         for i in range(3):
             for j in range(3):
-                camera[p, i, j] += tmp[i, j] + tmp[j, i]
+                for k in range(6):
+                    camera[p, i, j] += M[i, k] * G[j, k] + G[i, k] * M[j, k]
     return camera, world
+
+
+@helper
+def _covariances(X, unknown, newest):
+    """Covariances (D, 3, 9) of the first D = unknown / 3 points with themselves and with the pose at `newest`."""
+    out = np.zeros((unknown // 3, 3, 9))
+    for row in range(len(X)):  # ``Xᵀ X``, in the order in which X lies in memory
+        for d in range(min(row, unknown - 1) // 3 + 1):
+            for i in range(3):
+                x = X[row, 3 * d + i]
+                for j in range(3):
+                    out[d, i, j] += x * X[row, 3 * d + j]
+                for j in range(6 if newest >= 0 and row >= newest else 0):
+                    out[d, i, 3 + j] += x * X[row, newest + j]
+    return out
 
 
 @kernel
 def rig_columns(
-    camera, poses, column, points, place, E, pose, point, z, weight, field, pose_of, cross, first, order,
-    inverse, B,
+    camera, poses, column, points, place, E, rows, field, prior, by_first, members, unknown, pose_of, cross, first,
+    order, inverse, n,
 ):  # fmt: skip
-    """Add to B (n, m) how ``H x = b`` depends on m errors of the rig, which displace measurements by `field` (M, 3, m).
+    """How ``H x = b`` depends on m errors of the rig, which displace measurements by `field` (M, 3, m): B (n, m).
 
-    The rows are those of `slam.window.kernels.linearise`; `pose_of` (M + Q,) are the poses of rows and places. Returns
-    ``inverse gradient`` (N, 3, m) of the points that are eliminated.
+    `prior` are the derivatives of the prior's η, `by_first` those of its numbers by the first pose; `members` of the
+    `unknown` points are the prior's. Second, ``inverse gradient`` (N, 3, m) of the points that are eliminated.
     """
-    m = B.shape[1]
+    pose, point, z, weight = rows
+    m, mine, shift = field.shape[2], 3 * members, 3 * (unknown - members)
+    B = np.zeros((n, m))
+    for i in range(len(prior)):
+        for k in range(m):
+            if i < mine or i >= mine + 6:
+                B[i + (shift if i >= mine else 0), k] += prior[i, k]
+            for a in range(6):
+                B[mine + shift + a, k] += by_first[i, a] * prior[i, k]
     gradient, own = np.zeros((len(points), 3, m)), np.zeros((len(points), 3, m))
     q, r, D, F = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, m))
     J, Jp = np.empty((3, 6)), np.empty((3, 3))
@@ -133,7 +146,7 @@ def rig_columns(
                 at = column[pose_of[order[o]]]
                 if at >= 0:
                     add_product(cross[order[o]].T, own[p], 6, -1.0, B[at : at + 6])
-    return own
+    return B, own
 
 
 @helper

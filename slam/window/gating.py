@@ -53,9 +53,6 @@ def share_by_chance(rejected: Array, limit: float) -> float:
     return float(gammainc(1.5, limit / spread / 2))
 
 
-_MOST_CORRELATED = 1 - 1e-9  # numerics: largest correlation of two pixels
-
-
 def squared_distances(residuals: Array, covariances: Array) -> Array:
     """Squared Mahalanobis distances ``νᵀ S⁻¹ ν`` (M,).
 
@@ -69,19 +66,6 @@ def squared_distances(residuals: Array, covariances: Array) -> Array:
 
     distance = kernels.squared_distances(np.ascontiguousarray(residuals), np.ascontiguousarray(covariances))
     return np.asarray(np.where(np.isfinite(distance), distance, np.inf))
-
-
-def with_noise(covariances: Array, sigma: float) -> Array:
-    """Covariances (M, 2, 2) [px²] of predicted pixels with the noise of a measurement [px] added, positive definite.
-
-    After a long gap variances are so large that their digits do not hold the noise of a pixel: where rounding has left
-    less than that, or a correlation beyond ±1, there is the least that is definite.
-    """
-    S = covariances + sigma**2 * np.eye(2)
-    S[:, [0, 1], [0, 1]] = np.maximum(S[:, [0, 1], [0, 1]], sigma**2)
-    most = _MOST_CORRELATED * np.sqrt(S[:, 0, 0] * S[:, 1, 1])
-    S[:, 0, 1] = S[:, 1, 0] = np.clip(S[:, 0, 1], -most, most)
-    return S
 
 
 def whiteners(covariances: Array) -> Array:

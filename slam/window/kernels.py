@@ -1,13 +1,15 @@
 """Compiled loops of the window: normal equations with landmarks eliminated, steps back to poses and points.
 
 Poses are ``T_world_left`` with perturbations on the right, [rotation, translation]. A point's perturbation is in a
-chart of inverse distance (`slam.window.chart_kernels`). Unknowns stand in the order: points of the prior, free poses.
+chart of inverse distance (`slam.window.chart_kernels`). Unknowns stand in the order: points of the prior, points that
+join them, free poses.
 
 Arrays that many loops take: `poses` (K, 4, 4) and `column`, their first unknowns (K,), −1 for a fixed one; `points`
 (N, 3) and `place`, what each is to the solver (N,), see `KNOWN`; `E`, their derivatives by their charts' coordinates
-(N, 3, 3); `pose` and `point`, what each row is of (M,); `first` and `order`, rows by point, see `by_point`; `H` (n, n),
-lower triangle, and `b` (n,), which are added to; `information` (N, 3, 3) and `gradient` (N, 3) of each point by its
-rows; `cross`, what each row tells of pose and point together (M, 6, 3).
+(N, 3, 3); `pose_of`, the poses of all rows, then of all places; `first` and `order`, these by point, see `by_point`;
+`H` (n, n), lower triangle, and `b` (n,), which are added to; `information` (N, 3, 3) and `gradient` (N, 3) of each
+point by its rows; `cross`, what each row or place tells of pose and point together (M + Q, 6, 3). `rows`, `places`,
+`motion`, `carried` and `prior` are tuples of the arrays of the classes of that name in `slam.window.problem`.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ import numpy as np
 from slam.kernels.linear import invert_symmetric, row_times, turn
 from slam.kernels.se3 import adjoint, between, log, move, transform_back
 from slam.kernels.stereo import by_pose, residual
-from slam.kernels.velocities import add_velocity_rows, velocity_change
 from slam.runtime.compilation import helper, kernel
-from slam.window.chart_kernels import chart, displace
+from slam.window.carried import add_carried, add_motion
+from slam.window.chart_kernels import chart, charts, displace
 
 #: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
 KNOWN, ELIMINATED = -2, -1
@@ -28,24 +30,137 @@ _BEHIND = 1e4  # numerics: squared whitened residual of a point that is behind i
 
 
 @kernel
-def linearise(camera, poses, column, points, place, E, pose, point, z, weight, whole, H, b):
-    """Add the rows' normal equations: their squared whitened residuals (M,), information, gradient and cross.
+def normal_equations(
+    camera, poses, column, points, place, basis, centre, rows, places, own, motion, carried, prior, pose_of, first,
+    order, whole, n,
+):  # fmt: skip
+    """The normal equations ``H x = b`` (n,) of a window.
 
-    `camera` (7,) is as in `slam.kernels.stereo`; `z` is (uL, vL, uR) (M, 3), NaN where missing,
-    and `weight` 1 / σ (M,), zero for a row that does not count. Unless
-    `whole`, H is left as it is.
+    `camera` (7,) is as in `slam.kernels.stereo`; `basis` (D + J, 3, 3) are charts of the points that are unknowns, in
+    the first pose's axes; inverse distances of all others count from the pose `centre`; `own` are independent means
+    (N, 3) and information (N, 3, 3) of points in world coordinates, or of none. Unless `whole`, H is left undefined.
+
+    Returns H; b; the sum of squares, ∞ where a point has left the prior's chart; E; the inverse information (N, 3, 3)
+    and the gradient of points; cross; derivatives (m, 6) of the prior's numbers by the first pose.
     """
-    count, rows = len(points), len(pose)
-    information, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    cross, squares = np.zeros((rows, 6, 3)), np.zeros(rows)
-    q, r, D, J, Jp = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
-    for m in range(rows):
+    H, b = np.zeros((n, n)) if whole else np.empty((n, n)), np.zeros(n)
+    E = charts(poses, centre, points, place, basis)
+    information, gradient = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    cross = np.zeros((len(pose_of), 6, 3))
+    cost, A = _add_prior(poses, points, 3 * len(basis), prior, whole, H, b)
+    cost += _add_rows(camera, poses, column, points, place, E, rows, whole, H, b, information, gradient, cross)
+    cost += _add_places(
+        poses, column, points, place, E, places, whole, H, b, information, gradient, cross[len(rows[0]) :]
+    )
+    if len(own[0]):
+        cost += _add_own_priors(points, place, E, own[0], own[1], information, gradient)
+    cost += add_motion(poses, column, motion, H, b)
+    if len(carried[2]):
+        cost += add_carried(poses, column, carried, H, b)
+    inverse = _eliminate(column, place, pose_of, cross, first, order, information, gradient, whole, H, b)
+    return H, b, cost, E, inverse, gradient, cross, A
+
+
+@helper
+def _add_prior(poses, points, D, prior, whole, H, b):
+    """Add the prior ``δᵀ Λ δ − 2 ηᵀ δ``; poses begin at the unknown D. Returns its value, and δ's derivatives A (m, 6).
+
+    The reference pose changes all of δ, the others and the points only their own.
+    """
+    members, information, vector = prior[0], prior[5], prior[6]
+    n, mine = len(vector), 3 * len(members)
+    shift = D - mine  # of the poses, behind points that join
+    delta, A = np.empty(n), np.empty((n, 6))
+    if n == 0:
+        return 0.0, A
+    if not _prior_rows(poses, points, prior, delta, A):
+        return np.inf, A
+    cost, pull, V = 0.0, vector.copy(), np.zeros((6, n))
+    for i in range(n):
+        _subtract(pull, information[i], delta[i])
+        for a in range(6 if whole else 0):
+            _subtract(V[a], information[i], -A[i, a])
+    for i in range(n):
+        cost -= delta[i] * (pull[i] + vector[i])
+        for a in range(6):
+            b[D + a] += A[i, a] * pull[i]
+        if i < mine or i >= mine + 6:
+            b[i + (shift if i >= mine else 0)] += pull[i]
+    for i in range(n if whole else 0):
+        row = i + (shift if i >= mine else 0)
+        if i < mine:
+            for a in range(6):
+                H[D + a, row] = V[a, i]
+        elif i >= mine + 6:
+            for a in range(6):
+                H[row, D + a] = V[a, i]
+        else:
+            continue
+        for j in range(min(mine, i + 1)):
+            H[row, j] = information[i, j]
+        for j in range(mine + 6, i + 1):
+            H[row, j + shift] = information[i, j]
+    for a in range(6 if whole else 0):
+        for c in range(a + 1):
+            total = 0.0
+            for i in range(n):
+                total += A[i, a] * V[c, i]
+            H[D + a, D + c] = total
+    return cost, A
+
+
+@helper
+def _subtract(v, row, x):
+    """``v − x row``, in place."""
+    for j in range(len(v)):
+        v[j] -= x * row[j]
+
+
+@helper
+def _prior_rows(poses, points, prior, delta, A):
+    """Where unknowns stand relative to the prior's: δ (m,), and its derivative A (m, 6) by the first pose.
+
+    Returns False where a point has left the half space of its chart.
+    """
+    members, basis, origin, T, relative = prior[:5]
+    q, s, D, J = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    M, N, Ad = np.empty((3, 4)), np.empty((3, 4)), np.empty((6, 6))
+    now, at = poses[0], 3 * len(members)
+    for d in range(len(members)):
+        if not chart(now, points[members[d]], basis[d], origin[d], q, s, D):
+            return False
+        for i in range(3):
+            delta[3 * d + i] = s[i]
+            by_pose(D[i], q, A[3 * d + i])
+    for p in range(len(relative)):
+        if p == 0:
+            between(T, now, M)
+        else:
+            between(poses[p], now, N)
+            adjoint(N, Ad)
+            between(now, poses[p], N)
+            between(relative[p], N, M)
+        log(M, q, J, delta[at : at + 6])
+        for i in range(6):
+            for j in range(6):
+                A[at + i, j] = (1.0 if i == j else 0.0) if p == 0 else -Ad[i, j]
+        at += 6
+    return True
+
+
+@helper
+def _add_rows(camera, poses, column, points, place, E, rows, whole, H, b, information, gradient, cross):
+    """Add measurements. Returns the sum of squares."""
+    pose, point, z, weight = rows
+    cost, q, r, D = 0.0, np.empty(3), np.empty(3), np.empty((3, 3))
+    J, Jp = np.empty((3, 6)), np.empty((3, 3))
+    for m in range(len(pose)):
         w = weight[m]
         if w == 0.0:
             continue
         transform_back(poses[pose[m]], points[point[m]], q)
         if not residual(camera, q, z[m], r, D):
-            squares[m] = _BEHIND
+            cost += _BEHIND
             continue
         for i in range(3):
             if np.isnan(r[i]):
@@ -53,13 +168,13 @@ def linearise(camera, poses, column, points, place, E, pose, point, z, weight, w
                 for j in range(3):
                     D[i, j] = 0.0
             r[i] *= w
-            squares[m] += r[i] * r[i]
+            cost += r[i] * r[i]
             for j in range(3):
                 D[i, j] *= w
         _add_row(
             poses, column, place, E, pose[m], point[m], q, r, D, J, Jp, whole, H, b, information, gradient, cross[m]
         )  # fmt: skip
-    return squares, information, gradient, cross
+    return cost
 
 
 @helper
@@ -90,16 +205,11 @@ def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, whole, H, b, informa
                 cross[a, c] = J[0, a] * Jp[0, c] + J[1, a] * Jp[1, c] + J[2, a] * Jp[2, c]
 
 
-@kernel
-def place_rows(
-    poses, column, points, place, E, pose, point, basis, origin, root, whole, H, b, information, gradient
-):  # fmt: skip
-    """Add points known relative to a pose: ``root ((α, β, ρ) − origin)`` of each is unit noise. See `linearise`.
-
-    `basis` (Q, 3, 3) is each row's chart in the pose's axes, `origin` (Q, 3) where the point stood in it, and `root`
-    (Q, 3, 3) the square root of its information. Returns the sum of squares, and cross (Q, 6, 3).
-    """
-    cross, cost = np.zeros((len(pose), 6, 3)), 0.0
+@helper
+def _add_places(poses, column, points, place, E, places, whole, H, b, information, gradient, cross):
+    """Add points known relative to a pose: ``root ((α, β, ρ) − origin)`` is unit noise. Returns the sum of squares."""
+    pose, point, basis, origin, root = places
+    cost = 0.0
     q, s, D, W = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     J, Jp, r = np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
     for m in range(len(pose)):
@@ -114,11 +224,11 @@ def place_rows(
         _add_row(
             poses, column, place, E, pose[m], point[m], q, r, W, J, Jp, whole, H, b, information, gradient, cross[m]
         )  # fmt: skip
-    return cost, cross
+    return cost
 
 
-@kernel
-def own_priors(points, place, E, mean, own, information, gradient):
+@helper
+def _add_own_priors(points, place, E, mean, own, information, gradient):
     """Add independent priors of points in world coordinates: mean (N, 3), information (N, 3, 3). Returns their cost."""
     cost, d, v = 0.0, np.empty(3), np.empty(3)
     for p in range(len(points)):
@@ -138,8 +248,8 @@ def own_priors(points, place, E, mean, own, information, gradient):
     return cost
 
 
-@kernel
-def eliminate(column, place, pose, cross, first, order, information, gradient, whole, H, b):
+@helper
+def _eliminate(column, place, pose_of, cross, first, order, information, gradient, whole, H, b):
     """Take points into H and b: those of the prior as unknowns, the others eliminated.
 
     Returns inverses (N, 3, 3) of the information of points that are eliminated.
@@ -154,7 +264,7 @@ def eliminate(column, place, pose, cross, first, order, information, gradient, w
                     H[3 * d + i, 3 * d + j] += information[p, i, j]
             for o in range(first[p], first[p + 1] if whole else 0):
                 m = order[o]
-                at = column[pose[m]]
+                at = column[pose_of[m]]
                 if at >= 0:
                     for i in range(6):
                         for j in range(3):
@@ -172,7 +282,7 @@ def eliminate(column, place, pose, cross, first, order, information, gradient, w
                 v[i] = S[i, 0] * gradient[p, 0] + S[i, 1] * gradient[p, 1] + S[i, 2] * gradient[p, 2]
             for o in range(first[p], first[p + 1]):
                 m = order[o]
-                at = column[pose[m]]
+                at = column[pose_of[m]]
                 if at < 0:
                     continue
                 for i in range(6):
@@ -181,7 +291,7 @@ def eliminate(column, place, pose, cross, first, order, information, gradient, w
                         W[i, j] = cross[m, i, 0] * S[0, j] + cross[m, i, 1] * S[1, j] + cross[m, i, 2] * S[2, j]
                 for o2 in range(first[p], first[p + 1] if whole else 0):
                     m2 = order[o2]
-                    to = column[pose[m2]]
+                    to = column[pose_of[m2]]
                     if to < 0 or to > at:
                         continue
                     for i in range(6):
@@ -210,63 +320,7 @@ def by_point(point, count):
 
 
 @kernel
-def prior_rows(poses, points, members, T, relative, basis, origin, pose_of, delta, A):
-    """Where unknowns stand relative to the prior's: δ (n,), and its derivative A (n, 6) by the reference pose.
-
-    Both are overwritten, points first. `members` are the prior's points (D,), `basis` (D, 3, 3) and `origin` (D, 3)
-    their charts in the reference pose's axes and where they stood in them; `T` (4, 4) is where that pose stood,
-    `relative` (P, 4, 4) where the poses `pose_of` (P,) stood before it, itself the first. Returns False where a point
-    has left the half space of its chart.
-    """
-    q, s, D, J = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    M, N, Ad = np.empty((3, 4)), np.empty((3, 4)), np.empty((6, 6))
-    now, at = poses[pose_of[0]], 3 * len(members)
-    for d in range(len(members)):
-        if not chart(now, points[members[d]], basis[d], origin[d], q, s, D):
-            return False
-        for i in range(3):
-            delta[3 * d + i] = s[i]
-            by_pose(D[i], q, A[3 * d + i])
-    for p in range(len(pose_of)):
-        if p == 0:
-            between(T, now, M)
-        else:
-            between(poses[pose_of[p]], now, N)
-            adjoint(N, Ad)
-            between(now, poses[pose_of[p]], N)
-            between(relative[p], N, M)
-        log(M, q, J, delta[at : at + 6])
-        for i in range(6):
-            for j in range(6):
-                A[at + i, j] = (1.0 if i == j else 0.0) if p == 0 else -Ad[i, j]
-        at += 6
-    return True
-
-
-@kernel
-def motion_rows(poses, column, triple, interval, weight, H, b):
-    """Add constant velocity, disturbed: successive velocities differ by noise. Returns the sum of squares.
-
-    `triple` (V, 3) are three successive poses, −1 first where the first velocity itself is noise; `interval` (V, 2) the
-    times between them [s], `weight` (V, 6) 1 / σ of the change of [ω, v].
-    """
-    cost = 0.0
-    J, r = np.empty((6, 18)), np.empty(6)
-    for m in range(len(triple)):
-        i0, i1, i2 = triple[m]
-        d0, d1 = interval[m]
-        velocity_change(poses, i0, i1, i2, d0, d1, r, J)
-        for i in range(6):
-            r[i] *= weight[m, i]
-            cost += r[i] * r[i]
-            for j in range(18):
-                J[i, j] *= weight[m, i]
-        add_velocity_rows(J, r, triple[m], column, H, b)
-    return cost
-
-
-@kernel
-def step(poses, column, points, place, E, pose, cross, first, order, inverse, gradient, x):
+def step(poses, column, points, place, E, pose_of, cross, first, order, inverse, gradient, x):
     """Poses (K, 4, 4) and points (N, 3) after a step x (n,) of the unknowns; eliminated points follow."""
     new, to = poses.copy(), points.copy()
     for k in range(len(poses)):
@@ -282,7 +336,7 @@ def step(poses, column, points, place, E, pose, cross, first, order, inverse, gr
                 v[i] = gradient[p, i]
             for o in range(first[p], first[p + 1]):
                 m = order[o]
-                at = column[pose[m]]
+                at = column[pose_of[m]]
                 if at >= 0:
                     for i in range(3):
                         for j in range(6):
@@ -301,7 +355,7 @@ def left_out_distances(camera, T, points, z, covariances, sigma, least, T_then, 
 
     With r the residual, ``rᵀ (σ² 1 − J C Jᵀ)⁻¹ r``, C the point's covariance (3, 3) in the newest camera T, in which
     the row itself takes part, and J as linearised for C, at `T_then` and `points_then`: elsewhere the difference need
-    not be positive. ∞ where the point is not in front of the camera, or where a residual has less than the share
+    not be positive. ∞ where the point is not in front of the camera; 0 where a residual has less than the share
     `least` of the row's noise.
     """
     out, q, r, D = np.empty(len(points)), np.empty(3), np.empty(3), np.empty((3, 3))
@@ -326,5 +380,5 @@ def left_out_distances(camera, T, points, z, covariances, sigma, least, T_then, 
         for i in range(3):
             total += r[i] * row_times(inverse, i, r)
         tested = min(S[0, 0], S[1, 1], S[2, 2]) >= least * sigma * sigma
-        out[m] = total if tested and total >= 0.0 else np.inf
+        out[m] = 0.0 if not tested else total if total >= 0.0 else np.inf
     return out

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from slam.geometry.arrays import Array, BoolArray
+from slam.geometry.arrays import Array, BoolArray, among
 from slam.geometry.se3 import adjoint, inverse
 from slam.window import chart_kernels, covariance_kernels
 from slam.window.problem import RelativePrior, Window
 from slam.window.solver import linearised
+
+_LEAST = 0.1  # numerics: share of its inverse distance that a point keeps at least in a step, as in `displace`
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,52 +21,56 @@ class Conditional:
     """Where what left stands, given what stayed: ``x = mean − gain y``, to first order.
 
     x and y are the changes since it left: first of points, in their charts' coordinates, then of poses as tangent
-    vectors.
-
-    Attributes:
-        mean: (g,).
-        gain: (g, s).
-        left, stayed: derivatives (G, 3, 3) and (S, 3, 3) of the points in the world by those coordinates.
+    vectors. Points change by inverse distance, not by distance: far ones may move by a multiple of what they were off.
     """
 
-    mean: Array
-    gain: Array
-    left: Array
-    stayed: Array
+    mean: Array  # (g,)
+    gain: Array  # (g, s)
+    left: Array  # derivatives (G, 3, 3) of the points that left, in the world, by those coordinates
+    stayed: Array  # likewise (S, 3, 3) of those that stayed
 
     def of(self, stayed: Array, poses: Array) -> tuple[Array, Array]:
-        """Changes of points that left (G, 3) [m] and of the pose (6,), by those of points (S, 3) and poses (P, 6)."""
-        y = np.linalg.solve(self.stayed, stayed[:, :, None])
+        """Changes of points (G, 3) [m] and poses (Q, 6) that left, by those (S, 3) and (P, 6) of what stayed."""
+        s = np.linalg.solve(self.stayed, stayed[:, :, None])[:, :, 0]
+        y = s / np.maximum(1.0 - _distance(self.stayed) * s[:, 2:], _LEAST)  # the inverse of `chart_kernels.displace`
         x = self.mean - self.gain @ np.concatenate([y.ravel(), poses.ravel()])
-        return (self.left @ x[:-6].reshape(-1, 3, 1))[:, :, 0], x[-6:]
+        d, poses = x[: 3 * len(self.left)].reshape(-1, 3), x[3 * len(self.left) :].reshape(-1, 6)
+        moved = (self.left @ d[:, :, None])[:, :, 0] / np.maximum(1.0 + _distance(self.left) * d[:, 2:], _LEAST)
+        return moved, poses
+
+
+def _distance(E: Array) -> Array:
+    """Distances (N, 1) of points from their charts' centres, by their derivatives (N, 3, 3)."""
+    return np.asarray(np.linalg.norm(E[:, :, 0], axis=1)[:, None])
 
 
 def marginalised(
-    w: Window, pose: int, leaving: BoolArray, field: Array | None = None
+    w: Window, poses: Sequence[int], leaving: BoolArray, field: Array | None = None
 ) -> tuple[RelativePrior, Conditional, float]:
-    """Marginalise a pose and some of the prior's points out of a window, with all that is measured of them.
+    """Marginalise poses and some of the prior's points out of a window, with all that is measured of them.
 
-    The window holds just that: the prior, the rows of the pose that leaves and of the points that leave, and what else
+    The window holds just that: the prior, the rows of the poses that leave and of the points that leave, and what else
     is known of them. Its `joining` points join the prior; all others that are not in it leave as well.
 
     Args:
         w: the window, all poses free.
-        pose: which pose leaves. If it is the first, the next one takes its place as the reference.
+        poses: which poses leave. If the first does, the first of those that stay becomes the reference.
         leaving: which of the prior's points leave (D,).
         field: derivatives (M, 3, m) of the rows' true measurements by errors of the rig; None for none.
 
     Returns:
         the prior on the other poses and the points that stay, in their order, then those that joined (points as
-        indices of this window); where the points that left, then the pose, are given the others; and what all that
+        indices of this window); where the points that left, then the poses, are given the others; and what all that
         cost at the present values.
 
     Raises:
         numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
     """
-    reference = 1 if pose == 0 else 0
+    gone_poses = among(len(w.poses), np.asarray(poses))
+    reference = int(np.argmin(gone_poses))
     e = linearised(w, reference)
     points = np.concatenate([leaving, np.zeros(len(w.joining), bool)])
-    gone = np.concatenate([np.repeat(points, 3), np.repeat(np.arange(len(w.poses)) == pose, 6)])
+    gone = np.concatenate([np.repeat(points, 3), np.repeat(gone_poses, 6)])
     information, vector, mean, gain = covariance_kernels.schur_complement(
         e.H, e.b, np.flatnonzero(gone), np.flatnonzero(~gone)
     )
@@ -74,13 +81,13 @@ def marginalised(
     E = e.E[w.members]
     conditional = Conditional(mean, gain, E[points], E[~points])
 
-    members, poses = w.members[~points], np.delete(w.poses, pose, axis=0)
+    members, stay = w.members[~points], w.poses[~gone_poses]
     D = len(members)
     if reference:
-        basis, _ = chart_kernels.relative_charts(poses[0], w.points[members])
+        basis, _ = chart_kernels.relative_charts(stay[0], w.points[members])
     else:
         basis = w.basis[~points]
-    origin, change, by = chart_kernels.chart_changes(poses[0], w.points[members], basis, conditional.stayed)
+    origin, change, by = chart_kernels.chart_changes(stay[0], w.points[members], basis, conditional.stayed)
     if not np.isfinite(origin).all():
         raise np.linalg.LinAlgError("a point of the prior is behind its chart")
     if reference:  # coordinates from another pose
@@ -88,7 +95,7 @@ def marginalised(
         information = _of_charts(back, _of_charts(back, information).T)
         vector, by_rig = _of_charts(back, vector), _of_charts(back, by_rig)
     # x = δ − A δ₀ of all but the reference
-    relative = inverse(poses[0]) @ poses
+    relative = inverse(stay[0]) @ stay
     A = np.concatenate([-by.reshape(3 * D, 6), np.eye(6), adjoint(inverse(relative[1:])).reshape(-1, 6)])
     at = slice(3 * D, 3 * D + 6)
     V = information @ A
@@ -97,7 +104,7 @@ def marginalised(
     vector[at] = A.T @ vector
     by_rig[at] = A.T @ by_rig
     prior = RelativePrior(
-        members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vector, by_rig
+        members, np.ascontiguousarray(basis), origin, stay[0].copy(), relative, information, vector, by_rig
     )
     return prior, conditional, e.cost
 

@@ -98,10 +98,4 @@ def residual_noise(stereo: RectifiedStereo, sigma: float, local: Array, own: Arr
     are known. Pixel noise and the landmark's own uncertainty, linearised at the estimated or at the measured position,
     whichever gives the smaller covariance: close to the camera a small error of depth would explain any pixel.
     """
-    _, J = stereo.project(local)
-    estimated = J @ own @ np.swapaxes(J, 1, 2)
-    _, J = stereo.project(stereo.triangulate(z))
-    measured = J @ own @ np.swapaxes(J, 1, 2)
-    size, other = (np.trace(C, axis1=1, axis2=2) for C in (estimated, measured))
-    smaller = (other > 0) & (other < size)
-    return np.where(smaller[:, None, None], measured, estimated) + sigma**2 * np.eye(3)
+    return np.asarray(kernels.residual_noise(stereo.intrinsics, local, np.ascontiguousarray(own), z, sigma))

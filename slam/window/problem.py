@@ -37,19 +37,13 @@ class Rows(Table):
 
 @dataclass(frozen=True, eq=False)
 class Places(Table):
-    """Points that are known relative to a pose, a row each; the error of their inverse distance is Gaussian.
+    """Points that are known relative to a pose, a row each; the error of their inverse distance is Gaussian."""
 
-    Attributes:
-        pose, point: indices of the pose and the point (Q,).
-        basis, origin: the chart in the pose's axes (Q, 3, 3), and the point's coordinates in it (Q, 3).
-        root: square root of its information there (Q, 3, 3).
-    """
-
-    pose: IndexArray
-    point: IndexArray
-    basis: Array
-    origin: Array
-    root: Array
+    pose: IndexArray  # indices of the pose (Q,)
+    point: IndexArray  # and of the point (Q,)
+    basis: Array  # the chart in the pose's axes (Q, 3, 3)
+    origin: Array  # the point's coordinates in it (Q, 3)
+    root: Array  # square root of its information there (Q, 3, 3)
 
     @classmethod
     def none(cls) -> Places:
@@ -60,17 +54,11 @@ class Places(Table):
 
 @dataclass(frozen=True, eq=False)
 class Motion(Table):
-    """Constant velocity, disturbed by noise: a row for each two successive intervals (paper B, section 2).
+    """Constant velocity, disturbed by noise: a row for each two successive intervals (paper B, section 2)."""
 
-    Attributes:
-        poses: indices of three successive poses (V, 3); −1 first where the first velocity is noise with mean zero.
-        interval: times between them (V, 2) [s].
-        weight: 1 / σ of the velocity's change [ω, v] (V, 6).
-    """
-
-    poses: IndexArray
-    interval: Array
-    weight: Array
+    poses: IndexArray  # three successive poses (V, 3); −1 first where the first velocity is noise with mean zero
+    interval: Array  # times between them (V, 2) [s]
+    weight: Array  # 1 / σ of the velocity's change [ω, v] (V, 6)
 
     @classmethod
     def none(cls) -> Motion:
@@ -80,28 +68,25 @@ class Motion(Table):
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """Constant velocity, disturbed, of a body past which a known camera moves: see `slam.window.carried`.
+    """Constant velocity, disturbed, of a body past which a known camera moves: see `slam.window.carried`."""
 
-    Attributes:
-        cameras: T_world_left (K, 4, 4) of the window's poses, which are T_body_left.
-        covariance: of the cameras together (6 K, 6 K).
-        poses, interval: as of `Motion` (V, 3), (V, 2).
-        mean: of the velocity [ω, v] (V, 6) where the first pose is −1, ω in body axes, v in world axes; else zero.
-        variance: of its change (V, 6).
-    """
-
-    cameras: Array
-    covariance: Array
-    poses: IndexArray
-    interval: Array
-    mean: Array
-    variance: Array
+    cameras: Array  # T_world_left (K, 4, 4) of the window's poses, which are T_body_left
+    covariance: Array  # of the cameras together (6 K, 6 K)
+    poses: IndexArray  # as of `Motion` (V, 3)
+    interval: Array  # likewise (V, 2)
+    mean: Array  # of [ω, v] (V, 6) where the first pose is −1, ω in body axes, v in world axes; else zero
+    variance: Array  # of the velocity's change (V, 6)
 
     @classmethod
     def none(cls) -> Carried:
         """No motion model."""
         none, six = np.zeros((0, 3), np.intp), np.zeros((0, 6))
         return cls(np.zeros((0, 4, 4)), np.zeros((0, 0)), none, np.zeros((0, 2)), six, six)
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """All of them."""
+        return tuple(vars(self).values())
 
     def select(self, keep: np.ndarray) -> Carried:
         """Some of the rows (a mask or indices)."""
@@ -120,25 +105,16 @@ class RelativePrior:
 
     With δ = [coordinates of each point in its chart, Log(T⁻¹ T₀), Log(M_i⁻¹ T₀⁻¹ T_i)] of the points and poses as they
     are, it costs ``δᵀ Λ δ − 2 ηᵀ δ``.
-
-    Attributes:
-        points: indices of its points (D,).
-        basis, origin: their charts in the first pose's axes (D, 3, 3), and their coordinates there (D, 3).
-        T: where the first pose stood (4, 4).
-        relative: where each pose stood before the first (P, 4, 4); the first is the identity.
-        information: Λ (n, n), n = 3 D + 6 P.
-        vector: η (n,).
-        by_rig: derivative of η (n, m) by m errors of the rig.
     """
 
-    points: IndexArray
-    basis: Array
-    origin: Array
-    T: Array
-    relative: Array
-    information: Array
-    vector: Array
-    by_rig: Array
+    points: IndexArray  # indices of its points (D,)
+    basis: Array  # their charts in the first pose's axes (D, 3, 3)
+    origin: Array  # their coordinates there (D, 3)
+    T: Array  # where the first pose stood (4, 4)
+    relative: Array  # where each pose stood before the first (P, 4, 4); the first is the identity
+    information: Array  # Λ (m, m), m = 3 D + 6 P
+    vector: Array  # η (m,)
+    by_rig: Array  # derivatives of η by errors of the rig, a column each
 
     @classmethod
     def of_pose(cls, T: Array, covariance: Array, by_rig: Array | None = None) -> RelativePrior:
@@ -148,6 +124,11 @@ class RelativePrior:
         by_rig = np.zeros((6, 0)) if by_rig is None else information @ by_rig
         one = np.eye(4)[None]
         return cls(none, np.zeros((0, 3, 3)), np.zeros((0, 3)), T, one, information, np.zeros(6), by_rig)
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """All but the last."""
+        return tuple(vars(self).values())[:-1]
 
     @classmethod
     def none(cls) -> RelativePrior:
@@ -163,7 +144,7 @@ class Window:
     Attributes:
         stereo: the rectified rig that measures.
         poses: T_world_left (K, 4, 4).
-        points: in world coordinates (N, 3) [m].
+        points: in world coordinates (N, 3) [m]; those that nothing measures take no part.
         rows: measurements.
         free: which poses are unknown (K,); None for all. Those of the prior must be.
         known: which points are exact (N,); None for none.
@@ -235,6 +216,12 @@ class Window:
         return first, order
 
     @cached_property
-    def pose_of_row(self) -> IndexArray:
+    def pose_of(self) -> IndexArray:
         """Pose of each row, then of each place."""
         return np.concatenate([self.rows.pose, self.places.pose])
+
+    def at(self, poses: Array, points: Array) -> Window:
+        """With other values of the poses and points."""
+        moved = object.__new__(Window)
+        moved.__dict__.update(self.__dict__, poses=poses, points=points)  # what was derived does not depend on them
+        return moved

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from slam.geometry.arrays import Array, IndexArray
-from slam.window import chart_kernels, covariance_kernels, kernels
-from slam.window.carried import carried_rows
+from slam.window import covariance_kernels, kernels
 from slam.window.problem import Window
 
 _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
+_WHOLE = 128  # cost: rows of a triangular matrix that is inverted as a whole
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
 #: numerics: Decrease of the cost by a step with the last factor below which that step is the last; it leaves far less.
 CLOSE = 1e-2
@@ -23,41 +23,31 @@ _NEAR = 50.0
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """A window linearised at its present values: ``H x = b``, points eliminated.
+    """A window linearised at its present values: ``H x = b``, points eliminated."""
 
-    Attributes:
-        window: what was linearised.
-        H: information of the unknowns (n, n), lower triangle.
-        b: (n,).
-        cost: sum of squares of everything, with the prior's ``δᵀ Λ δ − 2 ηᵀ δ``.
-        E: derivatives of points by their charts' coordinates (N, 3, 3).
-        inverse: inverse information of each eliminated point (N, 3, 3).
-        gradient: of each point by its own rows (N, 3).
-        cross: information that each row, then each place, shares between pose and point (M + Q, 6, 3).
-    """
-
-    window: Window
-    H: Array
-    b: Array
-    cost: float
-    E: Array
-    inverse: Array
-    gradient: Array
-    cross: Array
+    window: Window  # what was linearised
+    H: Array  # information of the unknowns (n, n), lower triangle
+    b: Array  # (n,)
+    cost: float  # sum of squares of everything, with the prior's ``δᵀ Λ δ − 2 ηᵀ δ``
+    E: Array  # derivatives of points by their charts' coordinates (N, 3, 3)
+    inverse: Array  # inverse information of each eliminated point (N, 3, 3)
+    gradient: Array  # of each point by its own rows (N, 3)
+    cross: Array  # information that each row, then each place, shares between pose and point (M + Q, 6, 3)
+    by_first: Array  # derivatives of the prior's numbers by the first pose (m, 6)
 
     @cached_property
     def factor(self) -> Array:
-        """Lower triangular L (n, n) with ``L Lᵀ = H``.
+        """Upper triangular Lᵀ (n, n) in Fortran's order, with ``L Lᵀ = H``.
 
         Raises:
             numpy.linalg.LinAlgError: H is not positive definite: something is not determined.
         """
         if not len(self.H):
             return self.H
-        L, info = dpotrf(self.H.T, lower=0, clean=1, overwrite_a=0)
-        if info or not np.isfinite(L[-1:, -1:]).all():
+        U, info = dpotrf(self.H.T, lower=0, clean=1, overwrite_a=0)
+        if info or not np.isfinite(U[-1:, -1:]).all():
             raise np.linalg.LinAlgError("the window's information is not positive definite")
-        return np.asarray(L)  # upper triangle, Lᵀ in Fortran's order
+        return np.asarray(U)
 
     def step(self, factor: Array) -> tuple[Array, float]:
         """Step of the unknowns (n,) by a factor of these or nearby equations, and the decrease of cost it expects.
@@ -73,26 +63,22 @@ class NormalEquations:
 
         `field` (M, 3, m) are those of the rows' true measurements.
         """
-        w, rows, m = self.window, self.window.rows, field.shape[2]
-        prior = _from_prior(w)
-        B = np.zeros((w.unknowns, m)) if prior is None else _placed(w, prior[1], w.prior.by_rig)
-        own = covariance_kernels.rig_columns(
-            w.stereo.intrinsics, w.poses, w.column, w.points, w.place, self.E, rows.pose, rows.point,
-            rows.z, rows.weight, field, w.pose_of_row, self.cross, *w.by_point, self.inverse, B,
+        w = self.window
+        prior = w.prior.by_rig if len(w.prior.vector) else np.zeros((0, field.shape[2]))
+        return covariance_kernels.rig_columns(
+            w.stereo.intrinsics, w.poses, w.column, w.points, w.place, self.E, w.rows.arrays, field, prior,
+            self.by_first, len(w.prior.points), len(w.members), w.pose_of, self.cross, *w.by_point, self.inverse,
+            w.unknowns,
         )  # fmt: skip
-        return B, own
 
     def after(self, x: Array) -> Window:
         """The window after a step of the unknowns."""
         w = self.window
         poses, points = kernels.step(
-            w.poses, w.column, w.points, w.place, self.E, w.pose_of_row, self.cross, *w.by_point, self.inverse,
+            w.poses, w.column, w.points, w.place, self.E, w.pose_of, self.cross, *w.by_point, self.inverse,
             self.gradient, x,
         )  # fmt: skip
-        moved = replace(w, poses=poses, points=points)
-        for name in ("members", "basis", "place", "column", "unknowns", "by_point", "pose_of_row"):
-            moved.__dict__[name] = getattr(w, name)  # these do not change
-        return moved
+        return w.at(poses, points)
 
 
 def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquations:
@@ -103,77 +89,13 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
         centre: the pose from which inverse distances of points outside the prior count.
         whole: with H; without it, H is left undefined, and only a factor of other equations may be used.
     """
-    n, rows = w.unknowns, w.rows
-    H, b = np.zeros((n, n)) if whole else np.empty((n, n)), np.zeros(n)
-    cost = _begin_with_prior(w, H, b, whole)
-    E = chart_kernels.charts(w.poses, centre, w.points, w.place, w.basis, 0)
-    squares, information, gradient, cross = kernels.linearise(
-        w.stereo.intrinsics, w.poses, w.column, w.points, w.place, E, rows.pose, rows.point, rows.z, rows.weight, whole,
-        H, b,
-    )  # fmt: skip
-    cost += float(squares.sum())
-    if len(w.places):
-        p = w.places
-        more, its = kernels.place_rows(
-            w.poses, w.column, w.points, w.place, E, p.pose, p.point, p.basis, p.origin, p.root, whole, H, b,
-            information, gradient,
-        )  # fmt: skip
-        cost, cross = cost + more, np.concatenate([cross, its])
-    if w.information is not None and w.mean is not None:
-        cost += kernels.own_priors(w.points, w.place, E, w.mean, w.information, information, gradient)
-    if len(w.motion.poses):
-        m = w.motion
-        cost += kernels.motion_rows(w.poses, w.column, m.poses, m.interval, m.weight, H, b)
-    if len(w.carried.poses):
-        c = w.carried
-        cost += carried_rows(
-            w.poses, w.column, c.cameras, c.covariance, c.poses, c.interval, c.mean, c.variance, H, b
-        )  # fmt: skip
-    inverse = kernels.eliminate(
-        w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, whole, H, b
-    )  # fmt: skip
-    return NormalEquations(w, H, b, cost, E, inverse, gradient, cross)
-
-
-def _from_prior(w: Window) -> tuple[Array, Array] | None:
-    """δ (n,) of the prior, and its derivative (n, 6) by the first pose; None where a point has left its chart."""
-    prior, n = w.prior, len(w.prior.vector)
-    delta, A = np.empty(n), np.empty((n, 6))
-    covered = not n or kernels.prior_rows(
-        w.poses, w.points, prior.points, prior.T, prior.relative, prior.basis, prior.origin,
-        np.arange(len(prior.relative)), delta, A,
-    )  # fmt: skip
-    return (delta, A) if covered else None
-
-
-def _placed(w: Window, A: Array, pull: Array) -> Array:
-    """What pulls at the prior's δ (n, ...), at the window's unknowns; A (n, 6) as of `_from_prior`."""
-    D, J, n = 3 * len(w.prior.points), 3 * len(w.joining), len(pull)
-    out = np.zeros((w.unknowns, *pull.shape[1:]))
-    out[:D], out[D + J : n + J] = pull[:D], pull[D:]
-    out[D + J : D + J + 6] = A.T @ pull
-    return out
-
-
-def _begin_with_prior(w: Window, H: Array, b: Array, whole: bool) -> float:
-    """Begin the normal equations with the prior; returns its cost, ∞ where a point has left its chart."""
-    prior, n = w.prior, len(w.prior.vector)
-    if not n:
-        return 0.0
-    found = _from_prior(w)
-    if found is None:
-        return np.inf
-    delta, A = found
-    D, J = 3 * len(prior.points), 3 * len(w.joining)
-    pull = prior.vector - prior.information @ delta
-    b[:] = _placed(w, A, pull)
-    if whole:
-        V, poses, reference = prior.information @ A, slice(D + J, n + J), slice(D + J, D + J + 6)
-        H[:D, :D], H[poses, :D] = prior.information[:D, :D], prior.information[D:, :D]
-        H[poses, poses] = prior.information[D:, D:]
-        H[reference, :D], H[poses, reference], H[reference, poses] = V[:D].T, V[D:], V[D:].T
-        H[reference, reference] = A.T @ V
-    return float(-delta @ (pull + prior.vector))
+    own = (
+        (np.zeros((0, 3)), np.zeros((0, 3, 3))) if w.mean is None or w.information is None else (w.mean, w.information)
+    )
+    return NormalEquations(w, *kernels.normal_equations(
+        w.stereo.intrinsics, w.poses, w.column, w.points, w.place, w.basis, centre, w.rows.arrays, w.places.arrays, own,
+        w.motion.arrays, w.carried.arrays, w.prior.arrays, w.pose_of, *w.by_point, whole, w.unknowns,
+    ))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,8 +117,7 @@ class Solution:
     @cached_property
     def inverse_factor(self) -> Array:
         """``L⁻¹`` (n, n), lower triangular."""
-        upper = self.equations.factor
-        return np.asarray(dtrtri(upper, lower=0)[0].T if len(upper) else upper)
+        return np.asarray(_upper_inverse(self.equations.factor).T)
 
     @cached_property
     def pose_covariance(self) -> Array:
@@ -215,9 +136,9 @@ class Solution:
         """
         w, e = self.window, self.equations
         B, own = e.by_rig(field)
-        X = np.ascontiguousarray(dpotrs(e.factor, B, lower=0)[0]) if B.size else B
+        X = self.inverse_factor.T @ (self.inverse_factor @ B)
         points = covariance_kernels.rig_points(
-            w.column, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, e.inverse, own, X
+            w.column, w.place, e.E, w.pose_of, e.cross, *w.by_point, e.inverse, own, X
         )
         return X[3 * len(w.members) :], points
 
@@ -226,7 +147,7 @@ class Solution:
         e = self.equations
         w = e.window
         return covariance_kernels.point_relations(
-            w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,
+            w.poses[pose], w.points, w.place, e.E, w.pose_of, e.cross, *w.by_point, w.column, e.inverse,
             self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members),
         )  # fmt: skip
 
@@ -243,7 +164,7 @@ class Solution:
             z: the rows' measurements (M, 3), uR NaN where missing.
             local: covariances of these points in the pose's coordinates (M, 3, 3), see `point_covariances`.
             sigma: noise of the rows [px].
-            least: share of its noise that a row's residual must have to be tested; ∞ where it has less.
+            least: share of its noise that a row's residual must have to be tested; the distance is 0 where it has less.
         """
         w, then, first = self.window, self.equations.window, self.window.by_point[0]
         distances = kernels.left_out_distances(
@@ -290,3 +211,16 @@ def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:
         if following.cost <= now.cost + 1e-9 * abs(now.cost) + 1e-12:
             return following
     return None
+
+
+def _upper_inverse(U: Array) -> Array:
+    """Inverse of an upper triangular matrix (n, n), by halves: products take a fraction of the time of LAPACK's own."""
+    n = len(U)
+    if n <= _WHOLE:
+        return np.asarray(dtrtri(U, lower=0)[0] if n else U)
+    half = n // 2
+    out = np.zeros((n, n), order="F")
+    first, last = _upper_inverse(U[:half, :half]), _upper_inverse(U[half:, half:])
+    out[:half, :half], out[half:, half:] = first, last
+    out[:half, half:] = -first @ (U[:half, half:] @ last)
+    return out

@@ -14,14 +14,16 @@ import numpy as np
 
 from slam.data import IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
-from slam.geometry.kernels import project_rectified, triangulate_rectified
+from slam.geometry.kernels import predicted_pixels, project_rectified, triangulate_rectified
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.models import EstimatorModels
-from slam.window.gating import landmarks_pose, with_noise
+from slam.window.gating import landmarks_pose
 
 #: Why a back end refuses `slam.interfaces.ConsideringBackend.consider`.
 TOO_LATE = "errors of the rig are followed from before the first predict or insert on"
+
+_MOST_CORRELATED = 1 - 1e-9  # numerics: largest correlation of two pixels
 
 #: Derivatives (N, 3, m) of measurements (N, 3) by m errors of the rig: see `slam.interfaces.ConsideringBackend`.
 Field = Callable[[Array], Array]
@@ -130,9 +132,8 @@ class RectifiedMeasurement:
 
         The covariances (M, 3, 3) [m²] are of the points as seen from the camera.
         """
-        left, J = self.rig.left.project_with_jacobian(local)
-        S = with_noise(J @ covariances @ np.swapaxes(J, 1, 2), self.models.pixel_sigma)
-        return left, self.rig.right.project((local + self.rig.b) @ self.rig.R.T), S
+        camera = self.rig.rectified_parameters
+        return predicted_pixels(camera, local, covariances, self.models.pixel_sigma, _MOST_CORRELATED)
 
     def landmarks_pose(self, points: Array, z: Array, T: Array, seed: int) -> Array | None:
         """The pose (4, 4) on which most landmarks agree, if there is one; see `slam.window.gating.landmarks_pose`.

@@ -14,7 +14,7 @@ from slam.geometry.pnp import find_consensus
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.window.gating import chi_square_gate, with_noise
+from slam.window.gating import chi_square_gate
 
 MODELS = EstimatorModels()
 
@@ -50,7 +50,7 @@ class FixedMapBackend:
         seen = self.rig.left.in_view(self._local(points))
         h = self._local(points[seen])
         left, right = self.rig.project(h)
-        S = with_noise(self._spread(h, covariances[seen])[:, :2, :2], self.models.pixel_sigma)
+        S = self._spread(h, covariances[seen])[:, :2, :2] + self.models.pixel_sigma**2 * np.eye(2)
         return Prediction(float(stamp), T.copy(), self.covariance.copy(), ids[seen], left, right, S)
 
     def update(self, observations, guess=None):

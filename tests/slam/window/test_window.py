@@ -8,7 +8,7 @@ import pytest
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.window import chart_kernels, solver
-from slam.window.marginal import marginalised
+from slam.window.marginal import Conditional, marginalised
 from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.solver import linearised
 from slam.window.stereo import RectifiedStereo
@@ -159,7 +159,7 @@ def test_gradient_is_the_costs_derivative():
     """Of a window with each kind of knowledge, whose points are at their best for its poses."""
     w = with_everything()
     part = replace(w, rows=w.rows.select(w.rows.pose == 0), motion=Motion.none(), places=Places.none())
-    prior = marginalised(replace(part, joining=np.arange(10, 20)), 0, np.zeros(0, bool))[0]
+    prior = marginalised(replace(part, joining=np.arange(10, 20)), [0], np.zeros(0, bool))[0]
     rest = w.rows.select(w.rows.pose > 0)
     w = replace(w, poses=w.poses[1:], rows=replace(rest, pose=rest.pose - 1), prior=prior, motion=Motion(
         np.array([(0, 1, 2), (1, 2, 3)]), np.full((2, 2), 0.1), np.full((2, 6), 3.0)))  # fmt: skip
@@ -207,16 +207,16 @@ def test_a_fixed_pose_stays():
         np.testing.assert_allclose(mine, its, rtol=1e-3, atol=1e-3 * np.trace(its, axis1=1, axis2=2).max())
 
 
-@pytest.mark.parametrize("leaves", [0, 1])
-def test_a_pose_that_leaves_changes_nothing(leaves):
+@pytest.mark.parametrize("leaves", [[0], [1], [0, 1], [1, 3]])
+def test_poses_that_leave_changes_nothing(leaves):
     """The rest is solved as before, with the same covariance: here everything is linear next to the solution."""
     found = solve(window())
     w, rows = found.window, found.window.rows
-    part = replace(w, rows=rows.select(rows.pose == leaves), joining=np.arange(POINTS))
+    part = replace(w, rows=rows.select(np.isin(rows.pose, leaves)), joining=np.arange(POINTS))
     prior, conditional, _ = marginalised(part, leaves, np.zeros(0, bool))
-    rest = rows.select(rows.pose != leaves)
-    rest = replace(rest, pose=rest.pose - (rest.pose > leaves))
-    others = np.arange(POSES) != leaves
+    others = ~np.isin(np.arange(POSES), leaves)
+    rest = rows.select(others[rows.pose])
+    rest = replace(rest, pose=(np.cumsum(others) - 1)[rest.pose])
     after = solve(Window(STEREO, w.poses[others], w.points, rest, prior=prior))
     np.testing.assert_allclose(after.window.poses, w.poses[others], atol=1e-6)
     keep = np.repeat(others, 6)
@@ -230,20 +230,29 @@ def test_what_left_follows_what_stayed():
     w = solve(window()).window
     rows = w.rows
     part = replace(w, rows=rows.select(rows.pose == 1), joining=np.arange(POINTS))
-    prior, conditional, _ = marginalised(part, 1, np.zeros(0, bool))
+    prior, conditional, _ = marginalised(part, [1], np.zeros(0, bool))
     M = se3.exp(1e-4 * np.array([1.0, -2, 0.5, 3, 1, -2]))
     others = np.arange(POSES) != 1
     points = se3.transform(M, w.points[prior.points]) - w.points[prior.points]
     poses = np.array([se3.log(se3.inverse(T) @ M @ T) for T in w.poses[others]])
-    x = conditional.of(points, poses)[1]
+    x = conditional.of(points, poses)[1][0]
     np.testing.assert_allclose(w.poses[1] @ se3.exp(x), M @ w.poses[1], atol=1e-6)
+
+
+def test_a_point_that_has_moved_far_counts_by_its_inverse_distance():
+    """By its distance, what left would follow it by a hundred times as much, and the next one by as much again."""
+    E = np.diag([5.0, 5.0, -25.0])[None]  # of a point 5 m ahead
+    gain = np.zeros((9, 9))
+    gain[2, 2] = 1.0
+    moved, _ = Conditional(np.zeros(9), gain, E, E).of(np.array([[0.0, 0.0, 495.0]]), np.zeros((1, 6)))
+    np.testing.assert_allclose(moved, [[0.0, 0.0, 1 / (2 / 5 - 1 / 500) - 5]])
 
 
 def test_the_prior_does_not_mind_where_all_stands():
     """Moved as one, only what is known of the first pose in the world resists."""
     w = solve(window()).window
     part = replace(w, rows=w.rows.select(w.rows.pose == 0), joining=np.arange(POINTS))
-    prior = marginalised(part, 0, np.zeros(0, bool))[0]
+    prior = marginalised(part, [0], np.zeros(0, bool))[0]
     far = se3.exp(np.array([0.3, -1.0, 0.4, 30, -20, 10]))
     there = replace(prior, T=far @ prior.T)
     moved = Window(STEREO, far @ w.poses[1:], se3.transform(far, w.points), Rows.none(), prior=there)
@@ -266,5 +275,5 @@ def test_what_nothing_determines_is_refused():
 def test_a_reference_that_leaves_without_points_leaves_a_prior_of_poses():
     w = window(prior=RelativePrior.of_pose(truth()[0][0], START, np.zeros((6, 2))))
     part = replace(w, rows=w.rows.select(w.rows.pose == 0))
-    prior = marginalised(part, 0, np.zeros(0, bool), np.zeros((len(part.rows), 3, 2)))[0]
+    prior = marginalised(part, [0], np.zeros(0, bool), np.zeros((len(part.rows), 3, 2)))[0]
     assert len(prior.points) == 0 and prior.by_rig.shape == (len(prior.vector), 2)
