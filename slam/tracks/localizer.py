@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtr
 
 from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
@@ -279,11 +280,29 @@ class Search:
 
     def _agreeing(self, matches: Matches, consensus: PoseConsensus) -> LandmarkMatches:
         """The matches that agree with a pose, by ascending id."""
-        matches = matches.select(consensus.inliers)
+        matches = self._without_strays(matches.select(consensus.inliers), consensus.T_world_left)
         if not len(matches):
             return LandmarkMatches.nothing()
         matches = matches.select(np.argsort(matches.tracks, kind="stable"))
         return LandmarkMatches(self.landmarks.ids[matches.tracks], matches.features, consensus.T_world_left)
+
+    def _without_strays(self, matches: Matches, T_world_left: Array) -> Matches:
+        """Without landmarks long out of view if so few of those in view were found that their place is another one.
+
+        Of many a few agree by chance with any pose, here with that of all others, so that the path would seem to be
+        without drift since they were seen. A place that is seen again shows the share of them that the others show.
+        """
+        out = self.landmarks.long_out_of_view(self.config.rematch_after)
+        again = out[matches.tracks]
+        found = int(again.sum())
+        if not 0 < found < self.config.minimum_consistent:
+            return matches
+        left = self.localizer.rig.left
+        view = left.in_image(left.project(transform(inverse(T_world_left), self.positions)))
+        others = view & ~out & self._searched_for(T_world_left)
+        share = min((len(matches) - found) / max(int(others.sum()), 1), 1.0)
+        by_chance = bdtr(found, int((view & out).sum()), share) < 1 - self.localizer.models.gate_probability
+        return matches.select(~again) if by_chance else matches
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -77,3 +79,18 @@ def test_places_are_not_asked_for_where_landmarks_are_found():
     expected = prediction(cloud.points[ids], 0.01, 5.0)
     found, _ = search(expected, landmarks, cloud.points[ids], features).localize(TrackingState(), never)
     assert len(found) > 50
+
+
+@pytest.mark.parametrize(("out_of_view", "shown", "believed"), [(60, 60, True), (60, 2, False), (4, 2, True)])
+def test_few_of_many_landmarks_of_long_ago_are_not_their_place(out_of_view, shown, believed):
+    """A few out of many agree by chance with the pose that all others give; of few, as many as of the others count."""
+    cloud = Cloud(150)
+    start, ids = cloud.features(np.eye(4), 0.0)
+    landmarks = LandmarkTable.empty(32).with_new(0, np.arange(len(ids)), start, np.arange(len(ids)))
+    old = np.arange(len(ids)) < out_of_view
+    landmarks = replace(landmarks, out_of_view=np.where(old, AssociationConfig.rematch_after, 0))
+    here = np.where(old, np.arange(len(ids)) < shown, np.arange(len(ids)) % 4 > 0)  # three quarters of the others
+    expected = prediction(cloud.points[ids], 0.01, 5.0)
+    matches = search(expected, landmarks, cloud.points[ids], start.select(np.flatnonzero(here))).match()
+    assert len(matches) == (here & ~old).sum() + shown * believed
+    assert old[matches.ids].sum() == shown * believed
