@@ -91,6 +91,7 @@ class Tracker:
             if self._session.can_restart(state):
                 return Elsewhere(matches.T_world_left, place)
             matches = LandmarkMatches.nothing()
+        landmarks = landmarks.with_returning(matches.returning)
         aligned = features
         if self._aligning is not None:
             rig, positions = self._session.rig, state.backend.positions

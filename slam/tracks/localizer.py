@@ -6,11 +6,10 @@ The same for every back end, which supplies predictions and positions, and is gi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtr
 
 from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
@@ -37,6 +36,8 @@ class LandmarkMatches:
     # it saw nothing
     kidnapped: bool = False
     doubted: int = 0  # number of landmarks that agree on a pose which is too far from the prediction to be believed yet
+    # ids of landmarks long out of view that were found too, but do not count yet, see `LandmarkTable.returning`
+    returning: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -279,30 +280,22 @@ class Search:
         )  # fmt: skip
 
     def _agreeing(self, matches: Matches, consensus: PoseConsensus) -> LandmarkMatches:
-        """The matches that agree with a pose, by ascending id."""
-        matches = self._without_strays(matches.select(consensus.inliers), consensus.T_world_left)
+        """The matches that agree with a pose, by ascending id.
+
+        A few of many landmarks long out of view agree by chance with any pose, here with that of all others, as if the
+        path had not drifted since. They count where enough for a pose are found at once, or the same in several frames.
+        """
+        matches = matches.select(consensus.inliers)
         if not len(matches):
             return LandmarkMatches.nothing()
         matches = matches.select(np.argsort(matches.tracks, kind="stable"))
-        return LandmarkMatches(self.landmarks.ids[matches.tracks], matches.features, consensus.T_world_left)
-
-    def _without_strays(self, matches: Matches, T_world_left: Array) -> Matches:
-        """Without landmarks long out of view if so few of those in view were found that their place is another one.
-
-        Of many a few agree by chance with any pose, here with that of all others, so that the path would seem to be
-        without drift since they were seen. A place that is seen again shows the share of them that the others show.
-        """
-        out = self.landmarks.long_out_of_view(self.config.rematch_after)
-        again = out[matches.tracks]
-        found = int(again.sum())
-        if not 0 < found < self.config.minimum_consistent:
-            return matches
-        left = self.localizer.rig.left
-        view = left.in_image(left.project(transform(inverse(T_world_left), self.positions)))
-        others = view & ~out & self._searched_for(T_world_left)
-        share = min((len(matches) - found) / max(int(others.sum()), 1), 1.0)
-        by_chance = bdtr(found, int((view & out).sum()), share) < 1 - self.localizer.models.gate_probability
-        return matches.select(~again) if by_chance else matches
+        c, table = self.config, self.landmarks
+        found = LandmarkMatches(table.ids[matches.tracks], matches.features, consensus.T_world_left)
+        new = table.long_out_of_view(c.rematch_after) & (table.returning + 1 < c.kidnapped_after)
+        new = new[matches.tracks]
+        if not 0 < new.sum() < min(c.minimum_consistent, len(found)):
+            return found
+        return replace(found.select(~new), returning=found.ids[new])
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:

@@ -81,16 +81,20 @@ def test_places_are_not_asked_for_where_landmarks_are_found():
     assert len(found) > 50
 
 
-@pytest.mark.parametrize(("out_of_view", "shown", "believed"), [(60, 60, True), (60, 2, False), (4, 2, True)])
-def test_few_of_many_landmarks_of_long_ago_are_not_their_place(out_of_view, shown, believed):
-    """A few out of many agree by chance with the pose that all others give; of few, as many as of the others count."""
+@pytest.mark.parametrize(("shown", "frames"), [(60, 1), (2, AssociationConfig().kidnapped_after)])
+def test_few_landmarks_of_long_ago_count_when_several_frames_show_them(shown, frames):
+    """A few out of many agree by chance with the pose that all others give, as if the path had no drift."""
     cloud = Cloud(150)
     start, ids = cloud.features(np.eye(4), 0.0)
     landmarks = LandmarkTable.empty(32).with_new(0, np.arange(len(ids)), start, np.arange(len(ids)))
-    old = np.arange(len(ids)) < out_of_view
+    old = np.arange(len(ids)) < 60
     landmarks = replace(landmarks, out_of_view=np.where(old, AssociationConfig.rematch_after, 0))
-    here = np.where(old, np.arange(len(ids)) < shown, np.arange(len(ids)) % 4 > 0)  # three quarters of the others
+    features = start.select(np.flatnonzero(~old | (np.arange(len(ids)) < shown)))
     expected = prediction(cloud.points[ids], 0.01, 5.0)
-    matches = search(expected, landmarks, cloud.points[ids], start.select(np.flatnonzero(here))).match()
-    assert len(matches) == (here & ~old).sum() + shown * believed
-    assert old[matches.ids].sum() == shown * believed
+    for frame in range(frames):
+        matches = search(expected, landmarks, cloud.points[ids], features).match()
+        counts = shown * (frame == frames - 1)
+        assert len(matches) == (~old).sum() + counts
+        assert old[matches.ids].sum() == counts
+        landmarks = landmarks.with_returning(matches.returning)
+    assert not landmarks.returning.any()
