@@ -44,7 +44,7 @@ def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Traject
     try:
         chain, graph, off = without_it(atlas)
         if off > _LIMIT and not (same_view and np.isfinite(off)):
-            return _left_out(atlas, chain, loop, rig, off > AtlasConfig.refused_beyond)
+            return _refused(atlas, chain, loop, rig)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if not _agree(chain, before, loop):
             return atlas.with_inactive_loop(loop)
@@ -56,20 +56,16 @@ def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Traject
             return atlas.with_inactive_loop(loop)
         graph = graph.with_loop(loop)
         if (graph.disagreement() > _LIMIT).any():
-            return _left_out(replace(atlas, pending=None), chain, loop, rig, refused=True)
+            return _refused(replace(atlas, pending=None), chain, loop, rig)
         return atlas.with_loop(loop).solved_by(graph, rig)
     except np.linalg.LinAlgError:
         return replace(given, refused=(*given.refused, loop.pair))
 
 
-def _left_out(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, refused: bool) -> Atlas:
-    """Leave out a loop that contradicts the others, or the others if fewer places support them.
-
-    One that is not `refused` contradicts them by no more than may be: it does not count as another place.
-    """
-    start, atlas = atlas.in_map(chain.poses), atlas.with_inactive_loop(loop)
-    if refused:
-        atlas = replace(atlas, refused=(*atlas.refused, loop.pair))
+def _refused(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError) -> Atlas:
+    """Refuse a loop that contradicts path and others, or the others if fewer places support them."""
+    start = atlas.in_map(chain.poses)
+    atlas = replace(atlas.with_inactive_loop(loop), refused=(*atlas.refused, loop.pair))
     if not atlas.loops or len(spaced(atlas, atlas.inactive_loops)) < 2:
         return atlas
     every = (*atlas.loops, *atlas.inactive_loops)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from slam.chi_square import chi_square_beyond
 from slam.models import FORBID_UNKNOWN
 
 
@@ -37,9 +36,7 @@ class AtlasConfig:
     inliers: ClassVar[int] = 15
     #: Least standard deviation of their pixels, along the direction of largest spread, as a share of the image's width.
     spread: ClassVar[float] = 0.1
-    #: A loop is closed if its distance from the path is at most this many standard deviations.
+    #: A loop farther from the path than this many standard deviations is refused.
     gate_sigmas: ClassVar[float] = 5.0
-    #: Beyond this square of the distance, as rare as a Gaussian number so far off, it is refused; else it is left out.
-    refused_beyond: ClassVar[float] = chi_square_beyond(6, gate_sigmas)
 
     __pydantic_config__ = FORBID_UNKNOWN

@@ -86,7 +86,7 @@ def test_true_loops_take_the_place_of_a_false_one_before_them():
     assert false.pair not in [x.pair for x in atlas.loops]
     assert len(atlas.loops) >= 5
     assert error(atlas) < 0.3
-    assert atlas.closed_in(true[-1].second) is not None
+    assert atlas.partners(true[-1].second)[0] is not None
 
 
 @pytest.mark.parametrize("number", [2, 4])
