@@ -12,7 +12,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
 from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.atlas.pose_graph import Chain, PoseGraph, _Normal
+from slam.mapping.atlas.pose_graph import Chain, PoseGraph
 from slam.rig_error import CommonError
 
 LAP, DEPTH = 60, 2.0
@@ -110,9 +110,3 @@ def test_a_loop_that_cannot_be_judged_is_refused(size, monkeypatch):
             PoseGraph.solved(chain, [], ODOM[:81], [20, 80])
     assert after.refused == (loop(80).pair,)
     assert after.solved is None
-
-
-def test_singular_equations_are_said_to_be():
-    none = np.zeros((1, 6, 6))
-    with pytest.raises(np.linalg.LinAlgError, match="singular"):
-        _Normal.of(2, np.array([0]), np.array([1]), none, none, none[:, :, :0])
