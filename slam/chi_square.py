@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc, gammainccinv, gammaincinv
+from scipy.special import gammaincinv
 
 #: Standard deviations within which a Gaussian number lies (99.7 %); smaller differences are not significant.
 SIGMAS = 3.0
@@ -15,11 +15,6 @@ SIGMAS = 3.0
 def chi_square_limit(dof: int, probability: float) -> float:
     """The quantile of χ² at `probability` for `dof` degrees of freedom."""
     return float(_quantiles(dof, probability)[dof])
-
-
-def chi_square_beyond(dof: int, sigmas: float) -> float:
-    """What χ² exceeds as seldom as a Gaussian number lies farther off than so many standard deviations."""
-    return 2.0 * float(gammainccinv(dof / 2.0, erfc(sigmas / np.sqrt(2.0))))
 
 
 def chi_square_limits(dof: NDArray, probability: float) -> NDArray[np.float64]:

@@ -127,7 +127,7 @@ class Session:
         self.rig_error = RemainingRigError(self.calibration)
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self.mapper = Mapper(rig, c.map, self.localizer, first)
-        self.loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
+        self.loop_closer = LoopCloser(rig, c.atlas.enabled, c.association, c.models, c.map.max_depth_error)
 
     def begin(self, first: Backend, prior_map: SavedMap | None) -> State:
         """The state before the first frame.

@@ -91,6 +91,7 @@ class Tracker:
             if self._session.can_restart(state):
                 return Elsewhere(matches.T_world_left, place)
             matches = LandmarkMatches.nothing()
+        landmarks = landmarks.with_returning(matches.returning)
         aligned = features
         if self._aligning is not None:
             rig, positions = self._session.rig, state.backend.positions
@@ -201,6 +202,7 @@ def frame_result(
     if atlas.loops:
         objects = tuple(_in_map(thing, atlas.T_map_odom) for thing in objects)
     status, reason = _status(step, mapped_before)
+    loop, refused_loop = atlas.partners(step.index)
     estimate, common = atlas.estimate(step.estimate, step.common), common if atlas.anchor is None else CommonError()
     if atlas.anchor is None:  # the pose as reported has another error by the rig than in the present path
         covariance = estimate.covariance + common.covariance - step.common.covariance
@@ -209,7 +211,7 @@ def frame_result(
         step.index, status, reason, estimate, step.report, step.features,
         len(step.prediction.ids), step.matches.ids, step.matches.rows, step.added.ids, step.added.rows, step.erased,
         len(step.landmarks), dict(milliseconds), step.labels.moving, objects, revision=revision,
-        T_map_odom=atlas.T_map_odom, loop=atlas.closed_in(step.index), refused_loop=atlas.refused_in(step.index),
+        T_map_odom=atlas.T_map_odom, loop=loop, refused_loop=refused_loop,
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
         returned=step.joined,
         common=common,

@@ -32,7 +32,8 @@ class AssociationConfig:
         consistency_sigmas: largest reprojection error of a match that agrees with a pose, in units of the pixel noise.
         wide_hypotheses: number of poses tried in the geometric check of matches against the whole map.
         kidnapped_after: if poses beyond `max_jump` or `lost_jump` agree with each other in this many successive frames,
-            the camera was kidnapped (moved while it saw nothing), and a new back end starts there in the map.
+            the camera was kidnapped (moved while it saw nothing), and a new back end starts there in the map. Likewise
+            a landmark long out of view counts as found in the last of so many successive frames.
         view_angle: landmarks are searched for only if their line of sight has turned by no more than this since they
             were first seen [degrees]; beyond, a feature is no longer at the same point. 180 for any angle.
         view_ratio: likewise, largest factor by which the distance may have changed.

@@ -6,7 +6,7 @@ The same for every back end, which supplies predictions and positions, and is gi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ class LandmarkMatches:
     # it saw nothing
     kidnapped: bool = False
     doubted: int = 0  # number of landmarks that agree on a pose which is too far from the prediction to be believed yet
+    # ids of landmarks long out of view that were found too, but do not count yet, see `LandmarkTable.returning`
+    returning: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -278,12 +280,22 @@ class Search:
         )  # fmt: skip
 
     def _agreeing(self, matches: Matches, consensus: PoseConsensus) -> LandmarkMatches:
-        """The matches that agree with a pose, by ascending id."""
+        """The matches that agree with a pose, by ascending id.
+
+        A few of many landmarks long out of view agree by chance with any pose, here with that of all others, as if the
+        path had not drifted since. They count where enough for a pose are found at once, or the same in several frames.
+        """
         matches = matches.select(consensus.inliers)
         if not len(matches):
             return LandmarkMatches.nothing()
         matches = matches.select(np.argsort(matches.tracks, kind="stable"))
-        return LandmarkMatches(self.landmarks.ids[matches.tracks], matches.features, consensus.T_world_left)
+        c, table = self.config, self.landmarks
+        found = LandmarkMatches(table.ids[matches.tracks], matches.features, consensus.T_world_left)
+        new = table.long_out_of_view(c.rematch_after) & (table.returning + 1 < c.kidnapped_after)
+        new = new[matches.tracks]
+        if not 0 < new.sum() < min(c.minimum_consistent, len(found)):
+            return found
+        return replace(found.select(~new), returning=found.ids[new])
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:

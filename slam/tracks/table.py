@@ -41,12 +41,14 @@ class LandmarkTable(Table):
     # frames since it was last measured (N,), of those in which some landmark was measured and this one not withheld
     # as possibly moving
     unseen: IdArray = None  # type: ignore[assignment]
+    # of those long out of view: frames up to the last in which it was found, in succession, without counting (N,)
+    returning: IdArray = None  # type: ignore[assignment]
     patches: NDArray[np.object_] = None  # type: ignore[assignment]  # `Patch` at first sight (N,), or None
 
     def __post_init__(self) -> None:
         n = len(self.ids)
         empty = {"seen_from": np.full((n, 3), np.nan), "patches": np.full(n, None)}
-        for name in ("seen_from", "out_of_view", "unseen", "patches"):
+        for name in ("seen_from", "out_of_view", "unseen", "returning", "patches"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, empty.get(name, np.zeros(n, np.int64)))
 
@@ -124,6 +126,12 @@ class LandmarkTable(Table):
     def long_out_of_view(self, after: int) -> BoolArray:
         """Which landmarks (N,) were outside of the image for `after` frames, or are of an earlier run."""
         return np.asarray((self.last_seen < 0) | (self.out_of_view >= after))
+
+    def with_returning(self, ids: IdArray) -> LandmarkTable:
+        """After a frame in which some landmarks (M,) long out of view were found without counting."""
+        if not (len(ids) or self.returning.any()):
+            return self
+        return replace(self, returning=np.where(isin(self.ids, ids), self.returning + 1, 0))
 
     def with_new(
         self, frame: int, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], camera: Array | None = None

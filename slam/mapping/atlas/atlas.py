@@ -219,18 +219,13 @@ class Atlas:
         anchor = MapAnchor(after.T_world_left, after.covariance, block_diag(P, known), error, common)
         return replace(self, gaps=(*self.gaps, TrackingGap(since, after.stamp, P, anchor)), anchor=anchor)
 
-    def closed_in(self, frame: int) -> int | None:
-        """Index of the earlier frame with which `frame` closed a loop; None if it closed none."""
-        return self._partner([x.pair for x in self.loops[-1:]], frame)
-
-    def refused_in(self, frame: int) -> int | None:
-        """Index of the earlier frame with which `frame` formed a loop that was refused; None if there was none."""
-        return self._partner(self.refused[-1:], frame)
-
-    def _partner(self, pairs: Sequence[tuple[int, int]], frame: int) -> int | None:
-        """Index of the earlier frame of a pair of keyframes whose second one is `frame`; None if there is none."""
-        found = (self.keyframes[first].frame for first, second in pairs if self.keyframes[second].frame == frame)
-        return next(found, None)
+    def partners(self, frame: int) -> tuple[int | None, int | None]:
+        """The earlier frames with which `frame` closed a loop, and formed one that was refused; None for none."""
+        closed, refused = (
+            next((self.keyframes[one].frame for one, other in last if self.keyframes[other].frame == frame), None)
+            for last in ([x.pair for x in self.loops[-1:]], self.refused[-1:])
+        )
+        return closed, refused
 
     def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as estimated at the time, or as revised in `path`.

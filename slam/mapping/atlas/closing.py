@@ -17,11 +17,10 @@ from slam.mapping.atlas.pose_graph import Chain, PoseGraph
 from slam.rig_error import CommonError
 
 _DIMENSIONS = 6  # fixed: mean of χ² of a pose
+_LIMIT = AtlasConfig.gate_sigmas**2  # largest squared Mahalanobis distance of a loop from the pose graph
 
 
-def close(
-    atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool, config: AtlasConfig
-) -> Atlas:
+def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool) -> Atlas:
     """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop; else refuse it.
 
     One that cannot be judged is refused.
@@ -33,7 +32,6 @@ def close(
         path: returns the path in odom so far.
         same_view: the camera sees the same from the same place, which is believed against the path: the covariance of
             the path between is then as much too small as the two disagree.
-        config: settings.
     """
     given, common = atlas, None if atlas.solved is None else atlas.solved.belief(rig)[0]
 
@@ -45,44 +43,35 @@ def close(
 
     try:
         chain, graph, off = without_it(atlas)
-        limit = config.gate_sigmas**2
-        if off > limit and not (same_view and np.isfinite(off)):
-            return _left_out(atlas, chain, loop, rig, config, off > config.refused_beyond)
+        if off > _LIMIT and not (same_view and np.isfinite(off)):
+            return _refused(atlas, chain, loop, rig)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
-        if config.agreeing > 1 and not (before is not None and _agree(chain, before, loop, limit)):
+        if not _agree(chain, before, loop):
             return atlas.with_inactive_loop(loop)
         atlas = replace(atlas, confirmed=True)
-        if off > limit:
+        if off > _LIMIT:
             atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
             chain, graph, _ = without_it(atlas)
         elif atlas.loops and not is_informative(graph, loop):
             return atlas.with_inactive_loop(loop)
         graph = graph.with_loop(loop)
-        if (graph.disagreement() > limit).any():
-            return _left_out(replace(atlas, pending=None), chain, loop, rig, config, refused=True)
+        if (graph.disagreement() > _LIMIT).any():
+            return _refused(replace(atlas, pending=None), chain, loop, rig)
         return atlas.with_loop(loop).solved_by(graph, rig)
     except np.linalg.LinAlgError:
         return replace(given, refused=(*given.refused, loop.pair))
 
 
-def _left_out(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, config: AtlasConfig, refused: bool) -> Atlas:
-    """Leave out a loop that contradicts the others, or the others if fewer places support them.
-
-    One that is not `refused` contradicts them by no more than may be: it does not count as another place.
-    """
-    limit, start = config.gate_sigmas**2, atlas.in_map(chain.poses)
-    atlas = atlas.with_inactive_loop(loop)
-    if refused:
-        atlas = replace(atlas, refused=(*atlas.refused, loop.pair))
-    if not atlas.loops or len(spaced(atlas, atlas.inactive_loops, config)) < 2:
+def _refused(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError) -> Atlas:
+    """Refuse a loop that contradicts path and others, or the others if fewer places support them."""
+    start = atlas.in_map(chain.poses)
+    atlas = replace(atlas.with_inactive_loop(loop), refused=(*atlas.refused, loop.pair))
+    if not atlas.loops or len(spaced(atlas, atlas.inactive_loops)) < 2:
         return atlas
     every = (*atlas.loops, *atlas.inactive_loops)
-    rival, present = (
-        agreeing(chain, every, loop, chain.poses, limit),
-        agreeing(chain, every, atlas.loops[-1], start, limit),
-    )
-    places = spaced(atlas, rival, config)
-    if len(places) <= len(spaced(atlas, present, config)):
+    rival, present = agreeing(chain, every, loop, chain.poses), agreeing(chain, every, atlas.loops[-1], start)
+    places = spaced(atlas, rival)
+    if len(places) <= len(spaced(atlas, present)):
         return atlas
     before = {x.pair for x in atlas.loops}
     held = {x.pair: x for x in (*places, *(x for x in rival if x.pair in before), loop)}
@@ -90,16 +79,16 @@ def _left_out(atlas: Atlas, chain: Chain, loop: Loop, rig: CommonError, config: 
     return atlas.solved_by(PoseGraph.solved(chain, atlas.loops, start), rig)
 
 
-def _agree(chain: Chain, before: Loop, loop: Loop, limit: float) -> bool:
+def _agree(chain: Chain, before: Loop | None, loop: Loop) -> bool:
     """Whether two loops, seen by keyframes shortly after each other, are consistent with each other."""
-    if loop.second - before.second > 3:  # keyframes
+    if before is None or loop.second - before.second > 3:  # keyframes
         return False
     T_old, P_old = chain.motion(before.first, loop.first)
     T_new, P_new = chain.motion(before.second, loop.second)
     expected = inverse(T_old) @ before.T_first_second @ T_new
     back, far = adjoint(inverse(T_new)), adjoint(inverse(expected))
     P = back @ before.covariance @ back.T + P_new + loop.covariance + far @ P_old @ far.T
-    return distance(expected, loop.T_first_second, P) < limit
+    return distance(expected, loop.T_first_second, P) < _LIMIT
 
 
 def is_informative(graph: PoseGraph, loop: Loop) -> bool:
@@ -116,37 +105,36 @@ def disagreement(graph: PoseGraph, loop: Loop) -> float:
     return distance(T, loop.T_first_second, P + loop.covariance)
 
 
-def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array, limit: float) -> list[Loop]:
+def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array) -> list[Loop]:
     """Loops that agree with the path, with the seed and with each other, in order of their second keyframes.
 
     The set grows from the seed: the loops nearest to it on the path are tested first, then each time twice as many.
     Loops that join shrink the path's covariance, against which the next ones are tested. It is empty if the seed
     contradicts the path.
 
-    `start` (K, 4, 4) are poses of all keyframes, at which the graph is first linearised; `limit` is the largest squared
-    Mahalanobis distance of a loop from the pose graph.
+    `start` (K, 4, 4) are poses of all keyframes, at which the graph is first linearised.
     """
     others = sorted((x for x in loops if x is not seed), key=lambda x: (abs(x.second - seed.second), x.first))
     also = [k for x in others for k in x.pair]
     graph = PoseGraph.solved(chain, [], start, [*also, *seed.pair])
-    if disagreement(graph, seed) > limit:
+    if disagreement(graph, seed) > _LIMIT:
         return []
     members, begin, size = [seed], 0, 1
     graph = PoseGraph.solved(chain, members, start, also)
     while begin < len(others):
-        joined = [x for x in others[begin : begin + size] if disagreement(graph, x) <= limit]
+        joined = [x for x in others[begin : begin + size] if disagreement(graph, x) <= _LIMIT]
         begin, size = begin + size, 2 * size
         while joined:
             whole = PoseGraph.solved(chain, [*members, *joined], start, also)
             off = whole.disagreement()
-            if (off <= limit).all():
+            if (off <= _LIMIT).all():
                 members, graph = [*members, *joined], whole
                 break
             del joined[int(np.argmax(off[len(members) :]))]
     return sorted(members, key=lambda x: x.second)
 
 
-def spaced(atlas: Atlas, loops: Sequence[Loop], config: AtlasConfig) -> list[Loop]:
+def spaced(atlas: Atlas, loops: Sequence[Loop]) -> list[Loop]:
     """One loop of each place, in order of the second keyframes.
 
     Loops at one place are not independent evidence: they see the same things, or the same lookalikes.
@@ -157,5 +145,5 @@ def spaced(atlas: Atlas, loops: Sequence[Loop], config: AtlasConfig) -> list[Loo
         keyframe = atlas.keyframes[loop.second]
         if keyframe.travelled > left:
             chosen.append(loop)
-            left = keyframe.travelled + config.return_depths * keyframe.depth
+            left = keyframe.travelled + AtlasConfig.return_depths * keyframe.depth
     return chosen

@@ -73,15 +73,15 @@ def distance(expected: Array, found: Array, covariance: Array) -> float:
     return float(xi @ np.linalg.solve(covariance, xi))
 
 
-def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: AtlasConfig) -> bool:
+def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig) -> bool:
     """Whether a camera's view differs enough from a keyframe's for a new one: other features, or another viewpoint.
 
     `motion` is the camera's pose (4, 4) in the keyframe's coordinates.
     """
-    if np.linalg.norm(motion[:3, 3]) > config.keyframe_distance * keyframe.depth:
+    if np.linalg.norm(motion[:3, 3]) > AtlasConfig.keyframe_distance * keyframe.depth:
         return True
     uv = rig.left.project(transform(inverse(motion), keyframe.points.astype(float)))
-    return bool(rig.left.in_image(uv).mean() < config.keyframe_share)
+    return bool(rig.left.in_image(uv).mean() < AtlasConfig.keyframe_share)
 
 
 def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> Array:

@@ -51,18 +51,18 @@ class LoopCloser:
 
     Args:
         rig: the rectified pair.
-        config: settings.
+        enabled: whether there are keyframes and loops.
         association: settings of the search by descriptor.
         models: with the noise of uL, vL, uR [px].
         max_depth_error: largest relative standard deviation of a kept feature's depth, the same as a new landmark's.
     """
 
     def __init__(
-        self, rig: StereoRig, config: AtlasConfig, association: AssociationConfig, models: EstimatorModels,
+        self, rig: StereoRig, enabled: bool, association: AssociationConfig, models: EstimatorModels,
         max_depth_error: float,
     ) -> None:  # fmt: skip
         self._rig = rig
-        self._config = config
+        self._enabled = enabled
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
         lax = 2 * association.consistency_sigmas  # a keyframe's points have the depth of one frame alone
         association = replace(association, wide_hypotheses=_HYPOTHESES, consistency_sigmas=lax)
@@ -73,7 +73,7 @@ class LoopCloser:
         """The atlas after a frame; `path` returns the path in odom so far."""
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
         wanted = begins or (not step.tracking.unmatched and self._is_keyframe(atlas, step))
-        if not (self._config.enabled and wanted):
+        if not (self._enabled and wanted):
             return atlas
         landmark_of = step.matches.landmark_of(len(step.features))
         landmark_of[step.added.rows] = step.added.ids
@@ -92,7 +92,7 @@ class LoopCloser:
             return atlas
         loop = max(found, key=lambda loop: loop.inliers)
         same = self._is_same_view(atlas, loop, step.features)
-        return close(atlas, loop, step.common, path, same, self._config)
+        return close(atlas, loop, step.common, path, same)
 
     @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
@@ -100,7 +100,7 @@ class LoopCloser:
 
         `correction` is that of the features; `seed` of the random choice in the geometric check.
         """
-        if not self._config.enabled or len(features) < self._config.inliers:
+        if not self._enabled or len(features) < AtlasConfig.inliers:
             return None
         likely = self._most_alike(atlas, features.descriptors, np.ones(len(atlas), bool))
         verified = self._verified(atlas, self._ranked(atlas, likely, features), features, correction, seed)
@@ -125,7 +125,7 @@ class LoopCloser:
         if len(atlas) == atlas.prior_count:
             return True
         last = atlas.keyframes[-1]
-        return view_has_changed(last, inverse(last.T_odom_left) @ step.estimate.T_world_left, self._rig, self._config)
+        return view_has_changed(last, inverse(last.T_odom_left) @ step.estimate.T_world_left, self._rig)
 
     def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray) -> Keyframe | None:
         """The frame as a keyframe, of features that do not move, landmarks first; None where too few have a depth."""
@@ -133,7 +133,7 @@ class LoopCloser:
         rows = np.setdiff1d(np.flatnonzero(features.has_stereo), step.labels.moving)
         rows = rows[depth_is_known(self._rig, features, rows, self._sigma, self._max_depth_error)]
         order = np.lexsort((-features.response[rows], landmark_of[rows] < 0))
-        rows = np.sort(rows[order[: self._config.features]])
+        rows = np.sort(rows[order[: AtlasConfig.features]])
         if len(rows) < _MINIMAL:
             return None
         points = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
@@ -159,7 +159,7 @@ class LoopCloser:
         Keyframes of a place that the camera has not left yet are excluded, those that it cannot have come to, given its
         uncertainty, and those whose landmarks the back end still measures: it knows their position by itself.
         """
-        c, poses, here = self._config, atlas.poses_in_map, atlas.T_map_odom @ new.T_odom_left
+        c, poses, here = AtlasConfig, atlas.poses_in_map, atlas.T_map_odom @ new.T_odom_left
         sigma = np.sqrt(np.trace(atlas.estimate(step.estimate, step.common).covariance[3:, 3:]))
         length, far = new.travelled - atlas.travelled, np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
@@ -178,10 +178,10 @@ class LoopCloser:
         Of the same view most features agree on a pose, so that a third of them at least match by descriptor alone.
         """
         moved = inverse(atlas.poses[:-1]) @ new.T_odom_left
-        apart = np.linalg.norm(moved[:, :3, 3], axis=1) > self._config.keyframe_distance * new.depth
+        apart = np.linalg.norm(moved[:, :3, 3], axis=1) > AtlasConfig.keyframe_distance * new.depth
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), np.append(apart, False))
         best = self._not_measured(atlas, likely, known)[:1]
-        enough = min(self._config.features, int(features.has_stereo.sum())) / 3
+        enough = min(AtlasConfig.features, int(features.has_stereo.sum())) / 3
         return self._ranked(atlas, best, features, enough)
 
     def _not_measured(self, atlas: Atlas, rows: NDArray[np.intp], known: IdArray) -> NDArray[np.intp]:
@@ -193,13 +193,13 @@ class LoopCloser:
         """Whether a frame shows what a loop's first keyframe did: most features, from the same place."""
         keyframe = atlas.keyframes[loop.first]
         most = min(len(keyframe), int(features.has_stereo.sum()))
-        return 2 * loop.inliers >= most and not view_has_changed(keyframe, loop.T_first_second, self._rig, self._config)
+        return 2 * loop.inliers >= most and not view_has_changed(keyframe, loop.T_first_second, self._rig)
 
     def _most_alike(self, atlas: Atlas, descriptors: NDArray[np.float32], possible: BoolArray) -> NDArray[np.intp]:
         """Numbers of those `possible` keyframes (K,) whose descriptors as a whole are most similar, best first."""
         similarity = atlas.index.similarity(descriptors)
         similarity[~possible] = -np.inf
-        best = np.argsort(-similarity, kind="stable")[: self._config.candidates]
+        best = np.argsort(-similarity, kind="stable")[: AtlasConfig.candidates]
         return np.asarray(best[np.isfinite(similarity[best])])
 
     def _ranked(
@@ -211,7 +211,7 @@ class LoopCloser:
         found = [match_everywhere(k.descriptors.astype(np.float32), k.laplacian, features, *limits) for k in seen]
         number = np.array([len(matches) for matches in found], int)
         order = np.argsort(-number, kind="stable")[:_VERIFIED]
-        return likely[order[number[order] >= max(enough, self._config.inliers)]]
+        return likely[order[number[order] >= max(enough, AtlasConfig.inliers)]]
 
     def _verified(
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, correction: Correction | None,
@@ -224,7 +224,7 @@ class LoopCloser:
         found = []
         for k in candidates.tolist():
             keyframe, pair = atlas.keyframes[k].corrected(correction, self._rig), (k, len(atlas) - 1)
-            found.append(verify(keyframe, features, pair, self._rig, self._localizer, self._config, seed))
+            found.append(verify(keyframe, features, pair, self._rig, self._localizer, seed))
         return [loop for loop in found if loop is not None]
 
     def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:

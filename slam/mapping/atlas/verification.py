@@ -21,9 +21,8 @@ from slam.window.stereo import RectifiedStereo
 
 
 def verify(
-    keyframe: Keyframe, features: StereoFeatures, pair: tuple[int, int], rig: StereoRig, localizer: Localizer,
-    config: AtlasConfig, seed: int,
-) -> Loop | None:  # fmt: skip
+    keyframe: Keyframe, features: StereoFeatures, pair: tuple[int, int], rig: StereoRig, localizer: Localizer, seed: int
+) -> Loop | None:
     """The loop from a keyframe to the present camera; None if too few features agree, or all are in one spot.
 
     `pair` are the numbers of both keyframes; `seed` is of the random choice in the geometric check.
@@ -31,11 +30,11 @@ def verify(
     points = keyframe.points.astype(float)
     landmarks = replace(keyframe_landmarks(keyframe), ids=np.arange(len(points)))
     found = localizer.match(nowhere(features.stamp, np.eye(4)), landmarks, points, features, seed)
-    if found.T_world_left is None or len(found) < config.inliers:
+    if found.T_world_left is None or len(found) < AtlasConfig.inliers:
         return None
     ids, seen = found.ids, found.rows
     across = np.linalg.eigvalsh(np.cov(features.uv_left[seen].T))[-1]
-    if np.sqrt(across) < config.spread * rig.width:
+    if np.sqrt(across) < AtlasConfig.spread * rig.width:
         return None
     measured = measurement_rows(features.uv_left[seen], features.uv_right[seen])
     try:

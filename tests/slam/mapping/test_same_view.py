@@ -9,9 +9,6 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.geometry import se3
-from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.atlas.keyframes import Keyframe
-from slam.rig_error import CommonError
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud
 
@@ -40,16 +37,3 @@ def test_a_camera_that_something_large_took_along_comes_back(backend):
     assert max(off) > 0.3  # taken along: that it is, others see to
     assert max(off[k] for k, r in enumerate(results) if r.loop == 0) < 0.05
     assert off[-1] < 0.2 * max(off)
-
-
-def test_covariances_of_the_path_between_are_inflated():
-    none, empty = np.zeros(0, np.int64), np.zeros((0, 3), np.float32)
-    looks = np.zeros((0, 16), np.float16), np.zeros(0, np.int8)
-    eye = np.eye(6)
-    keyframes = [
-        Keyframe(k, float(k), np.eye(4), eye, eye, eye[:, :0], 0.0, 1.0, empty, *looks, none) for k in range(4)
-    ]
-    atlas = Atlas.of_earlier_run(keyframes, np.tile(np.eye(4), (4, 1, 1)))
-    inflated = atlas.inflated(0, 2, 9.0).chain(CommonError()).steps
-    assert inflated[:, 0, 0].tolist() == [1, 9, 9, 1]
-    assert atlas.chain(CommonError()).steps[:, 0, 0].tolist() == [1, 1, 1, 1]

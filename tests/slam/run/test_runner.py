@@ -16,6 +16,7 @@ import pytest
 from slam.config import SystemConfig
 from slam.errors import MeasurementError, SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
+from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.map_io import load_map
 from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
@@ -57,8 +58,9 @@ def rows_of(path):
 
 
 @pytest.mark.slow
-def test_landmarks_that_have_left_the_map_are_kept_where_they_were(tmp_path):
-    few = SystemConfig.for_kind("handheld").with_settings(["map.max_landmarks=80", "atlas.keyframe_distance=0.05"])
+def test_landmarks_that_have_left_the_map_are_kept_where_they_were(tmp_path, monkeypatch):
+    monkeypatch.setattr(AtlasConfig, "keyframe_distance", 0.05)
+    few = SystemConfig.for_kind("handheld").with_settings(["map.max_landmarks=80"])
     run(open_sequence("synthetic:aisle?frames=30&speed=6"), RunOptions("ekf", "surf", few, tmp_path))
     data = RunData.read(tmp_path, "a")
     assert len(data.old) > 10

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -77,3 +79,22 @@ def test_places_are_not_asked_for_where_landmarks_are_found():
     expected = prediction(cloud.points[ids], 0.01, 5.0)
     found, _ = search(expected, landmarks, cloud.points[ids], features).localize(TrackingState(), never)
     assert len(found) > 50
+
+
+@pytest.mark.parametrize(("shown", "frames"), [(60, 1), (2, AssociationConfig().kidnapped_after)])
+def test_few_landmarks_of_long_ago_count_when_several_frames_show_them(shown, frames):
+    """A few out of many agree by chance with the pose that all others give, as if the path had no drift."""
+    cloud = Cloud(150)
+    start, ids = cloud.features(np.eye(4), 0.0)
+    landmarks = LandmarkTable.empty(32).with_new(0, np.arange(len(ids)), start, np.arange(len(ids)))
+    old = np.arange(len(ids)) < 60
+    landmarks = replace(landmarks, out_of_view=np.where(old, AssociationConfig.rematch_after, 0))
+    features = start.select(np.flatnonzero(~old | (np.arange(len(ids)) < shown)))
+    expected = prediction(cloud.points[ids], 0.01, 5.0)
+    for frame in range(frames):
+        matches = search(expected, landmarks, cloud.points[ids], features).match()
+        counts = shown * (frame == frames - 1)
+        assert len(matches) == (~old).sum() + counts
+        assert old[matches.ids].sum() == counts
+        landmarks = landmarks.with_returning(matches.returning)
+    assert not landmarks.returning.any()

@@ -11,16 +11,13 @@ from slam.geometry.se3 import Array, exp, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.closing import close
-from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.atlas.pose_graph import Chain, PoseGraph, _Normal
+from slam.mapping.atlas.pose_graph import Chain, PoseGraph
 from slam.rig_error import CommonError
 
 LAP, DEPTH = 60, 2.0
 SIGMAS = np.repeat([2e-3, 0.05], 3)  # of a step
 SURE = np.repeat([1e-3, 0.01], 3)  # of a loop
-LIMIT = 25.0
-ONE_WITNESS = AtlasConfig(agreeing=1)
 FALSE = exp(np.array([0.0, 0.0, 0.0, 1.5, 0.0, 0.0]))  # by which a place that looks alike is off: what drift may be
 
 
@@ -64,13 +61,19 @@ def closed(loops: list[Loop]) -> Atlas:
         whole = atlas_of(each.second + 1)
         parts = {name: getattr(whole, name) for name in ("keyframes", "index")}
         path = Trajectory(0.1 * np.arange(each.second + 1), ODOM[: each.second + 1])
-        kept = close(replace(kept, **parts), each, CommonError(), lambda path=path: path, False, ONE_WITNESS)
+        kept = close(replace(kept, **parts), each, CommonError(), lambda path=path: path, False)
     return kept
 
 
 def error(atlas: Atlas) -> float:
     poses = atlas.poses_in_map
     return float(np.linalg.norm(poses[-1, :3, 3] - TRUE[len(poses) - 1, :3, 3]))
+
+
+@pytest.fixture(autouse=True)
+def _one_witness(monkeypatch):
+    """A loop needs no other keyframe that sees it."""
+    monkeypatch.setattr("slam.mapping.atlas.closing._agree", lambda *_: True)
 
 
 def test_true_loops_take_the_place_of_a_false_one_before_them():
@@ -83,7 +86,7 @@ def test_true_loops_take_the_place_of_a_false_one_before_them():
     assert false.pair not in [x.pair for x in atlas.loops]
     assert len(atlas.loops) >= 5
     assert error(atlas) < 0.3
-    assert atlas.closed_in(true[-1].second) is not None
+    assert atlas.partners(true[-1].second)[0] is not None
 
 
 @pytest.mark.parametrize("number", [2, 4])
@@ -102,14 +105,8 @@ def test_a_loop_that_cannot_be_judged_is_refused(size, monkeypatch):
     chain, path = Chain(ODOM[:81], steps), Trajectory(0.1 * np.arange(81), ODOM[:81])
     monkeypatch.setattr(Atlas, "chain", lambda *_: chain)
     with np.errstate(all="ignore"):
-        after = close(atlas_of(81), loop(80), CommonError(), lambda: path, False, ONE_WITNESS)
+        after = close(atlas_of(81), loop(80), CommonError(), lambda: path, False)
         with pytest.raises(np.linalg.LinAlgError):
             PoseGraph.solved(chain, [], ODOM[:81], [20, 80])
     assert after.refused == (loop(80).pair,)
     assert after.solved is None
-
-
-def test_singular_equations_are_said_to_be():
-    none = np.zeros((1, 6, 6))
-    with pytest.raises(np.linalg.LinAlgError, match="singular"):
-        _Normal.of(2, np.array([0]), np.array([1]), none, none, none[:, :, :0])
