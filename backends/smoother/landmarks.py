@@ -138,6 +138,18 @@ class SmootherLandmarks(LandmarkRows):
             self, mean=mean, information=information, z=np.full_like(self.z, np.nan), pose=-1 + 0 * self.pose
         )
 
+    def folded(self, first: int) -> Self:
+        """With what they are known by, in place of all measurements, where one was made before pose number `first`.
+
+        Poses before it are kept no more. The numbers of the poses stay: they say when a landmark was measured last.
+        """
+        old = ((self.pose >= 0) & (self.pose < first)).any(axis=1) & ~self.world
+        return replace(
+            self, mean=np.where(old[:, None], self.position, self.mean),
+            information=np.where(old[:, None, None], inverses(self.own), self.information),
+            z=np.where(old[:, None, None], np.nan, self.z),
+        )  # fmt: skip
+
     def refined(self, stereo: RectifiedStereo, sigma: float, first: int, poses: Array) -> Self:
         """Where their measurements put them, given the poses (K, 4, 4) from number `first` on.
 
@@ -182,21 +194,22 @@ class SmootherLandmarks(LandmarkRows):
     def covariances(
         self, stereo: RectifiedStereo, sigma: float, chosen: IndexArray, first: int, poses: Array, joint: Array
     ) -> Array:
-        """Covariances (M, 3, 3) in the world of some landmarks, given the joint one of poses.
+        """Covariances (M, 3, 3) in the world of some landmarks, given the joint one `joint` (6 K, 6 K) of the last poses.
 
         With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
         fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
-        information. Measurements from earlier poses count for the first one. A landmark that none of the graph's poses
-        measured is carried by the newest, with the drift since it was seen. The poses (K, 4, 4) from number `first` on
-        have the covariance `joint` (6 K, 6 K).
+        information. Measurements from earlier poses than these count for the first of them. A landmark that was never
+        measured is carried by the newest, with the drift since it is known. All `poses` (N, 4, 4) are from number
+        `first` on.
         """
         frames, z = (self.pose - first).clip(0).ravel(), self.z.reshape(-1, 3)
         rows = np.where(self.pose >= 0, np.arange(self.pose.size).reshape(self.pose.shape), -1)[chosen]
         x, own = self.position[chosen], self.own[chosen]
         information, *_ = information_of(stereo.intrinsics, poses, frames, z, x, rows, sigma)
         older = np.where(self.world[chosen, None, None], 0.0, self.information[chosen])
-        J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
         n, width = len(chosen), len(joint)
+        known = np.arange(len(poses) - width // 6, len(poses))
+        J = carried_by(known, poses[known], frames, x, rows, information, older, own)
         C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
         C += np.where(np.asarray((rows < 0).all(axis=1))[:, None, None], self.away[chosen], 0.0)
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))

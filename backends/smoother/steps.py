@@ -212,9 +212,8 @@ class Steps(RectifiedMeasurement):
 
     def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks in the world."""
-        first, joint = graph.joint_covariance(s)
-        poses, marks = s.poses[s.of(first) :], s.landmarks
-        C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, first, poses, joint)
+        marks, joint = s.landmarks, graph.joint_covariance(s)[1]
+        C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, s.first, s.poses, joint)
         for i in np.flatnonzero(marks.begun[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found

@@ -220,6 +220,36 @@ def test_a_landmark_that_was_long_away_may_lie_off_by_the_drift():
     assert np.median(distances) < 6
 
 
+def test_what_is_known_of_a_landmark_outlasts_the_poses_that_measured_it():
+    """It was found anew from the measurements of those poses alone that were kept: .09 m and .40 m off for .03 m."""
+    backend, known = SmootherBackend(RIG, MODELS, past=10), set()
+    seen_last: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
+    for k, (stamp, _, seen) in enumerate(drive(90, points=500)):
+        step(backend, stamp, seen, known)
+        marks = backend.state.landmarks
+        for i, last, position, own in zip(marks.ids.tolist(), marks.pose.max(axis=1), marks.position, marks.own):
+            if last == k - 17:  # by now it stands still: its poses have left the lag
+                seen_last[i] = last, position, own
+    old = [i for i, (last, *_) in seen_last.items() if last == marks.pose.max(axis=1)[marks.rows_of([i])[0]]]
+    assert len(old) > 15 and backend.state.first > 40
+    for what, number in (("position", 1), ("own", 2)):
+        expected = np.array([seen_last[i][number] for i in old])
+        np.testing.assert_allclose(getattr(marks, what)[marks.rows_of(old)], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_landmarks_behind_the_camera_are_as_uncertain_as_the_poses_that_saw_them():
+    """Their measurements were taken for some of a later pose, which sees nothing behind it: a median NEES of 70."""
+    poses = path(100, DT, np.array([0.0, 0.0, 4.0]), np.zeros(3))
+    models = EstimatorModels(MotionModel(1.0, 0.3), 0.7, initial_velocity_sigma=15.0)
+    backend, data = SmootherBackend(RIG, models), scene(poses, points=1000, limit=40, sigma=0.7)
+    run(backend, data)
+    found = backend.estimate()
+    off = (found.positions - data.points[found.ids])[:, :, None]
+    squared = (np.swapaxes(off, 1, 2) @ np.linalg.solve(found.covariances, off)).ravel()
+    passed = data.points[found.ids, 2] < poses[-1][2, 3] - 8
+    assert passed.sum() > 20 and np.median(squared[passed]) < 6  # χ²₃: 2.4; they share the path's error
+
+
 def test_a_landmark_measured_for_longer_than_the_lag_keeps_what_was_known_of_it():
     """A camera sways before the same few points: its error does not grow with every lag."""
     sway = np.cos(np.arange(150) / 12)
