@@ -194,7 +194,7 @@ class SmootherLandmarks(LandmarkRows):
     def covariances(
         self, stereo: RectifiedStereo, sigma: float, chosen: IndexArray, first: int, poses: Array, joint: Array
     ) -> Array:
-        """Covariances (M, 3, 3) in the world of some landmarks, given the joint one `joint` (6 K, 6 K) of the last poses.
+        """Covariances (M, 3, 3) in the world of some landmarks, given that of the last poses, `joint` (6 K, 6 K).
 
         With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
         fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
