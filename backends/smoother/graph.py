@@ -342,6 +342,11 @@ class Graph:
         J = R @ points_by_pose(transform(inverse(self._first), position[None]))[0]
         return np.asarray(self._solver.getISAM2().marginalCovariance(key) + J @ self._base @ J.T)
 
+    @property
+    def newest(self) -> int:
+        """Number of the newest pose in it; −1 for none."""
+        return self._number
+
     def _is_of(self, s: SmootherState) -> bool:
         """Whether it is the state's graph, up to poses that entered since the last update."""
         return s.begun <= self._number <= s.number and self._kind == _kind(s)

@@ -61,13 +61,16 @@ class SmootherLandmarks(LandmarkRows):
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
 
-    def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0) -> SmootherLandmarks:
+    def measured(
+        self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0, before: int = -1
+    ) -> SmootherLandmarks:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number.
 
         A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
         in a new one. If landmarks that were found together all did so at once, the motion model alone
         would tie that pose to the one before. So the first factor spans fewer, down to half of them, differently for
-        each landmark.
+        each landmark. After frames that measured nothing many would, all the same: then every other one takes this
+        measurement, too, as long as its first pose has not left the graph, whose newest one is pose `before`.
 
         What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
         was known beforehand.
@@ -75,8 +78,9 @@ class SmootherLandmarks(LandmarkRows):
         last, begun = self.pose[rows].max(axis=1), self.begun.copy()
         half, full = max(track // 2, 1), begun[rows] <= pose - track
         anew = (last < 0) | (last < pose - half)
+        held = (last >= 0) & (before < pose - 1) & (begun[rows] > before - track) & (self.serial[rows] // 2 % 2 == 0)
         smart = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, begun[rows]))
-        begun[rows] = np.where(begun[rows] == VARIABLE, VARIABLE, smart)
+        begun[rows] = np.where(held | (begun[rows] == VARIABLE), begun[rows], smart)
         old = np.zeros(len(self), bool)
         old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():

@@ -134,7 +134,7 @@ class Steps(RectifiedMeasurement):
         own = marks.from_newest[seen]
         marks.by_rig[seen] = landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T)
-        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number))
+        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number), graph.newest)
         sight = Sight.of(marks, seen, z[used])
         if s.inside:
             after = replace(

@@ -146,6 +146,20 @@ def test_a_lag_of_frames_that_measured_nothing_is_no_failure(lag, more):
     assert off @ np.linalg.solve(last.covariance, off) < 25
 
 
+@pytest.mark.parametrize(("lag", "dark"), [(4, 7), (16, 7), (16, 12)])
+def test_landmarks_hold_the_camera_together_after_frames_that_measured_nothing(lag, dark):
+    """All their factors were full and began anew at once: of 30 up to 10 were rejected, and sigma was .25 to .56 m."""
+    data, backend, known = drive(20 + dark, points=250), SmootherBackend(RIG, MODELS, lag=lag), set()
+    for k, (stamp, _, seen) in enumerate(data):
+        if 10 <= k < 10 + dark:
+            enter(backend, k, stamp, seen)
+        else:
+            assert len(step(backend, stamp, seen, known).rejected) < 3
+    last = backend.estimate(landmarks=False)
+    off = se3.log(se3.inverse(last.T_world_left) @ data.poses[-1])
+    assert np.sqrt(np.trace(last.covariance[3:, 3:])) < 0.04 and off @ np.linalg.solve(last.covariance, off) < 25
+
+
 def test_landmarks_that_were_found_together_do_not_all_begin_anew_together():
     """That would leave but the motion model between two poses, and the newest one 2.8 times as uncertain."""
     data = drive(22, points=150)
