@@ -46,7 +46,7 @@ WRONG = {
 def drive(name: str, backend: str, settings: list[str]) -> tuple[float, RigPosterior]:
     """Error of the online path [m], and what is found of the rig."""
     sequence = open_sequence(name)
-    config = SystemConfig.for_kind(sequence.kind, None, backend).with_settings(settings)
+    config = SystemConfig.for_kind(sequence.kind, None).with_settings(settings)
     system = StereoSlam(sequence.rig, None, backend, config=config)
     results = [system.process_features(sequence.observations(k)) for k in range(len(sequence))]
     poses = np.array([r.estimate.T_world_left for r in results])

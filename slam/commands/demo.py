@@ -52,7 +52,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     with progress(None, "", quiet):
         compile_kernels(ONLINE[-1])
     for backend in ONLINE:
-        config = SystemConfig.for_kind(sequence.kind, "surf", backend)
+        config = SystemConfig.for_kind(sequence.kind)
         with progress(len(sequence), f"aisle · {backend}", quiet) as tell:
 
             def seen(result: FrameResult, tell: Callable[[FrameResult], None] = tell) -> None:

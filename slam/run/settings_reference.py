@@ -40,10 +40,9 @@ def settings() -> Iterator[Setting]:
     rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
-            named: dict[str, Any] = {section: name}
-            parts = {}
+            parts, frontend = {}, name if section == "frontend" else None
             for kind in KINDS:
-                options = getattr(SystemConfig.for_kind(kind, **named), section)
+                options = getattr(SystemConfig.for_kind(kind, frontend), section)
                 parts[kind] = getattr(registry.create(f"{section}s", name, rig, **options), "config", None)
             if all(map(is_dataclass, parts.values())):
                 yield from (s for s in _of_class(parts, section, name) if can_be_set(s.key, name))
