@@ -18,6 +18,7 @@ VARIABLE = -(10**9)  #: in place of the number of the pose with which a smart fa
 #: Least distance of a landmark that becomes a variable, in its standard deviations. A variable is linearised in space,
 #: and so off by one such part of its deviation, to the same side for all: of 20 together by a seventh of theirs.
 _LINEAR = 30.0
+_NEARER = 0.5  # share of the distance at which a landmark became a variable, below which it is one no more
 _GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
 _DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
 _BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
@@ -37,6 +38,7 @@ class SmootherLandmarks(LandmarkRows):
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
     begun: IndexArray  # number of the pose from which its smart factor counts (S,), or later; or VARIABLE
+    far: Array  # distance from the camera [m] at which it became a variable (S,)
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
     @classmethod
@@ -47,7 +49,7 @@ class SmootherLandmarks(LandmarkRows):
         n = len(ids)
         return cls(
             ids, first + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
-            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), by_rig,
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), np.zeros(n), by_rig,
         )  # fmt: skip
 
     @classmethod
@@ -98,22 +100,25 @@ class SmootherLandmarks(LandmarkRows):
         None where it measures more: these hold the path well enough as they come and go, at half the cost.
         These are landmarks whose smart factor is full: as variables they keep what it says of them, as its measurements
         go over. They are close enough to be linear in their position: far ones made a path metres off, unnoticed, and
-        Gauss-Newton steps might put them behind the camera. Variables that were not measured for longer than a factor
+        Gauss-Newton steps might put them behind the camera. What is known of one from afar is linear there: one that
+        the camera has come near goes on in a smart factor. Variables that were not measured for longer than a factor
         spans make room, the oldest first.
         """
         if len(rows) > most:
             return self
         last, variable = self.pose.max(axis=1), self.begun == VARIABLE
-        far = np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
-        sure = _LINEAR * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < far
+        distance = np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
+        sure = _LINEAR * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < distance
         full = ~variable[rows] & (self.begun[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
         new = rows[full & sure & np.isfinite(z[:, 2])]
         away = np.flatnonzero(variable & (last < pose - track))
         away = away[np.argsort(last[away], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
-        begun = self.begun.copy()
+        begun, far = self.begun.copy(), self.far.copy()
         begun[away] = 0
+        begun[rows[variable[rows] & (distance < _NEARER * far[rows])]] = 0
         begun[np.sort(new)[: most - int(variable.sum()) + len(away)]] = VARIABLE
-        return replace(self, begun=begun)
+        far[rows] = np.where(variable[rows], far[rows], distance)
+        return replace(self, begun=begun, far=far)
 
     def at(self, serials: IdArray, points: Array) -> Self:
         """With some landmarks (V,), by serial number, at points (V, 3)."""
