@@ -22,6 +22,7 @@ Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
 FAILURES = (RuntimeError, ValueError, LookupError)
 
 _ENDLESS = 1e9  # numerics: a lag that no run reaches
+_CAREFUL = 20  # numerics: poses after a failure whose factors are made so that they do not throw
 _FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with which the first pose is held
 
 
@@ -175,7 +176,7 @@ class Tracks:
             place = transform(s.poses[s.of(known.pose)], known.position[None])[0]
         problem.values.insert(landmark_key(serial), place)
 
-    def make_smart(self, problem: GraphProblem) -> list[tuple[Track, int]]:
+    def make_smart(self, problem: GraphProblem, careful: bool = True) -> list[tuple[Track, int]]:
         """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""
         made = []
         for track in problem.grown.values():
@@ -183,7 +184,7 @@ class Tracks:
                 if track.slot >= 0:
                     problem.removed.append(track.slot)
                 made.append((track, problem.factors.size()))
-                problem.factors.add(self._make.smart(track.points, track.keys))
+                problem.factors.add(self._make.smart(track.points, track.keys, careful))
         return made
 
     def forget(self, s: SmootherState) -> None:
@@ -218,6 +219,7 @@ class Graph:
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
         self.rebuilds = 0
+        self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
         self._make, self._lag = make, lag
         self.restart()
 
@@ -252,6 +254,7 @@ class Graph:
                 return self._update(s, range(number + 1, s.number + 1), GraphProblem()), ""
             except FAILURES as error:
                 why, self.rebuilds = _line(error), self.rebuilds + 1
+                self._careful = s.number + (self._lag or _CAREFUL)
         if why:
             s = replace(s, landmarks=s.landmarks.without_variables(s.number))
         return self.rebuilt(s), why
@@ -263,7 +266,7 @@ class Graph:
             SolverError: gtsam fails.
         """
         self.restart()
-        oldest = self.oldest(s)
+        oldest, self._careful = self.oldest(s), max(self._careful, s.number + 1)
         try:
             self._kind, self._first = _kind(s), s.poses[s.of(oldest)]
             prior, self._base = held(s, oldest)
@@ -289,7 +292,7 @@ class Graph:
             self._tracks.add_rows(problem, s, number, first)
             self._taken = len(s.sights[s.of(number)])
         kept = self._tracks.keep(problem, s)
-        made = self._tracks.make_smart(problem)
+        made = self._tracks.make_smart(problem, s.number < self._careful)
         # Nothing leaves before the newest pose is solved for: what leaves fixes where its neighbours are linearised.
         now: Stamps = dict.fromkeys(problem.values.keys(), float(before))
         self._solver.update(problem.factors, problem.values, now, problem.removed)

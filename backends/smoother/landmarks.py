@@ -80,7 +80,9 @@ class SmootherLandmarks(LandmarkRows):
         last, begun = self.pose[rows].max(axis=1), self.begun.copy()
         half, full = max(track // 2, 1), begun[rows] <= pose - track
         anew = (last < 0) | (last < pose - half)
-        held = (last >= 0) & (before < pose - 1) & (begun[rows] > before - track) & (self.serial[rows] // 2 % 2 == 0)
+        held = (
+            (last >= 0) & (0 <= before < pose - 1) & (begun[rows] > before - track) & (self.serial[rows] // 2 % 2 == 0)
+        )
         smart = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, begun[rows]))
         begun[rows] = np.where(held | (begun[rows] == VARIABLE), begun[rows], smart)
         old = np.zeros(len(self), bool)
