@@ -151,7 +151,7 @@ class EkfBackend:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        return self._predicted(stamp, self._advanced)
+        return self._predicted(stamp, lambda camera, dt: camera.advanced(self.models, self.state.covariance.camera, dt))
 
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
@@ -279,10 +279,6 @@ class EkfBackend:
         self.state = s
 
     # --- the filter's parts ---
-
-    def _advanced(self, camera: Any, dt: float) -> Motion:
-        """The camera after a step by the motion model."""
-        return camera.advanced(self.models, self.state.covariance.camera, dt)
 
     def _predicted(self, stamp: float, moved: Callable[[Any, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""
