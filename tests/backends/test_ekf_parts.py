@@ -12,7 +12,7 @@ from backends.ekf.angles import attitude, body_rate_derivative, pose_jacobian, r
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
-from backends.ekf.solve import Innovation, UnsolvableError, Update, Whitened, gate, solve
+from backends.ekf.solve import Innovation, UnsolvableError, Update, Whitened, _descend, gate, solve
 from backends.ekf.state import FilterState
 from slam.geometry import se3
 from slam.geometry.se3 import angles, body_rate_matrix
@@ -370,6 +370,18 @@ def test_a_step_that_lowers_no_cost_is_no_information(monkeypatch):
     monkeypatch.setattr("backends.ekf.solve._descend", lambda update, rows, now, s, change: (now, change))
     with pytest.raises(UnsolvableError, match="cost"):
         ungated(far_off(5)[1])
+
+
+def test_a_shortened_step_shortens_the_velocities_too(monkeypatch):
+    """They went all the way while the pose stayed behind."""
+    _, update = far_off(5)
+    costs = iter([1.0, 2.0, 0.5])  # where it is, after the whole step, after half of it
+    monkeypatch.setattr("backends.ekf.solve.Linearisation.cost", lambda self, update, rows: next(costs))
+    change = 0.01 * np.random.default_rng(0).standard_normal(48)
+    after, step = _descend(update, np.ones((12, 3), bool), update.at(), np.zeros(42), change)
+    np.testing.assert_allclose(step, 0.5 * change, atol=1e-15)
+    np.testing.assert_allclose(after.change[6:], 0.5 * change[6:], atol=1e-12)
+    assert (after.change[:6] == 0).all()
 
 
 def test_what_is_taken_out_was_never_there():
