@@ -21,7 +21,7 @@ from backends.smoother.state import SmootherState
 from slam.bounds import from_options, require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
@@ -190,19 +190,13 @@ class _BatchSolution:
         for factor in _motions(keys, np.diff(stamps).clip(max=LONGEST), make):
             problem.factors.add(factor)
         places = _places(s, make.stereo, numbers)
-        known = {serial: one for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
-        self.landmarks = {*places, *known}
+        known = {serial for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
+        self.landmarks = known.union(places)
         for serial in sorted(self.landmarks):
-            one = known.get(serial)
-            if one is None:
-                problem.values.insert(landmark_key(serial), places[serial])
-            elif one.pose < 0:
+            if serial in known:
                 tracks.add_known(problem, s, serial)
             else:
-                tied = [pose_key(one.pose), landmark_key(serial)]
-                noise = gtsam.noiseModel.Gaussian.Covariance(one.covariance)
-                problem.factors.add(gtsam.CustomFactor(noise, tied, _seen_at(tied, one.position)))
-                problem.values.insert(tied[1], transform(s.poses[s.of(one.pose)], one.position[None])[0])
+                problem.values.insert(landmark_key(serial), places[serial])
         for number in numbers:
             sight = s.sights[s.of(number)]
             for serial, z in zip(sight.serials.tolist(), sight.z.tolist()):
@@ -269,16 +263,3 @@ def _motions(keys: list[int], dt: Array, make: FactorMaker) -> Iterator[gtsam.No
         before = float(dt[i - 1]) if i else None
         first = is_first(before, interval)
         yield make.motion(keys[i if first else i - 1 : i + 2], np.array([before or np.nan, interval]))
-
-
-def _seen_at(keys: list[int], local: Array) -> Callable[[gtsam.CustomFactor, gtsam.Values, Any], Any]:
-    """Residual (3,) of a point known to be at `local` (3,) in a camera's coordinates."""
-
-    def error(_factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
-        T = values.atPose3(keys[0]).matrix()
-        point = transform(inverse(T), values.atPoint3(keys[1])[None])
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = points_by_pose(point)[0], T[:3, :3].T.copy()
-        return point[0] - local
-
-    return error

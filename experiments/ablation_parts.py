@@ -104,7 +104,7 @@ class Variant:
         own = self.settings if isinstance(self.settings, tuple) else self.settings[sequence.kind]
         both = (*(BASE[sequence.kind] if self.base else ()), *own)
         known = [s for s in both if not s.startswith("backend.") or backend == "ekf"]
-        return SystemConfig.for_kind(sequence.kind, "surf", backend).with_settings([*case.settings, *known])
+        return SystemConfig.for_kind(sequence.kind).with_settings([*case.settings, *known])
 
 
 ALL_ON = Variant("everything on")

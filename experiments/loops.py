@@ -84,7 +84,7 @@ def drive(name: str, backend: str, settings: list[str], images: bool = False) ->
     """
     sequence = open_sequence(name)
     frontend = "surf" if images else None
-    config = SystemConfig.for_kind("driving", frontend, backend).with_settings(settings)
+    config = SystemConfig.for_kind("driving", frontend).with_settings(settings)
     system = StereoSlam(sequence.rig, frontend, backend, config=config)
     out, count = Drive(), len(sequence)
     frames = iter(sequence) if images else None

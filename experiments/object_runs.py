@@ -29,7 +29,7 @@ def seen_in(name: str, images: bool, frames: int, first: int = 0) -> list[tuple[
     numbers = range(first, min(frames, len(sequence)))
     if not images:
         return [(s.features, s.objects) for s in map(sequence.simulate, numbers)]
-    options = SystemConfig.for_kind(sequence.kind, "surf", "ekf").frontend
+    options = SystemConfig.for_kind(sequence.kind).frontend
     frontend = registry.create("frontends", "surf", sequence.rig, **options)
     found = [frontend.extract(sequence.frame(k)) for k in numbers]
     return [(features, labels_in_images(sequence, k, features)) for k, features in zip(numbers, found)]
@@ -37,7 +37,7 @@ def seen_in(name: str, images: bool, frames: int, first: int = 0) -> list[tuple[
 
 def system_for(sequence: Any, backend: str, images: bool, settings: list[str]) -> slam.StereoSlam:
     frontend = "surf" if images else None
-    config = SystemConfig.for_kind(sequence.kind, frontend, backend).with_settings(settings)
+    config = SystemConfig.for_kind(sequence.kind, frontend).with_settings(settings)
     return slam.StereoSlam(sequence.rig, frontend, backend, config=config)
 
 

@@ -188,7 +188,7 @@ def extracted(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -
 
 def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str) -> float:
     """One back end on one trial: error of the path [m]."""
-    system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, "surf", backend))
+    system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
     results = [system.process_features(one) for one in features]
     measured = [r.estimate for r in results if r.status in MEASURED]
     path = Trajectory(np.array([e.stamp for e in measured]), np.array([e.T_world_left for e in measured]))

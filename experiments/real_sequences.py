@@ -44,7 +44,7 @@ def folder_of(name: str, backend: str, out: Path) -> Path:
 def run_one(name: str, folder: Path, backend: str, out: Path, frames: int | None) -> dict[str, Any]:
     sequence = open_sequence(folder)
     target = folder_of(name, backend, out)
-    config = SystemConfig.for_kind(sequence.kind, "surf", backend)
+    config = SystemConfig.for_kind(sequence.kind)
     options = RunOptions(backend, "surf", config, target, 0, frames, kind=sequence.kind)
     return run(sequence, options)
 

@@ -109,7 +109,7 @@ def run(index: int, backend: str, noise_seed: int | None = None) -> Errors:
     data = recorded(index)
     rng = np.random.default_rng(noise_seed)
     score = score_for(data.sequence)
-    config = SystemConfig.for_kind(data.sequence.kind, "surf", backend)
+    config = SystemConfig.for_kind(data.sequence.kind)
     system = slam.StereoSlam(data.sequence.rig, None, backend, config=config)
     stamps, poses = [], []
     for k, features in enumerate(data.features):

@@ -43,9 +43,6 @@ FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
     ("driving", "surf"): {"features": 600, "upright": True, "min_depth": 1.0},
 }
 
-#: Options of back ends that depend on the kind of motion: there are none.
-BACKENDS: dict[tuple[str, str | None], dict[str, Any]] = {}
-
 
 @dataclass(frozen=True)
 class SystemConfig:
@@ -84,8 +81,8 @@ class SystemConfig:
                 raise ConfigurationError(f"{section}.{taken[0]}: the system gives this, so it is no option")
 
     @classmethod
-    def for_kind(cls, kind: str, frontend: str | None = "surf", backend: str | None = None) -> SystemConfig:
-        """The default settings for a kind of motion (``"handheld"``, ``"driving"``), front end and back end by name.
+    def for_kind(cls, kind: str, frontend: str | None = "surf") -> SystemConfig:
+        """The default settings for a kind of motion (``"handheld"``, ``"driving"``), and a front end by name.
 
         Raises:
             ConfigurationError: the kind is not known.
@@ -97,7 +94,6 @@ class SystemConfig:
             map=MAPS[kind],
             objects=OBJECTS[kind],
             frontend=dict(FRONTENDS.get((kind, frontend), {})),
-            backend=dict(BACKENDS.get((kind, backend), {})),
         )
 
     def to_json(self) -> dict[str, Any]:

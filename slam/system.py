@@ -97,7 +97,7 @@ class StereoSlam:
                 raise ConfigurationError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
-        c = config or SystemConfig.for_kind(kind, *names)
+        c = config or SystemConfig.for_kind(kind, names[0])
         if prior_map is not None and len(prior_map) > c.map.max_landmarks:  # all of it is kept
             c = replace(c, map=replace(c.map, max_landmarks=len(prior_map)))
         self.config = c

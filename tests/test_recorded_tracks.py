@@ -101,7 +101,7 @@ def agreement(
 def replayed(folder, name, start, stop, wrong=0.0):
     """The steps of a replay, the back end, and how far it is off over the whole stretch [m]."""
     tracks = load(folder).between(start, stop)
-    config = SystemConfig.for_kind("driving", None, name)
+    config = SystemConfig.for_kind("driving", None)
     backend = backends.create(name, tracks.rig, models=config.models, **config.backend)
     steps = list(replay(tracks, backend, config, wrong))
     moved = inverse(steps[0].T_world_left) @ steps[-1].T_world_left

@@ -4,8 +4,8 @@ In the papers' order:
 
 - `motion`: the camera's state and its transition (paper B, section 2), in the angles of `angles`.
 - `landmarks`: a landmark's three numbers, and the table of all.
-- `measurement`: ``z = h(x)`` and H (A, Eqs. 5-10; B, Eqs. 1-5).
-- `solve`: innovation, gate, and the update of the mean (A, Eq. 11); `recovery`: what else is tried where it fails.
+- `solve`: measurement, innovation, gate, and the update of the mean (A, Eqs. 5-11; B, Eqs. 1-5); `recovery`: what else
+  is tried where it fails.
 - `covariance`: ``A P Aᵀ + W Q Wᵀ`` (B, section 2), landmarks that join (A, Eq. 10), ``P − K S Kᵀ`` (A, Eq. 11).
 - `state`: camera, landmarks and covariance, and the steps from one such state to the next.
 - `filter`: the back end.

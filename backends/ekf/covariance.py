@@ -71,13 +71,6 @@ class Covariance:
         """Of its [r, φ] (6, 6)."""
         return self.head[:POSE, :POSE]
 
-    @property
-    def dense(self) -> Array:
-        """Of the state (12 + 3A, 12 + 3A)."""
-        h = len(self.head)
-        with_camera = self.head[:CAMERA, h : h + len(self.marks)]
-        return np.block([[self.camera, with_camera], [with_camera.T, self.marks]])
-
     def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
         """Covariances (M, 3, 3) of landmarks, and theirs (M, 3, 6) with the camera's [r, φ]; by rows of the table."""
         a, b, h = self.count, self.correlated, len(self.head)

@@ -10,9 +10,9 @@ import numpy as np
 
 from backends.ekf.covariance import CAMERA, POSE, positive
 from backends.ekf.landmarks import COORDINATES, Coordinates, FilterLandmarks, distant_anchors
-from backends.ekf.motion import Camera, EulerCamera, Motion, motion_noise
+from backends.ekf.motion import EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
-from backends.ekf.solve import Jacobian, UnsolvableError, Update
+from backends.ekf.solve import UnsolvableError, Update
 from backends.ekf.state import FilterState
 from slam.bounds import from_options, require_positive
 from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
@@ -45,8 +45,7 @@ class EkfConfig:
         landmarks: coordinates of a landmark in the state: ``"inverse_depth"`` by the camera that saw it first, or
             ``"euclidean"`` in the world, as the papers do. See `backends.ekf.landmarks`.
         consistent: keep the unobservable pose of the whole map (where the world's origin is and which way it faces)
-            from seeming to be measured: the covariance is transported to the corrected state after each update. With
-            stereo measurements only.
+            from seeming to be measured: the covariance is transported to the corrected state after each update.
 
     Raises:
         ConfigurationError: a value is out of its range.
@@ -80,7 +79,7 @@ class Form:
 
     name: str  # of the back end, for messages
     config: Any  # its options
-    camera: Camera  # the first one
+    camera: Any  # the first one: `backends.ekf.motion.EulerCamera`, or another
     covariance: Array  # of its error (12, 12)
     coordinates: Coordinates  # of the landmarks
     iterations: int  # most linearisations of an update
@@ -92,7 +91,7 @@ def papers_form(models: EstimatorModels, options: dict[str, Any]) -> Form:
     config = from_options(EkfConfig, "ekf", options)
     use = config.resolved()
     stereo = use.measurement == "stereo"
-    camera, P = EulerCamera.first(models, use.consistent and stereo)
+    camera, P = EulerCamera.first(models, use.consistent)
     return Form("ekf", config, camera, P, COORDINATES[use.landmarks], use.iterations, stereo)
 
 
@@ -152,7 +151,7 @@ class EkfBackend:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        return self._predicted(stamp, self._advanced)
+        return self._predicted(stamp, lambda camera, dt: camera.advanced(self.models, self.state.covariance.camera, dt))
 
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
@@ -281,11 +280,7 @@ class EkfBackend:
 
     # --- the filter's parts ---
 
-    def _advanced(self, camera: Camera, dt: float) -> Motion:
-        """The camera after a step by the motion model."""
-        return camera.advanced(self.models, self.state.covariance.camera, dt)
-
-    def _predicted(self, stamp: float, moved: Callable[[Camera, float], Motion]) -> Prediction:
+    def _predicted(self, stamp: float, moved: Callable[[Any, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""
         s = self.state
         require_stamp(self._form.name, stamp, s.stamp if s.frame >= 0 else None)
@@ -303,8 +298,9 @@ class EkfBackend:
         T, rows = s.pose, self._measure.visible(s.pose, s.landmarks.points)
         marks, (blocks, cross) = s.landmarks.select(rows), s.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        H = Jacobian(toward, marks.gauge @ s.camera.world(), rows)  # of where landmarks are as seen from the camera
-        seen = H.own_covariances(s.covariance.pose, cross, blocks)
+        A = -toward @ (marks.gauge @ s.camera.world())  # derivatives (M, 3, 6) of where they are, seen from the camera
+        seen = (A @ s.covariance.pose + 2 * toward @ cross) @ A.transpose(0, 2, 1)
+        seen = 0.5 * (seen + seen.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
         left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], seen)
         return Prediction(s.stamp, T.copy(), s.pose_covariance(), marks.ids, left, right, S)
 

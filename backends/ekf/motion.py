@@ -1,11 +1,15 @@
-"""How the camera moves, for [r, φ, v, ω] and its printed transition (paper B, section 2)."""
+"""How the camera moves, for [r, φ, v, ω] and its printed transition (paper B, section 2).
+
+A filter may be of another camera (`backends.iekf`), which has the methods of `EulerCamera`: they say what its error
+(12,) means, of which six numbers are of the pose, and six of velocity and rate.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -18,37 +22,6 @@ from slam.models import ANYWHERE, EstimatorModels
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
 _PIECES = 64  # numerics: at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # numerics: of a step whose error may be carried as a turn about the world's axes [rad]
-
-
-class Camera(Protocol):
-    """The camera's part of a filter's state, and what its error (12,) means: of the pose (6), of velocity and rate (6).
-
-    - `pose`: ``T_world_left`` (4, 4).
-    - `transports`: whether the covariance is transported to the corrected state after an update.
-    - `by_error`: derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error.
-    - `world`: the displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose.
-    - `moved`: after an error (12,) is corrected. `at`: at another pose (4, 4), with the same velocities.
-    - `seen_from`: the error (12,) that would bring the other camera here.
-    - `transport`: an error as seen from another camera, by the error (12, 12): the same displacement of the world,
-      where it `transports`.
-    - `advanced`: after `dt` [s], with the error's covariance P (12, 12).
-    - `at_rest`: after a step of a camera that stands: the pose stays, and the velocity is zero for certain.
-    - `settled`: in coordinates in which nothing is near a singularity.
-    """
-
-    @property
-    def pose(self) -> Array: ...  # noqa: D102
-    @property
-    def transports(self) -> bool: ...  # noqa: D102
-    def by_error(self) -> Array: ...  # noqa: D102
-    def world(self) -> Array: ...  # noqa: D102
-    def moved(self, error: Array) -> Any: ...  # noqa: D102
-    def at(self, T: Array) -> Any: ...  # noqa: D102
-    def seen_from(self, other: Any) -> Array: ...  # noqa: D102
-    def transport(self, to: Any) -> Array: ...  # noqa: D102
-    def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion: ...  # noqa: D102
-    def at_rest(self) -> Motion: ...  # noqa: D102
-    def settled(self) -> Motion: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,21 +53,26 @@ class EulerCamera:
         return camera, _of_angles(prior(models), phi)
 
     @cached_property
-    def pose(self) -> Array:  # noqa: D102
+    def pose(self) -> Array:
+        """``T_world_left`` (4, 4)."""
         return se3.pose(attitude(self.R_world_angles, self.x[3:6]), self.x[:3])
 
-    def by_error(self) -> Array:  # noqa: D102
+    def by_error(self) -> Array:
+        """Derivative (6, 6) of the pose's right perturbation [rotation, translation] by the pose's error."""
         return pose_jacobian(self.pose[:3, :3], self.x[3:6])
 
-    def world(self) -> Array:  # noqa: D102
+    def world(self) -> Array:
+        """The displacement (6, 6) of the world [shift, turn about its origin] that is an error of the pose."""
         W, A = np.eye(POSE), turning(self.R_world_angles, self.x)
         W[:3, 3:], W[3:, 3:] = hat(self.x[:3]) @ A, A
         return W
 
-    def moved(self, error: Array) -> EulerCamera:  # noqa: D102
+    def moved(self, error: Array) -> EulerCamera:
+        """After an error (12,) is corrected."""
         return replace(self, x=self.x + error)
 
-    def at(self, T: Array) -> EulerCamera:  # noqa: D102
+    def at(self, T: Array) -> EulerCamera:
+        """At another pose (4, 4), with the same velocities."""
         phi, before = angles(self.R_world_angles.T @ T[:3, :3]), self.x[3:6]
         other = np.array([phi[0] + np.pi, np.pi - phi[1], phi[2] + np.pi])  # the same rotation
         changes = np.stack([phi, other]) - before
@@ -102,11 +80,15 @@ class EulerCamera:
         nearest = before + changes[np.argmin(np.linalg.norm(changes, axis=1))]
         return replace(self, x=np.concatenate([T[:3, 3], nearest, self.x[POSE:]]))
 
-    def seen_from(self, other: EulerCamera) -> Array:  # noqa: D102
+    def seen_from(self, other: EulerCamera) -> Array:
+        """The error (12,) that would bring the other camera here."""
         return self.x - other.x
 
     def transport(self, to: EulerCamera) -> Array:
-        """The displacement of the world is kept: see `backends.ekf.state.FilterState.corrected`."""
+        """An error as seen from another camera, by the error (12, 12): the same displacement of the world.
+
+        See `backends.ekf.state.FilterState.corrected`. Without transport it is the same numbers.
+        """
         J = np.eye(CAMERA)
         if self.transports:
             A, A_before = turning(self.R_world_angles, to.x), turning(self.R_world_angles, self.x)
@@ -117,19 +99,21 @@ class EulerCamera:
         return J
 
     def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
-        """The printed transition (paper B, section 2), in pieces where it would run into the angles' singularity."""
+        """After `dt` [s], with the error's covariance P (12, 12): the printed transition (paper B, section 2).
+
+        It is made in pieces where it would run into the angles' singularity.
+        """
         gap = after_gap(models, P, dt)
         if gap is not None:  # it may be turned anyhow: it stays, independent of the map
             camera = replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
             return Motion(camera, np.zeros((CAMERA, CAMERA)), _of_angles(gap, self.x[3:6]))
-        motion, turn = Motion(self), float(self.x[10]) * dt
-        if abs(float(self.x[4]) + turn) > LIMIT:
-            motion = self._reanchored(motion)
-            turn = float(motion.camera.x[10]) * dt
-        pieces = max(1, math.ceil(min(abs(turn) / LIMIT, _PIECES)))
+        turn = np.linalg.norm(body_rate_matrix(self.x[3:6]) @ self.x[9:]) * dt  # φy turns by no more
+        motion, pieces = Motion(self), math.ceil(np.clip(turn / LIMIT, 1, _PIECES))
         for _ in range(pieces):
+            phi_y, rate = motion.camera.x[[4, 10]]
+            if max(abs(phi_y), abs(phi_y + rate * dt / pieces)) > LIMIT:
+                motion = motion.then(*motion.camera._reanchored())
             motion = motion.then(*motion.camera._transition(models, dt / pieces))
-            motion = motion.camera._settled(motion)
         return motion
 
     def _transition(self, models: EstimatorModels, dt: float) -> tuple[EulerCamera, Array, Array]:
@@ -148,22 +132,15 @@ class EulerCamera:
             A = A @ J
         return replace(self, x=x), A, motion_noise(models, dt)
 
-    def at_rest(self) -> Motion:  # noqa: D102
+    def at_rest(self) -> Motion:
+        """After a step of a camera that stands: the pose stays, and the velocity is zero for certain."""
         camera = replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
         return Motion(camera, np.diag(np.repeat([1.0, 0.0], POSE)))
 
-    def settled(self) -> Motion:
-        """With a new angles' world where φy is near its singularity."""
-        return self._settled(Motion(self))
-
-    def _settled(self, motion: Motion) -> Motion:
-        phi_y = float(self.x[4])
-        near = abs(math.sin(phi_y)) > math.sin(LIMIT) or math.cos(phi_y) < 0
-        return self._reanchored(motion) if near else motion
-
-    def _reanchored(self, motion: Motion) -> Motion:
+    def _reanchored(self) -> tuple[EulerCamera, Array]:
+        """With a new angles' world, far from its singularity."""
         x, R_world_angles, J = reanchor(self.R_world_angles, self.x)
-        return motion.then(replace(self, x=x, R_world_angles=R_world_angles), J)
+        return replace(self, x=x, R_world_angles=R_world_angles), J
 
 
 def turning(R_world_angles: Array, x: Array) -> Array:

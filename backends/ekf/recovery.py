@@ -11,6 +11,7 @@ Then the prediction is wrong, not the observations. There are three cases, tried
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -43,23 +44,45 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     Raises:
         UnsolvableError: there is none, and the reason is numerical.
     """
-    found, error = None, None
+    found, error, most = None, None, (len(update.z) + 1) // 2
     try:
-        wider, gated = _gated(update, noises)
-        found = _agreed(wider, gated)
-        if wider is not update and not _most(update, found):
-            found = _agreed(update, gate(update)) or found  # they passed, but do not agree with each other
+        for tried, gated in _gated(update, noises, max(MIN_OBSERVATIONS, most)):
+            found = _agreed(tried, gated) or found
+            if found is not None and found.used.sum() >= most:
+                return found
     except UnsolvableError as reason:
         error = reason
-    if not _most(update, found):
-        found = _restarted(update, search, models) or found
+    least = max(MIN_CONSENSUS, most)
+    finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
+    T = search() if finite and len(update.z) >= least else None
+    if T is not None:
+        there = replace(update, guess=T).wider(restart_noise(update.camera.pose, T, models))
+        try:
+            restarted = solve(there, gate(there, at_guess=True))
+            if restarted is not None and restarted.used.sum() >= least:
+                return restarted
+        except UnsolvableError:
+            pass
     if found is None and error is not None:
         raise error
     return found
 
 
-def _most(update: Update, found: Posterior | None) -> bool:
-    return found is not None and bool(2 * found.used.sum() >= len(update.z))
+def _gated(update: Update, noises: Iterable[Array], most: int) -> Iterable[tuple[Update, Gated]]:
+    """The first prior, with more noise or seen from the guess, with which most pass the gate; then it as it is.
+
+    What still disagrees is taken out later by `solve`.
+    """
+    first = gate(update)
+    if len(update.z) >= most > first.used.sum():
+        priors = itertools.chain([update], map(update.wider, noises))
+        tries = ((one, at_guess) for one in priors for at_guess in (False, True)[: 1 + (update.guess is not None)])
+        for one, at_guess in tries:
+            gated = gate(one, at_guess)
+            if gated.used.sum() >= most:
+                yield one, gated
+                break
+    yield update, first
 
 
 def _agreed(update: Update, gated: Gated) -> Posterior | None:
@@ -73,39 +96,6 @@ def _agreed(update: Update, gated: Gated) -> Posterior | None:
         return None
     share = share_by_chance(rejected, float(gated.limits.max()))
     return None if bdtrc(used - 1, count, share) > 1 - update.gate_probability else found
-
-
-def _gated(update: Update, noises: Iterable[Array]) -> tuple[Update, Gated]:
-    """The update, with more noise and seen from the guess if most pass the gate only then, and its gate.
-
-    What still disagrees is taken out later by `solve`.
-    """
-    first, count = gate(update), len(update.z)
-    most = max(MIN_OBSERVATIONS, (count + 1) // 2)
-    if count < most or first.used.sum() >= most:
-        return update, first
-    for noise in (None, *noises):
-        wider = update if noise is None else update.wider(noise)
-        for at_guess in (False,) if update.guess is None else (False, True):
-            gated = gate(wider, at_guess) if wider is not update or at_guess else first
-            if gated.used.sum() >= most:
-                return wider, gated
-    return update, first
-
-
-def _restarted(update: Update, search: Search, models: EstimatorModels) -> Posterior | None:
-    """With a camera that is where the landmarks say, wherever it was before; None where most do not agree with it."""
-    least = max(MIN_CONSENSUS, (len(update.z) + 1) // 2)
-    finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
-    T = search() if finite and len(update.z) >= least else None
-    if T is None:
-        return None
-    there = replace(update, guess=T).wider(restart_noise(update.camera.pose, T, models))
-    try:
-        found = solve(there, gate(there, at_guess=True))
-    except UnsolvableError:
-        return None
-    return found if found is not None and found.used.sum() >= least else None
 
 
 def restart_noise(before: Array, after: Array, models: EstimatorModels) -> Array:

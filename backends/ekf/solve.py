@@ -1,8 +1,13 @@
 """The measurement update, gated and iterated: what it makes of a prior. The filter's state is not changed here.
 
-In the papers' order: the innovation ν and its covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain
-``K = P Hᵀ S⁻¹``, the corrected state ``x + K ν`` and covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is
-``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for the pose and measured landmarks alone.
+In the papers' order: the measurement ``z = h(x)`` and H (paper A, Eqs. 5-10; B, Eqs. 1-5), the innovation ν and its
+covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain ``K = P Hᵀ S⁻¹``, the corrected state ``x + K ν`` and its
+covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is ``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``.
+
+A landmark's measurement depends on where it is as seen from the camera alone. An error x of the camera's pose moves it
+there by ``−lever x`` in its own coordinates, so that ``H = own [−lever, 1]`` has columns for the pose and the
+landmark: a displacement of both together is no row's business, wherever H is taken. A component that is not measured,
+or gated, keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
 """
 
 from __future__ import annotations
@@ -14,16 +19,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg.blas import dgemm, dtrmm
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from backends.ekf import kernels
 from backends.ekf.covariance import CAMERA, POSE, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.measurement import Jacobian, Measurement
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
+from slam.window.gating import squared_distances
 from slam.window.stereo import Field, RectifiedStereo, no_field
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
@@ -44,7 +48,7 @@ class UnsolvableError(ArithmeticError):
 class Update:
     """One update: the prior, and what was measured."""
 
-    camera: Any  # `backends.ekf.motion.Camera`
+    camera: Any  # `backends.ekf.motion.EulerCamera`, or another
     covariance: Covariance
     landmarks: FilterLandmarks  # those that were measured (M,)
     marks: IndexArray  # which of the state these are (M,)
@@ -63,39 +67,47 @@ class Update:
 
     @cached_property
     def numbers(self) -> IndexArray:
-        """Where the pose and the measured landmarks stand in the state (6 + 3M,)."""
-        landmarks = CAMERA + 3 * self.marks[:, None] + np.arange(3)
-        return np.concatenate([np.arange(POSE), landmarks.reshape(-1)])
+        """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
+        return (3 * self.marks[:, None] + np.arange(3)).reshape(-1)
 
-    @cached_property
-    def measurement(self) -> Measurement:
-        """What is predicted."""
-        return Measurement(self.stereo, self.coordinates, self.landmarks.anchors)
+    def among_measured(self, change: Array) -> Array:
+        """The part (6 + 3M,) of a change of the state (n,) that the measurements depend on."""
+        return np.concatenate([change[:POSE], change[CAMERA + self.numbers]])
 
-    def at(self, T: Array | None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
-        """Linearised at a pose (4, 4), or the prior's own, and a change (M, 3) of the landmarks' coordinates."""
-        camera, J, mean, c = self.camera, np.eye(CAMERA), np.zeros(CAMERA), self.landmarks.c
-        if T is not None:
-            camera = camera.at(T)
-            J = self.camera.transport(camera)
-            mean = np.linalg.solve(J, self.camera.seen_from(camera))
-        change = np.zeros_like(c) if change is None else change
-        z, own = self.measurement.at(camera.pose, self.coordinates.moved(c, change))
-        lever = self.landmarks.gauge @ (camera.world() @ J[:POSE, :POSE])
-        return Linearisation(camera, J, mean, change, z, own, lever, from_prior)
+    def seen(self, T: Array, change: Array) -> tuple[Array, Array]:
+        """Predicted (M, 3) [px] at a pose T (4, 4) and a change of the state (n,), NaN behind a camera.
+
+        And derivatives (M, 3, 3) by the coordinates. A landmark is at ``h = Rᵀ (Y − r)`` (paper B, Eqs. 3-5).
+        """
+        anchors, moved = self.landmarks.anchors, change[CAMERA + self.numbers].reshape(-1, 3)
+        c = self.coordinates.moved(self.landmarks.c, moved)
+        z, J = self.stereo.project((self.coordinates.points(anchors, c) - T[:3, 3]) @ T[:3, :3])
+        return z, J @ (T[:3, :3].T @ self.coordinates.jacobian(anchors, c))
+
+    def at(self, camera: Any = None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
+        """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose."""
+        there, J, mean = self.camera, np.eye(CAMERA), np.zeros(CAMERA)
+        change = np.zeros(CAMERA + len(self.covariance.marks)) if change is None else change.copy()
+        if camera is not None:
+            there = self.camera.at(camera.pose)
+            J = self.camera.transport(there)
+            mean = np.linalg.solve(J, self.camera.seen_from(there))
+            change[:CAMERA] = np.concatenate([np.zeros(POSE), camera.seen_from(there)[POSE:]])
+        lever = self.landmarks.gauge @ (there.world() @ J[:POSE, :POSE])
+        return Linearisation(there, J, mean, change, *self.seen(there.pose, change), lever, from_prior)
 
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
     """Where measurements are linearised."""
 
-    camera: Any
+    camera: Any  # the prior's at another pose
     J: Array  # (12, 12): an error of the prior's camera is J times that, as an error of this one
     mean: Array  # the error (12,) of the prior's camera less that of this one
-    change: Array  # of the landmarks' coordinates (M, 3)
+    change: Array  # of the state (n,) from the prior, but for the pose
     z: Array  # what is predicted here (M, 3) [px]
     own: Array  # its derivatives (M, 3, 3) by the coordinates
-    lever: Array  # see `Jacobian`
+    lever: Array  # (M, 3, 6), see the module
     from_prior: float  # squared distance from the prior
 
     def cost(self, update: Update, rows: BoolArray) -> float:
@@ -114,43 +126,65 @@ class Innovation:
     """ν and its covariance S, linearised somewhere (paper A, Eq. 11)."""
 
     rows: BoolArray  # mask of its rows (M, 3)
-    H: Jacobian
-    HP: tuple[Array, Array]  # see `Jacobian.times`
+    own: Array  # H: derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
+    by_pose: Array  # and (3M, 6) by the pose's error
+    HP: tuple[Array, Array]  # H P: with the camera (3M, 12), and with the landmarks of the state (3M, 3A)
     nu: Array  # innovation of the prior's mean (3M,)
-    S: Array  # its covariance, lower triangle (3M, 3M)
+    S: Array  # its covariance (3M, 3M)
 
     @classmethod
     def of(cls, update: Update, rows: BoolArray, at: Linearisation) -> Innovation:
         """Linearised at an iterate."""
-        H = Jacobian(at.own if rows.all() else np.where(rows[:, :, None], at.own, 0.0), at.lever, update.marks)
+        P, numbers, moved = update.covariance, update.numbers, update.among_measured(at.change)[POSE:]
+        own = at.own if rows.all() else np.where(rows[:, :, None], at.own, 0.0)
+        by_pose, h = -(own @ at.lever).reshape(-1, POSE), len(P.head)
         nu = np.where(rows, update.z - at.z, 0.0).reshape(-1)
-        nu += (H.own @ at.change[:, :, None]).reshape(-1) - H.by_pose.reshape(-1, POSE) @ at.mean[:POSE]
-        HP = H.times(update.covariance)
-        return cls(rows, H, HP, nu, H.covariance(*HP, update.sigma**2))
+        nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) - by_pose @ at.mean[:POSE]
+        with_camera = _times(own, by_pose, P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
+        with_marks = _times(own, by_pose, P.head[:POSE, h : h + len(P.marks)], P.marks[numbers])
+        S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, numbers].T)
+        S[np.diag_indices(len(S))] += update.sigma**2
+        return cls(rows, own, by_pose, (with_camera, with_marks), nu, S)
+
+    def with_rest(self, update: Update) -> Array:
+        """``H P`` with the last poses and with what has left the state; less ``F δ`` with errors of the rig."""
+        P, h = update.covariance, len(update.covariance.head)
+        with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h + len(P.marks) :]], axis=1)
+        with_marks = np.concatenate([P.head[CAMERA:, h + update.numbers].T, P.cross[update.numbers]], axis=1)
+        rest = _times(self.own, self.by_pose, with_pose, with_marks)
+        if P.rig:
+            rest[:, -P.rig :] -= np.where(self.rows[:, :, None], update.field(update.z), 0.0).reshape(-1, P.rig)
+        return rest
+
+    def transposed_times(self, y: Array) -> Array:
+        """``Hᵀ y`` (6 + 3M,) of [pose, measured landmarks], for y (3M,); it is zero elsewhere."""
+        return np.concatenate([y @ self.by_pose, (y.reshape(-1, 1, 3) @ self.own).reshape(-1)])
+
+
+def _times(own: Array, by_pose: Array, of_pose: Array, of_marks: Array) -> Array:
+    """H (3M, ·) of a matrix with the rows (6, k) of the pose and (3M, k) of the measured landmarks."""
+    out = by_pose @ of_pose
+    out += (own @ of_marks.reshape(len(own), 3, -1)).reshape(out.shape)
+    return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """The innovation whitened by ``S = L Lᵀ``: ``w = L⁻¹ ν`` has covariance 1.
-
-    To take out measurements is to project w on what is orthogonal to the columns of L⁻¹ that belong to them: that gives
-    what a factorisation without them would.
-    """
+    """The innovation of some landmarks whitened by ``S = L Lᵀ``: ``w = L⁻¹ ν`` has covariance 1."""
 
     innovation: Innovation
-    rows: BoolArray  # mask of its rows (M, 3)
-    nu: Array  # (3M,)
-    inverse: Array  # L⁻¹ (3M, 3M), lower triangular
-    taken: Array  # orthonormal directions (3M, K) of what has been taken out
+    used: BoolArray  # which landmarks (M,)
+    nu: Array  # (3M,), zero for the others
+    inverse: Array  # L⁻¹ (3M, 3M), lower triangular, with zero rows for the others
 
     @classmethod
-    def of(cls, innovation: Innovation, gone: BoolArray) -> Whitened:
-        """Without some rows (mask (M, 3)).
+    def of(cls, innovation: Innovation, used: BoolArray) -> Whitened:
+        """Of some landmarks (mask (M,)).
 
         Raises:
             UnsolvableError: S is not positive definite.
         """
-        nu, S, out = innovation.nu, innovation.S, np.flatnonzero(gone)
+        nu, S, out = innovation.nu, innovation.S, np.flatnonzero(np.repeat(~used, 3))
         if len(out):
             nu, S = nu.copy(), S.copy()
             nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
@@ -159,41 +193,12 @@ class Whitened:
             raise UnsolvableError("the innovation covariance is not positive definite")
         inverse = _inverse(upper).T
         inverse[out, out] = 0.0
-        return cls(innovation, innovation.rows & ~gone, nu, inverse, np.zeros((len(nu), 0)))
-
-    def without(self, gone: BoolArray) -> Whitened:
-        """Without some more landmarks (mask (M,))."""
-        columns = self.inverse[:, np.flatnonzero(gone[:, None] & self.rows)]
-        more = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))[0]
-        taken = np.concatenate([self.taken, more], axis=1)
-        return replace(self, rows=self.rows & ~gone[:, None], taken=taken)
-
-    def whiten(self, X: Array) -> Array:
-        """``L⁻¹ X``, as far as it is not taken out, for X (3M, ...)."""
-        W = self.inverse @ X
-        return np.asarray(W - self.taken @ (self.taken.T @ W))
-
-    def lost(self, update: Update) -> tuple[Array, Array, Array]:
-        """``P Hᵀ L⁻ᵀ``, see `Covariance.corrected`."""
-        P, (with_camera, with_marks) = update.covariance, self.innovation.HP
-        rest = self.innovation.H.times_rest(P)
-        if P.rig:
-            field = np.where(self.innovation.rows[:, :, None], update.field(update.z), 0.0)
-            rest[:, -P.rig :] -= field.reshape(-1, P.rig)
-        narrow = self.whitened(np.concatenate([with_camera, rest], axis=1))
-        return narrow[: len(P.head)], self.whitened(with_marks), narrow[len(P.head) :]
-
-    def whitened(self, HX: Array) -> Array:
-        """`whiten` of H X, transposed (N, 3M), in Fortran's order."""
-        V = dtrmm(1.0, self.inverse.T, HX.T, side=1)
-        if self.taken.size:
-            V = dgemm(-1.0, V @ self.taken, self.taken, beta=1.0, c=V, trans_b=1, overwrite_c=1)
-        return np.asarray(V)
+        return cls(innovation, used, nu, inverse)
 
     @cached_property
     def w(self) -> Array:
         """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
-        return self.whiten(self.nu)
+        return np.asarray(self.inverse @ self.nu)
 
     @cached_property
     def y(self) -> Array:
@@ -203,7 +208,15 @@ class Whitened:
     @cached_property
     def by_pose(self) -> Array:
         """The whitened innovation's covariance (3M, 6) with the pose."""
-        return self.whiten(self.innovation.HP[0][:, :POSE])
+        return np.asarray(self.inverse @ self.innovation.HP[0][:, :POSE])
+
+    def lost(self, update: Update) -> tuple[Array, Array, Array]:
+        """``P Hᵀ L⁻ᵀ``, see `Covariance.corrected`."""
+        with_camera, with_marks = self.innovation.HP
+        narrow = np.concatenate([with_camera, self.innovation.with_rest(update)], axis=1)
+        V, V_marks = (dtrmm(1.0, self.inverse.T, HX.T, side=1) for HX in (narrow, with_marks))
+        h = len(update.covariance.head)
+        return V[:h], V_marks, V[h:]
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -211,11 +224,12 @@ class Whitened:
         For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
         by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
         """
-        found = kernels.conditional_distances(self.inverse, self.taken.T @ self.inverse, self.y)
-        used = self.rows.any(axis=1)
-        if not np.isfinite(found[used]).all():
+        columns = np.ascontiguousarray(self.inverse.reshape(-1, len(self.used), 3).transpose(1, 2, 0)[self.used])
+        found = np.zeros(len(self.used))
+        found[self.used] = squared_distances(self.y.reshape(-1, 3)[self.used], columns @ columns.transpose(0, 2, 1))
+        if not np.isfinite(found).all():
             raise UnsolvableError("the innovation covariance is not positive definite")
-        return np.where(used, found, 0.0)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,10 +237,14 @@ class Posterior:
     """The maximum of the posterior (or one step towards it)."""
 
     update: Update
-    used: BoolArray  # which landmarks (M,) it is made of
     at: Linearisation  # the last linearisation
     change: Array  # of the state (n,), see `Linearisation.camera_after`
     whitened: Whitened  # the last innovation, from which the covariance follows
+
+    @property
+    def used(self) -> BoolArray:
+        """Which landmarks (M,) it is made of."""
+        return self.whitened.used
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,14 +264,15 @@ def gate(update: Update, at_guess: bool = False) -> Gated:
     Raises:
         UnsolvableError: the prior is not finite, or S is not positive definite.
     """
-    start, measured = update.at(update.guess if at_guess else None), np.isfinite(update.z)
-    P = update.covariance
+    start = update.at(update.camera.at(update.guess)) if at_guess else update.at()
+    P, measured = update.covariance, np.isfinite(update.z)
     if not (np.isfinite(start.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
         raise UnsolvableError("the predicted state is not finite")
     visible = np.asarray(np.isfinite(start.z).all(axis=1))
     innovation = Innovation.of(update, measured & visible[:, None], start)
-    limits = chi_square_limits(measured.sum(axis=1), update.gate_probability)
-    own = kernels.own_distances(innovation.nu, innovation.S)
+    m, limits = len(visible), chi_square_limits(measured.sum(axis=1), update.gate_probability)
+    blocks = innovation.S.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)]
+    own = squared_distances(innovation.nu.reshape(m, 3), blocks)
     if not np.isfinite(own).all():
         raise UnsolvableError("the predicted innovations are not finite or not positive definite")
     distances = np.where(visible, own, np.nan)
@@ -269,48 +288,45 @@ def solve(update: Update, gated: Gated) -> Posterior | None:
     Raises:
         UnsolvableError: S is not positive definite, the new state not finite, or the pose's covariance not positive.
     """
-    if not gated.used.any():
-        return None
-    used, first = gated.used, Whitened.of(gated.innovation, gated.innovation.rows & ~gated.used[:, None])
+    used = gated.used
     while used.any():
-        at, change, whitened = _iterate(update, gated.start, first)
-        excess = whitened.distances() / gated.limits
+        found = _iterate(update, gated.start, Whitened.of(gated.innovation, used))
+        excess = found.whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            left = update.covariance.pose - whitened.by_pose.T @ whitened.by_pose
+            left = update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
-            return Posterior(update, used, at, change, whitened)
+            return found
         used = used & (excess <= max(1.0, 0.5 * worst))
-        first = first.without(~used)
     return None
 
 
-def _iterate(update: Update, now: Linearisation, whitened: Whitened) -> tuple[Linearisation, Array, Whitened]:
-    """The change of the state (n,), from where, by an update whose first linearisation is `whitened`, and the last.
+def _iterate(update: Update, now: Linearisation, whitened: Whitened) -> Posterior:
+    """An update whose first linearisation is `whitened`.
 
     Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. The prior is
     transported from its own coordinates, not from those of the iterate: where landmarks move by much, the result is not
     quite the posterior's maximum. Where the first is far from linear, the guess may be the better next place. One
     iteration is taken as it is: the papers' filter.
     """
-    rows, reached = whitened.rows, None
+    rows, reached = whitened.innovation.rows & whitened.used[:, None], None
     for iteration in range(1, update.iterations + 1):
-        s, HP = whitened.innovation.H.transposed_times(whitened.y), whitened.innovation.HP
-        change = np.concatenate([now.mean + whitened.y @ HP[0], whitened.y @ HP[1]])
+        HP, y = whitened.innovation.HP, whitened.y
+        change = np.concatenate([now.mean + y @ HP[0], y @ HP[1]])
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
         if update.iterations == 1 or _linear(update, whitened, now, change):
-            return now, change, whitened
-        following, step = _descend(update, rows, now, s, change)
+            return Posterior(update, now, change, whitened)
+        following, step = _descend(update, rows, now, whitened.innovation.transposed_times(y), change)
         if iteration == 1 and update.guess is not None:
             following = min(following, _at_guess(update), key=lambda iterate: iterate.cost(update, rows))
         if following is now:
             break
-        reached = now, step, whitened
+        reached = Posterior(update, now, step, whitened)
         if iteration < update.iterations:
             now = following
-            whitened = Whitened.of(Innovation.of(update, rows, now), np.zeros_like(rows))
+            whitened = Whitened.of(Innovation.of(update, rows, now), whitened.used)
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
@@ -330,21 +346,21 @@ def _inverse(U: Array) -> Array:
 
 def _linear(update: Update, whitened: Whitened, now: Linearisation, change: Array) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
-    moved = change[update.numbers[POSE:]].reshape(-1, 3)
-    T, c = now.camera_after(change).pose, update.coordinates.moved(update.landmarks.c, moved)
-    z, _ = update.measurement.seen(T, c)
-    seen = moved - now.lever @ change[:POSE] - now.change
-    errors = np.where(whitened.rows, z - now.z - (now.own @ seen[:, :, None])[:, :, 0], 0.0)
+    z, _ = update.seen(now.camera_after(change).pose, change)
+    step = update.among_measured(change - now.change)
+    seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
+    rows = whitened.innovation.rows & whitened.used[:, None]
+    errors = np.where(rows, z - now.z - (now.own @ seen[:, :, None])[:, :, 0], 0.0)
     if not np.abs(errors).max() < _LINEAR * update.sigma:
         return False
-    shift = whitened.whiten(errors.reshape(-1)) @ whitened.by_pose
+    shift = (whitened.inverse @ errors.reshape(-1)) @ whitened.by_pose
     variances = update.covariance.pose.diagonal() - (whitened.by_pose**2).sum(axis=0)
     return bool((shift**2 <= _POSE_SHARE**2 * variances).all())
 
 
 def _at_guess(update: Update) -> Linearisation:
     """The guess, with the landmarks where they are believed: its distance from the prior is that of the pose alone."""
-    there, distance = update.at(update.guess), math.inf
+    there, distance = update.at(update.camera.at(update.guess)), math.inf
     with suppress(np.linalg.LinAlgError):  # a pose that is known exactly cannot be moved
         mean = there.mean[:POSE]
         distance = float(mean @ np.linalg.solve(update.covariance.pose, mean))
@@ -359,16 +375,14 @@ def _descend(
     Where it ends, and the step (n,). The next linearisation is at the pose reached: the camera turns, and the landmarks
     stay. On the way the distance from the prior, with d at the start and d' at the end, is that of (1 − a) d + a d'.
     """
-    numbers = update.numbers
-    start = np.concatenate([np.zeros(POSE), now.change.reshape(-1)])
-    mean = np.concatenate([now.mean[:POSE], np.zeros(now.change.size)])
-    end, between = float(s @ (change[numbers] - mean)), float(s @ (start - mean))
-    cost, step = now.cost(update, rows), change.copy()
+    mean = np.concatenate([now.mean, np.zeros(len(change) - CAMERA)])
+    end, between = (float(s @ update.among_measured(x - mean)) for x in (change, now.change))
+    cost = now.cost(update, rows)
     for halving in range(_HALVINGS):
         a = 0.5**halving
-        step[numbers] = start + a * (change[numbers] - start)
+        step = now.change + a * (change - now.change)
         distance = (1 - a) ** 2 * now.from_prior + 2 * a * (1 - a) * between + a * a * end
-        following = update.at(now.camera_after(step).pose, step[numbers[POSE:]].reshape(-1, 3), distance)
+        following = update.at(now.camera_after(step), step, distance)
         if following.cost(update, rows) <= cost * (1 + 1e-9):
             return following, step
-    return now, step
+    return now, change

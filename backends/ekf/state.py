@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.motion import Camera, Motion
+from backends.ekf.motion import Motion
 from backends.ekf.solve import Posterior, UnsolvableError
 from slam.data import IdArray, IndexArray, RecentPoses
 from slam.geometry.se3 import Array
@@ -29,13 +30,13 @@ class FilterState:
     frame: int  # number of the prediction, −1 before the first
     dt: float  # time since the last one [s], 0 for the first
     measured: bool  # whether the pose may not be updated any more
-    camera: Camera  # pose and velocities; it says what its error means
+    camera: Any  # `backends.ekf.motion.EulerCamera`, or another: pose and velocities, and what their error means
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
     recent: tuple[tuple[float, Array], ...] = ()  # stamps [s] and poses (4, 4) of the last frames, the newest first
 
     @classmethod
-    def first(cls, camera: Camera, P: Array) -> FilterState:
+    def first(cls, camera: Any, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
         return cls(float("nan"), -1, 0.0, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
 
@@ -154,10 +155,6 @@ class FilterState:
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.marks[found.used]] = self.frame
-        J = self.camera.transport(camera)
         shift = (marks.gauge - before.gauge)[: P.count] @ camera.world() * camera.transports
-        covariance = P.corrected(found.whitened.lost(update), J, shift)
-        settled = camera.settled()
-        if settled.camera is not camera:
-            covariance = covariance.camera_moved(settled.J, settled.noise)
-        return replace(self, camera=settled.camera, landmarks=marks, covariance=covariance).relieved()
+        covariance = P.corrected(found.whitened.lost(update), self.camera.transport(camera), shift)
+        return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()

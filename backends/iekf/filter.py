@@ -37,7 +37,7 @@ from slam.models import EstimatorModels
 
 @dataclass(frozen=True, eq=False)
 class InvariantCamera:
-    """Pose and velocities, with the error [δp, θ, δv, δω] (12,); see the module, and `backends.ekf.motion.Camera`."""
+    """Pose and velocities, with the error [δp, θ, δv, δω] (12,); see the module and `backends.ekf.motion`."""
 
     pose: Array  # T_world_left (4, 4)
     v: Array  # velocity (3,) in the world [m/s]
@@ -50,62 +50,56 @@ class InvariantCamera:
         return cls(models.initial_pose, np.zeros(3), np.zeros(3)), prior(models)
 
     def by_error(self) -> Array:
-        """See `Camera`: ``[R̂ᵀ θ, R̂ᵀ δp]``."""
+        """See `EulerCamera`: ``[R̂ᵀ θ, R̂ᵀ δp]``."""
         J = np.zeros((POSE, POSE))
         J[:3, 3:] = J[3:, :3] = self.pose[:3, :3].T
         return J
 
     def world(self) -> Array:
-        """See `Camera`: ``ξ_p = δp + p̂ × θ``."""
+        """See `EulerCamera`: ``ξ_p = δp + p̂ × θ``."""
         W = np.eye(POSE)
         W[:3, 3:] = hat(self.pose[:3, 3])
         return W
 
     def moved(self, error: Array) -> InvariantCamera:
-        """See `Camera`."""
+        """See `EulerCamera`."""
         T = se3.pose(se3.so3_exp(error[3:6]) @ self.pose[:3, :3], self.pose[:3, 3] + error[:3])
         return replace(self, pose=T, v=self.v + error[6:9], rate=self.rate + error[9:])
 
     def at(self, T: Array) -> InvariantCamera:
-        """See `Camera`."""
+        """See `EulerCamera`."""
         return replace(self, pose=T)
 
     def seen_from(self, other: InvariantCamera) -> Array:
-        """See `Camera`."""
+        """See `EulerCamera`."""
         turn = se3.so3_log(self.pose[:3, :3] @ other.pose[:3, :3].T)
         shift = self.pose[:3, 3] - other.pose[:3, 3]
         return np.concatenate([shift, turn, self.v - other.v, self.rate - other.rate])
 
     def transport(self, to: InvariantCamera) -> Array:
-        """See `Camera`: ``T(χ̂⁺)⁻¹ T(χ̂)``."""
+        """See `EulerCamera`: ``T(χ̂⁺)⁻¹ T(χ̂)``."""
         J = np.eye(CAMERA)
         J[:3, 3:6], J[6:9, 3:6] = hat(self.pose[:3, 3] - to.pose[:3, 3]), hat(self.v - to.v)
         return J
 
     def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
-        """See `Camera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
+        """See `EulerCamera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
         gap = after_gap(models, P, dt)
         if gap is not None:  # it may be turned anyhow: it stays, independent of the map
             still = replace(self, v=np.zeros(3), rate=np.zeros(3))
             return Motion(still, np.zeros((CAMERA, CAMERA)), gap)
         R, turn = self.pose[:3, :3], self.rate * dt
-        T = se3.pose(R @ se3.so3_exp(turn), self.pose[:3, 3] + dt * self.v)
+        after = se3.nearest_rotation(R @ se3.so3_exp(turn))  # products of many rotations lose digits
+        T = se3.pose(after, self.pose[:3, 3] + dt * self.v)
         A, G = np.eye(CAMERA), np.eye(CAMERA)
         G[3:6, 3:6] = R @ se3.so3_left_jacobian(turn)
         A[:3, 6:9], A[3:6, 9:] = dt * np.eye(3), dt * G[3:6, 3:6]
         return Motion(replace(self, pose=T), A, G @ motion_noise(models, dt) @ G.T)
 
     def at_rest(self) -> Motion:
-        """See `Camera`."""
+        """See `EulerCamera`."""
         still = replace(self, v=np.zeros(3), rate=np.zeros(3))
         return Motion(still, np.diag(np.repeat([1.0, 0.0], POSE)))
-
-    def settled(self) -> Motion:
-        """See `Camera`: nothing is singular; a rotation is made orthonormal again."""
-        R = self.pose[:3, :3]
-        if np.abs(R @ R.T - np.eye(3)).max() <= 1e-12:
-            return Motion(self)
-        return Motion(replace(self, pose=se3.pose(se3.nearest_rotation(R), self.pose[:3, 3])))
 
 
 @dataclass(frozen=True)

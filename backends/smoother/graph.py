@@ -187,11 +187,16 @@ class Tracks:
                 problem.factors.add(self._make.smart(track.points, track.keys, careful))
         return made
 
-    def forget(self, number: int) -> None:
-        """After a pose was solved for: forget the smart factors that will not grow at the next; once in a while."""
-        self._solved = number
-        if self._lag is not None and not number % self._lag:
-            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] > number - self._lag}
+    def forget(self, s: SmootherState) -> None:
+        """After its newest pose was solved for: forget what will not grow or come back; once in a while.
+
+        Of a landmark of which more is known it stays known that this is used up.
+        """
+        self._solved = s.number
+        if self._lag is not None and not s.number % self._lag:
+            oldest = s.number - self._lag
+            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] > oldest}
+            self._variables = {n: last for n, last in self._variables.items() if last >= oldest or n in s.known}
 
 
 class Graph:
@@ -297,7 +302,7 @@ class Graph:
         for _ in range(again):
             self._solver.update()
         self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
-        self._tracks.forget(s.number)
+        self._tracks.forget(s)
         values = self._solver.calculateEstimate()
         poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)])
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
@@ -339,6 +344,11 @@ class Graph:
         R = self._first[:3, :3]
         J = R @ points_by_pose(transform(inverse(self._first), position[None]))[0]
         return np.asarray(self._solver.getISAM2().marginalCovariance(key) + J @ self._base @ J.T)
+
+    @property
+    def newest(self) -> int:
+        """Number of the newest pose in it; −1 for none."""
+        return self._number
 
     def _is_of(self, s: SmootherState) -> bool:
         """Whether it is the state's graph, up to poses that entered since the last update."""

@@ -18,6 +18,7 @@ VARIABLE = -(10**9)  #: in place of the number of the pose with which a smart fa
 #: Least distance of a landmark that becomes a variable, in its standard deviations. A variable is linearised in space,
 #: and so off by one such part of its deviation, to the same side for all: of 20 together by a seventh of theirs.
 _LINEAR = 30.0
+_NEARER = 0.5  # share of the distance at which a landmark became a variable, below which it is one no more
 _GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
 _DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
 _BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
@@ -37,6 +38,7 @@ class SmootherLandmarks(LandmarkRows):
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
     begun: IndexArray  # number of the pose from which its smart factor counts (S,), or later; or VARIABLE
+    far: Array  # distance from the camera [m] at which it became a variable (S,)
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
     @classmethod
@@ -47,7 +49,7 @@ class SmootherLandmarks(LandmarkRows):
         n = len(ids)
         return cls(
             ids, first + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
-            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), by_rig,
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), np.zeros(n), by_rig,
         )  # fmt: skip
 
     @classmethod
@@ -61,13 +63,16 @@ class SmootherLandmarks(LandmarkRows):
         """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
         return self.own + self.away
 
-    def measured(self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0) -> SmootherLandmarks:
+    def measured(
+        self, rows: IndexArray, z: Array, pose: int, track: int, oldest: int = 0, before: int = -1
+    ) -> SmootherLandmarks:
         """With one more measurement (M, 3) of some landmarks, from the pose of a number.
 
         A smart factor spans at most `track` poses. Then, or if a landmark was not measured for half as many, it goes on
         in a new one. If landmarks that were found together all did so at once, the motion model alone
         would tie that pose to the one before. So the first factor spans fewer, down to half of them, differently for
-        each landmark.
+        each landmark. After frames that measured nothing many would, all the same: then every other one takes this
+        measurement, too, as long as its first pose has not left the graph, whose newest one is pose `before`.
 
         What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
         was known beforehand.
@@ -75,8 +80,11 @@ class SmootherLandmarks(LandmarkRows):
         last, begun = self.pose[rows].max(axis=1), self.begun.copy()
         half, full = max(track // 2, 1), begun[rows] <= pose - track
         anew = (last < 0) | (last < pose - half)
+        held = (
+            (last >= 0) & (0 <= before < pose - 1) & (begun[rows] > before - track) & (self.serial[rows] // 2 % 2 == 0)
+        )
         smart = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, begun[rows]))
-        begun[rows] = np.where(begun[rows] == VARIABLE, VARIABLE, smart)
+        begun[rows] = np.where(held | (begun[rows] == VARIABLE), begun[rows], smart)
         old = np.zeros(len(self), bool)
         old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
@@ -94,22 +102,25 @@ class SmootherLandmarks(LandmarkRows):
         None where it measures more: these hold the path well enough as they come and go, at half the cost.
         These are landmarks whose smart factor is full: as variables they keep what it says of them, as its measurements
         go over. They are close enough to be linear in their position: far ones made a path metres off, unnoticed, and
-        Gauss-Newton steps might put them behind the camera. Variables that were not measured for longer than a factor
+        Gauss-Newton steps might put them behind the camera. What is known of one from afar is linear there: one that
+        the camera has come near goes on in a smart factor. Variables that were not measured for longer than a factor
         spans make room, the oldest first.
         """
         if len(rows) > most:
             return self
         last, variable = self.pose.max(axis=1), self.begun == VARIABLE
-        far = np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
-        sure = _LINEAR * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < far
+        distance = np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
+        sure = _LINEAR * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < distance
         full = ~variable[rows] & (self.begun[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
         new = rows[full & sure & np.isfinite(z[:, 2])]
         away = np.flatnonzero(variable & (last < pose - track))
         away = away[np.argsort(last[away], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
-        begun = self.begun.copy()
+        begun, far = self.begun.copy(), self.far.copy()
         begun[away] = 0
+        begun[rows[variable[rows] & (distance < _NEARER * far[rows])]] = 0
         begun[np.sort(new)[: most - int(variable.sum()) + len(away)]] = VARIABLE
-        return replace(self, begun=begun)
+        far[rows] = np.where(variable[rows], far[rows], distance)
+        return replace(self, begun=begun, far=far)
 
     def at(self, serials: IdArray, points: Array) -> Self:
         """With some landmarks (V,), by serial number, at points (V, 3)."""
@@ -137,6 +148,18 @@ class SmootherLandmarks(LandmarkRows):
         return replace(
             self, mean=mean, information=information, z=np.full_like(self.z, np.nan), pose=-1 + 0 * self.pose
         )
+
+    def folded(self, first: int) -> Self:
+        """With what they are known by, in place of all measurements, where one was made before pose number `first`.
+
+        Poses before it are kept no more. The numbers of the poses stay: they say when a landmark was measured last.
+        """
+        old = ((self.pose >= 0) & (self.pose < first)).any(axis=1) & ~self.world
+        return replace(
+            self, mean=np.where(old[:, None], self.position, self.mean),
+            information=np.where(old[:, None, None], inverses(self.own), self.information),
+            z=np.where(old[:, None, None], np.nan, self.z),
+        )  # fmt: skip
 
     def refined(self, stereo: RectifiedStereo, sigma: float, first: int, poses: Array) -> Self:
         """Where their measurements put them, given the poses (K, 4, 4) from number `first` on.
@@ -182,21 +205,22 @@ class SmootherLandmarks(LandmarkRows):
     def covariances(
         self, stereo: RectifiedStereo, sigma: float, chosen: IndexArray, first: int, poses: Array, joint: Array
     ) -> Array:
-        """Covariances (M, 3, 3) in the world of some landmarks, given the joint one of poses.
+        """Covariances (M, 3, 3) in the world of some landmarks, given that of the last poses, `joint` (6 K, 6 K).
 
         With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
         fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
-        information. Measurements from earlier poses count for the first one. A landmark that none of the graph's poses
-        measured is carried by the newest, with the drift since it was seen. The poses (K, 4, 4) from number `first` on
-        have the covariance `joint` (6 K, 6 K).
+        information. Measurements from earlier poses than these count for the first of them. A landmark that was never
+        measured is carried by the newest, with the drift since it is known. All `poses` (N, 4, 4) are from number
+        `first` on.
         """
         frames, z = (self.pose - first).clip(0).ravel(), self.z.reshape(-1, 3)
         rows = np.where(self.pose >= 0, np.arange(self.pose.size).reshape(self.pose.shape), -1)[chosen]
         x, own = self.position[chosen], self.own[chosen]
         information, *_ = information_of(stereo.intrinsics, poses, frames, z, x, rows, sigma)
         older = np.where(self.world[chosen, None, None], 0.0, self.information[chosen])
-        J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
         n, width = len(chosen), len(joint)
+        known = np.arange(len(poses) - width // 6, len(poses))
+        J = carried_by(known, poses[known], frames, x, rows, information, older, own)
         C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
         C += np.where(np.asarray((rows < 0).all(axis=1))[:, None, None], self.away[chosen], 0.0)
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))

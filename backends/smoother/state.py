@@ -131,6 +131,6 @@ class SmootherState:
             return self
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], sights=self.sights[gone:], ties=self.ties[gone:],
-            spread=self.spread[gone:],
+            spread=self.spread[gone:], landmarks=self.landmarks.folded(self.first + gone),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip

@@ -134,7 +134,7 @@ class Steps(RectifiedMeasurement):
         own = marks.from_newest[seen]
         marks.by_rig[seen] = landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T)
-        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number))
+        marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number), graph.newest)
         sight = Sight.of(marks, seen, z[used])
         if s.inside:
             after = replace(
@@ -212,9 +212,8 @@ class Steps(RectifiedMeasurement):
 
     def landmark_covariances(self, s: SmootherState, graph: Graph, rows: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmarks in the world."""
-        first, joint = graph.joint_covariance(s)
-        poses, marks = s.poses[s.of(first) :], s.landmarks
-        C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, first, poses, joint)
+        marks, joint = s.landmarks, graph.joint_covariance(s)[1]
+        C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, s.first, s.poses, joint)
         for i in np.flatnonzero(marks.begun[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found

@@ -198,7 +198,7 @@ def replay_command(
     from slam.settings import require_settable
 
     loaded, name = load_recording(recording), backend or "ekf"
-    default = SystemConfig.for_kind(loaded.kind, None, name)
+    default = SystemConfig.for_kind(loaded.kind, None)
     require_settable(settings or [], default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings or [])
     with run_folder(out, loaded.name, name) as folder:

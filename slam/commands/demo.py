@@ -50,7 +50,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
             f"{len(ONLINE)} runs of {frames} frames: about {seconds:.0f} s on two idle cores, 40 s more the first time"
         )
     for backend in ONLINE:
-        config = SystemConfig.for_kind(sequence.kind, "surf", backend)
+        config = SystemConfig.for_kind(sequence.kind)
         with progress(len(sequence), f"aisle · {backend}", quiet) as tell:
             compile_kernels(ONLINE[-1])
 

@@ -70,7 +70,7 @@ def prepare(
     mono = mono or before.mono
     if mono and before.prior_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
-    chosen = SystemConfig.for_kind(kind, frontend, backend)
+    chosen = SystemConfig.for_kind(kind, frontend)
     if config is not None:  # options of another front end or back end than its are the defaults
         if changed := changed_versions(made_with, versions()):
             logging.getLogger(__name__).warning("made with other versions, results may differ: %s", "; ".join(changed))

@@ -87,7 +87,7 @@ def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
     if name == SIMULATED and isinstance(sequence, WorldSequence):  # the noise of these features is known
         first = [f"models.pixel_sigma={sequence.values['sigma']}"] if sequence.values["sigma"] else []
     settings = [*first, *trial.variant.settings]
-    return SystemConfig.for_kind(sequence.kind, name, trial.backend).with_settings(settings)
+    return SystemConfig.for_kind(sequence.kind, name).with_settings(settings)
 
 
 @contextmanager

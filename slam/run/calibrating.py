@@ -177,7 +177,7 @@ def _unit(name: str, unit: str, focal: float) -> tuple[float, str]:
 
 def _config(sequence: StereoSequence, settings: Sequence[str]) -> SystemConfig:
     """The settings for a recording."""
-    config = SystemConfig.for_kind(sequence.kind, _FRONTEND, _BACKEND).with_settings([*_SETTINGS, *settings])
+    config = SystemConfig.for_kind(sequence.kind, _FRONTEND).with_settings([*_SETTINGS, *settings])
     if not config.self_calibration.enabled:
         raise ConfigurationError("slam calibrate needs self_calibration.enabled=true")
     return config

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from backends.ekf import EkfBackend
+from backends.ekf.covariance import CAMERA, Covariance
 from slam.data import Observations
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -25,6 +26,13 @@ def nees(backend: EkfBackend, truth: np.ndarray) -> float:
     found = backend.estimate(landmarks=False)
     xi = se3.log(se3.inverse(found.T_world_left) @ truth)
     return float(xi @ np.linalg.solve(found.covariance, xi))
+
+
+def dense(covariance: Covariance) -> np.ndarray:
+    """Of camera and landmarks of the state, as one matrix (12 + 3A, 12 + 3A)."""
+    h = len(covariance.head)
+    with_camera = covariance.head[:CAMERA, h : h + len(covariance.marks)]
+    return np.block([[covariance.camera, with_camera], [with_camera.T, covariance.marks]])
 
 
 def halfway(data: Scene, frames: int, models: EstimatorModels = MODELS, **options) -> tuple[EkfBackend, set[int]]:

@@ -8,6 +8,7 @@ import pytest
 import backends
 from experiments.long_run import RIG, Corridor, measured, run, setting, table
 from slam.data import Observations
+from tests.backends.ekf_runs import dense
 
 
 @pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
@@ -38,5 +39,5 @@ def test_the_filters_memory_follows_the_map():
         backend.remove(backend.estimate().ids)
         seen = measured(corridor.pose(0.0), points, ids, rng)
         backend.add(Observations(seen.ids + 1000 * k, seen.uv_left, seen.uv_right))
-        assert len(backend.state.covariance.dense) == 12 + 3 * len(seen)
+        assert len(dense(backend.state.covariance)) == 12 + 3 * len(seen)
     assert len(seen) > 50

@@ -10,15 +10,15 @@ from scipy.optimize import least_squares
 
 from backends.ekf.angles import attitude, body_rate_derivative, pose_jacobian, reanchor
 from backends.ekf.covariance import CAMERA, Covariance
-from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth, gauge_jacobian
-from backends.ekf.measurement import Jacobian, Measurement
+from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
-from backends.ekf.solve import Innovation, UnsolvableError, Update, Whitened, gate, solve
+from backends.ekf.solve import Innovation, UnsolvableError, Update, Whitened, _descend, gate, solve
 from backends.ekf.state import FilterState
 from slam.geometry import se3
 from slam.geometry.se3 import angles, body_rate_matrix
 from slam.models import EstimatorModels, MotionModel
 from slam.window.stereo import RectifiedStereo
+from tests.backends.ekf_runs import dense
 from tests.backends.scenes import RIG
 from tests.slam.numeric import assert_equal_to_rounding, jacobian, positive
 
@@ -79,12 +79,6 @@ def test_the_jacobian_of_a_new_angles_world(phi):
 # --- measurements ---
 
 
-def model(rig, coordinates=None, anchors=None) -> Measurement:
-    """With landmarks in world coordinates, which have no anchors, unless others are given."""
-    anchors = np.zeros((0, 3, 4)) if anchors is None else anchors
-    return Measurement(RectifiedStereo.of(rig), coordinates or Euclidean(), anchors)
-
-
 def covariance_of(P: np.ndarray) -> Covariance:
     """Of a camera and landmarks with a joint covariance."""
     none = np.zeros((len(P) - CAMERA, 0)), np.zeros((0, 0)), np.zeros((0, 3, 3))
@@ -93,34 +87,29 @@ def covariance_of(P: np.ndarray) -> Covariance:
 
 @pytest.mark.parametrize("phi", ATTITUDES)
 def test_measurement_jacobians(phi):
-    """By the papers' [r, φ] and by the landmark, also where the pose has columns through the landmark's alone."""
+    """By the papers' [r, φ] and by the landmark; and what follows from H: H P, its transpose, and S."""
     rng = np.random.default_rng(2)
     camera = EulerCamera(np.concatenate([rng.standard_normal(3), phi, np.zeros(6)]), se3.so3_exp(np.ones(3)), False)
-    h = rng.uniform((-1, -1, 4), (1, 1, 10), (5, 3))
-    points, measured = se3.transform(camera.pose, h), model(RIG)
-    z, own = measured.at(camera.pose, points)
-    np.testing.assert_allclose(z, measured.stereo.project(h)[0], atol=1e-9)
-    lever = gauge_jacobian(Euclidean(), np.zeros((5, 3, 4)), points, points) @ camera.world()
-    J = Jacobian(own, lever, np.arange(5))
-    H = np.concatenate(J.times(covariance_of(np.eye(27))), axis=1)
-    for i in range(len(H)):
-        np.testing.assert_allclose(J.transposed_times(np.eye(len(H))[i]), np.delete(H[i], np.s_[6:12]), atol=1e-9)
+    h, P = rng.uniform((-1, -1, 4), (1, 1, 10), (5, 3)), positive(27, rng)
+    marks = FilterLandmarks.at(Euclidean(), np.arange(5), np.zeros((5, 3, 4)), se3.transform(camera.pose, h), 0)
+    s = replace(FilterState.first(camera, P[:12, :12]), landmarks=marks, covariance=covariance_of(P))
+    update = update_of(s, np.zeros((5, 3)), Euclidean(), 1)
+    np.testing.assert_allclose(update.at().z, RectifiedStereo.of(RIG).project(h)[0], atol=1e-9)
 
     def predicted(x):
-        return measured.at(replace(camera, x=np.append(x[:6], np.zeros(6))).pose, x[6:].reshape(-1, 3))[0]
+        return update.seen(camera.moved(x[:12]).pose, x)[0]
 
-    expected = jacobian(predicted, np.append(camera.x[:6], points.reshape(-1)))
-    np.testing.assert_allclose(np.delete(H, np.s_[6:12], axis=1), expected, rtol=1e-6, atol=1e-5)
-    P = positive(27, rng)
-    HP = J.times(covariance_of(P))
-    assert_equal_to_rounding(np.concatenate(HP, axis=1), H @ P)
-    S = J.covariance(*HP, 0.25)
-    np.testing.assert_allclose(np.tril(S), np.tril(H @ P @ H.T + 0.25 * np.eye(15)), rtol=1e-9, atol=1e-6)
-    blocks = np.array([P[12 + 3 * i : 15 + 3 * i, 12 + 3 * i : 15 + 3 * i] for i in range(5)])
-    found = J.own_covariances(P[:6, :6], P[12:, :6].reshape(5, 3, 6), blocks)
-    for i in range(5):
-        rows = slice(3 * i, 3 * i + 3)
-        np.testing.assert_allclose(found[i], H[rows] @ P @ H[rows].T, rtol=1e-9, atol=1e-6)
+    H = jacobian(predicted, np.zeros(27))
+    found = Innovation.of(update, np.ones((5, 3), bool), update.at())
+    for i, row in enumerate(np.eye(15)):
+        np.testing.assert_allclose(found.transposed_times(row), update.among_measured(H[i]), rtol=1e-6, atol=1e-5)
+    expected = H @ P
+    np.testing.assert_allclose(
+        np.concatenate(found.HP, axis=1), expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max()
+    )
+    np.testing.assert_allclose(
+        found.S, expected @ H.T + 0.25 * np.eye(15), rtol=1e-5, atol=1e-6 * np.abs(found.S).max()
+    )
 
 
 # --- the landmarks' coordinates ---
@@ -199,7 +188,7 @@ def test_the_last_poses_are_kept():
     assert_equal_to_rounding(whole(covariance), M @ P @ M.T)
     g = numbers([0, 1, 2, 3, 4, 5, 6, 8, 12])
     back = covariance.rearranged(np.array([0, 1, 2, 3, 4, 5, 6, 8, 12]), np.array([7, 10]), np.array([11]))
-    assert_equal_to_rounding(back.dense, P[np.ix_(g, g)])
+    assert_equal_to_rounding(dense(back), P[np.ix_(g, g)])
     found = np.delete(back.head[12:24, : 24 + 27], np.s_[12:24], axis=1)
     assert_equal_to_rounding(found, np.concatenate([poses[2], poses[1]]) @ P[:6, g])
     assert_equal_to_rounding(back.joint_poses(np.eye(6), 3)[-6:, -6:], P[:6, :6])
@@ -267,7 +256,7 @@ def in_deviations(P: np.ndarray, of: np.ndarray) -> np.ndarray:
 
 def test_the_prediction_is_as_printed():
     s, _, _ = state_of(4, InverseDepth())
-    camera, P, dt = s.camera.x + 0.1 * np.arange(12.0) / 12, s.covariance.dense, 0.25
+    camera, P, dt = s.camera.x + 0.1 * np.arange(12.0) / 12, dense(s.covariance), 0.25
     s = replace(s, camera=replace(s.camera, x=camera))
     found = s.advanced(dt, s.camera.advanced(MODELS, P[:12, :12], dt))
     A, W = np.eye(len(P)), np.zeros((len(P), 6))
@@ -276,30 +265,29 @@ def test_the_prediction_is_as_printed():
     linear, angular = MODELS.motion.velocity_variance(dt)
     assert_equal_to_rounding(found.camera.x, A[:12, :12] @ camera)
     expected = A @ P @ A.T + W @ np.diag([linear] * 3 + [angular] * 3) @ W.T
-    assert_equal_to_rounding(in_deviations(found.covariance.dense, expected), in_deviations(expected, expected))
+    assert_equal_to_rounding(in_deviations(dense(found.covariance), expected), in_deviations(expected, expected))
 
 
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_the_update_is_the_joseph_form(coordinates):
     s, h, rng = state_of(12, coordinates)
-    P, marks = s.covariance.dense, s.landmarks
+    P, marks = dense(s.covariance), s.landmarks
     z = RIG.project_stereo(h + 0.01 * rng.standard_normal(h.shape))[0] + 0.3 * rng.standard_normal((12, 3))
-    measured = model(RIG, coordinates, marks.anchors)
     update = update_of(s, z, coordinates, 1)
     solution = solve(update, gate(update))
     assert solution.used.all()
     x = np.concatenate([s.camera.x, marks.c.reshape(-1)])
 
-    def predict(x):
-        return measured.at(replace(s.camera, x=x[:12]).pose, x[12:].reshape(-1, 3))[0].reshape(-1)
+    def predict(change):
+        return update.seen(s.camera.moved(change[:12]).pose, change)[0].reshape(-1)
 
-    H, nu = jacobian(predict, x, 1e-5), z.reshape(-1) - predict(x)
+    H, nu = jacobian(predict, 0 * x, 1e-5), z.reshape(-1) - predict(0 * x)
     S = H @ P @ H.T + 0.25 * np.eye(36)
     K = np.linalg.solve(S, H @ P).T
     J = np.eye(len(P)) - K @ H
     joseph = J @ P @ J.T + 0.25 * K @ K.T
     after = s.corrected(solution)
-    difference = in_deviations(after.covariance.dense - joseph, joseph)
+    difference = in_deviations(dense(after.covariance) - joseph, joseph)
     assert np.abs(difference).max() < 1e-5  # what the differences leave in H
     found = np.concatenate([after.camera.x, after.landmarks.c.reshape(-1)])
     np.testing.assert_allclose(found, x + K @ nu, rtol=1e-6, atol=1e-6)
@@ -310,7 +298,7 @@ def test_the_update_is_the_joseph_form(coordinates):
 def test_augmentation_is_the_derivative_of_triangulation(coordinates):
     s, _, _ = state_of(3, coordinates)
     h = np.array([[0.4, -0.3, 6.0]])
-    noise, P, camera = RIG.triangulation_covariance(h, 0.5), s.covariance.dense, s.camera.x
+    noise, P, camera = RIG.triangulation_covariance(h, 0.5), dense(s.covariance), s.camera.x
     after = s.placed(coordinates, np.array([9]), h, noise)
 
     def of(x):
@@ -322,7 +310,7 @@ def test_augmentation_is_the_derivative_of_triangulation(coordinates):
     own = J[:, :6] @ P[:6, :6] @ J[:, :6].T + J[:, 6:] @ noise[0] @ J[:, 6:].T
     expected = np.block([[P, cross.T], [cross, own]])
     # central differences by 1e-6 leave 1e-10 in J
-    found = in_deviations(after.covariance.dense, expected)
+    found = in_deviations(dense(after.covariance), expected)
     np.testing.assert_allclose(found, in_deviations(expected, expected), atol=1e-7)
     np.testing.assert_allclose(after.landmarks.points[-1], (s.pose @ np.append(h[0], 1))[:3], atol=1e-12)
 
@@ -336,7 +324,7 @@ def far_off(iterations: int, guess: bool = False) -> tuple[FilterState, Update]:
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (12, 3))
     s = FilterState.first(*EulerCamera.first(MODELS, False))
     truth = s.camera.moved(np.concatenate([[0.3, -0.2, 1.5, 0.05, 0.15, -0.1], np.zeros(6)])).pose
-    z = model(RIG).at(truth, points)[0] + 0.5 * rng.standard_normal((12, 3))
+    z = RIG.project_stereo(se3.transform(se3.inverse(truth), points))[0] + 0.5 * rng.standard_normal((12, 3))
     marks = FilterLandmarks.at(
         Euclidean(), np.arange(12), np.zeros((12, 3, 4)), points + 0.05 * rng.standard_normal((12, 3)), 0
     )
@@ -358,8 +346,8 @@ def corrected(s: FilterState, update: Update) -> np.ndarray:
 
 def residuals(s: FilterState, update: Update, change: np.ndarray) -> np.ndarray:
     """Whitened: of the prior, whose covariance is diagonal, and of the measurements."""
-    z, _ = update.measurement.at(s.camera.moved(change[:12]).pose, s.landmarks.c + change[12:].reshape(-1, 3))
-    prior = change / np.sqrt(np.diag(s.covariance.dense))
+    z, _ = update.seen(s.camera.moved(change[:12]).pose, change)
+    prior = change / np.sqrt(np.diag(dense(s.covariance)))
     return np.concatenate([prior, ((update.z - z) / update.sigma).reshape(-1)])
 
 
@@ -367,7 +355,7 @@ def residuals(s: FilterState, update: Update, change: np.ndarray) -> np.ndarray:
 def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch):
     monkeypatch.setattr("backends.ekf.solve._LINEAR", 1e-6)
     s, update = far_off(30, guess)
-    deviation = np.sqrt(np.diag(s.covariance.dense))
+    deviation = np.sqrt(np.diag(dense(s.covariance)))
     solution = ungated(update)
     assert solution.used.all()
     cost = lambda x: residuals(s, update, deviation * x)  # noqa: E731
@@ -384,26 +372,35 @@ def test_a_step_that_lowers_no_cost_is_no_information(monkeypatch):
         ungated(far_off(5)[1])
 
 
+def test_a_shortened_step_shortens_the_velocities_too(monkeypatch):
+    """They went all the way while the pose stayed behind."""
+    _, update = far_off(5)
+    costs = iter([1.0, 2.0, 0.5])  # where it is, after the whole step, after half of it
+    monkeypatch.setattr("backends.ekf.solve.Linearisation.cost", lambda self, update, rows: next(costs))
+    change = 0.01 * np.random.default_rng(0).standard_normal(48)
+    after, step = _descend(update, np.ones((12, 3), bool), update.at(), np.zeros(42), change)
+    np.testing.assert_allclose(step, 0.5 * change, atol=1e-15)
+    np.testing.assert_allclose(after.change[6:], 0.5 * change[6:], atol=1e-12)
+    assert (after.change[:6] == 0).all()
+
+
 def test_what_is_taken_out_was_never_there():
     """A landmark's distance from what the others predict is the fall of the NIS when it is left out."""
     s, update = far_off(1)
 
-    def whitened(update: Update) -> Whitened:
-        innovation = gate(replace(update, gate_probability=1 - 1e-15)).innovation
-        return Whitened.of(innovation, np.zeros_like(innovation.rows))
+    def whitened(update: Update, used: np.ndarray) -> Whitened:
+        return Whitened.of(gate(replace(update, gate_probability=1 - 1e-15)).innovation, used)
 
-    every, P = whitened(update), s.covariance.dense
+    every, P = whitened(update, np.ones(12, bool)), dense(s.covariance)
     for gone in ([0], [5], [11], [3, 4, 8]):
         mask = np.isin(np.arange(12), gone)
-        without = every.without(mask)
+        without = whitened(update, ~mask)
         if len(gone) == 1:
             fall = every.w @ every.w - without.w @ without.w
             assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
-        fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)))
-        HP = [np.concatenate(one.innovation.HP, axis=1) for one in (without, fresh)]
-        np.testing.assert_allclose(without.y @ HP[0], fresh.y @ HP[1], rtol=1e-6, atol=1e-9)
+        fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)), np.ones(12, bool))
         np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
-        V, W = without.whitened(HP[0]), fresh.whitened(HP[1])
+        V, W = (np.concatenate(one.lost(update)) for one in (without, fresh))
         np.testing.assert_allclose(in_deviations(V @ V.T, P), in_deviations(W @ W.T, P), atol=1e-9)
 
 
@@ -414,9 +411,12 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     s, _, rng = state_of(12, coordinates)
     s = replace(s, camera=replace(s.camera, transports=transports))
     update = update_of(s, np.full((12, 3), 100.0), coordinates, 5, 0.9)
-    for T in (None, s.pose @ se3.exp(np.array([0.05, -0.1, 0.02, 0.5, -0.2, 0.3]))):
-        at = update.at(T, 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c)
-        H = np.concatenate(Innovation.of(update, np.ones((12, 3), bool), at).H.times(covariance_of(np.eye(48))), axis=1)
+    update = replace(update, covariance=covariance_of(np.eye(48)))
+    there = s.camera.at(s.pose @ se3.exp(np.array([0.05, -0.1, 0.02, 0.5, -0.2, 0.3])))
+    for camera in (None, there):
+        change = 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c
+        at = update.at(camera, np.append(np.zeros(12), change))
+        H = np.concatenate(Innovation.of(update, np.ones((12, 3), bool), at).HP, axis=1)
         U = np.zeros((48, 6))
         U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
         U[12:] = s.landmarks.gauge.reshape(-1, 6)

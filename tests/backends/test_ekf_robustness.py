@@ -23,6 +23,7 @@ from tests.backends.ekf_runs import (
     ROLL,
     STILL,
     YAW,
+    dense,
     errors,
     nees,
     predicted,
@@ -88,7 +89,7 @@ def test_a_gap_of_any_length(make, gap):
             report = step(backend, stamp + (gap if k >= 15 else 0), seen, known)
             assert k == 0 or len(report.used) > 5 * len(report.rejected)
         assert errors(backend, poses)[1] < 0.05
-        P = backend.state.covariance.dense
+        P = dense(backend.state.covariance)
         assert np.linalg.eigvalsh(P / np.sqrt(np.outer(P.diagonal(), P.diagonal()))).min() > 0
 
 
@@ -132,7 +133,7 @@ def test_an_update_that_ends_a_great_uncertainty_keeps_all_its_digits(landmarks)
     backend.predict(1e9 + 1e5)
     report = backend.update(seen(ids[::2]))
     assert report.status is UpdateStatus.OK and len(report.used) > 15
-    P = backend.state.covariance.dense
+    P = dense(backend.state.covariance)
     deviation = np.sqrt(P.diagonal())
     assert np.linalg.eigvalsh(P / np.outer(deviation, deviation))[0] > 0
     assert (np.linalg.eigvalsh(backend.estimate().covariances)[:, 0] > 0).all()
@@ -311,5 +312,5 @@ def test_an_interrupted_call_happened_or_did_not(monkeypatch):
     assert count > 100
     np.testing.assert_array_equal(often.trajectory().poses, whole.trajectory().poses)
     np.testing.assert_array_equal(often.trajectory().stamps, whole.trajectory().stamps)
-    np.testing.assert_array_equal(often.state.covariance.dense, whole.state.covariance.dense)
+    np.testing.assert_array_equal(dense(often.state.covariance), dense(whole.state.covariance))
     np.testing.assert_array_equal(often.estimate().positions, whole.estimate().positions)

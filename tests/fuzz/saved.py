@@ -74,7 +74,7 @@ def _use_map(path: Path, backend: str) -> None:
 def _use_recording(path: Path, backend: str) -> None:
     recording = load_recording(path)
     if len(recording) <= 20:
-        config = replace(SystemConfig.for_kind(recording.kind, None, backend), models=recording.models)
+        config = replace(SystemConfig.for_kind(recording.kind, None), models=recording.models)
         run_recording(recording, RunOptions(backend, "recording", config, path.parent / "out"))
 
 

@@ -74,7 +74,7 @@ def _with(config: Any) -> SystemConfig:
 def texts(rng: np.random.Generator, folder: Path) -> None:
     """``section.key=value`` texts, and trees of JSON with hostile leaves."""
     backend = choose(rng, ("ekf", "smoother"))
-    default = SystemConfig.for_kind(choose(rng, ("handheld", "driving")), "surf", backend)
+    default = SystemConfig.for_kind(choose(rng, ("handheld", "driving")))
     chosen = [_setting(rng, default.to_json(), backend) for _ in range(int(rng.integers(1, 4)))]
     config = default.with_settings(chosen)
     if config.objects.database:

@@ -56,7 +56,7 @@ def functions(rng: np.random.Generator, folder: Path) -> None:
         lambda: StereoSlam(world.rig, None, "ekf").process_features(value),
         lambda: list(StereoSlam(world.rig, "surf", "ekf").run(value)),
         lambda: list(StereoSlam(world.rig, "surf", "ekf").run([*world, value], overlap=bool(rng.random() < 0.5))),
-        lambda: SystemConfig.for_kind(value, other, "ekf"),
+        lambda: SystemConfig.for_kind(value, other),
         lambda: SystemConfig().with_settings(value),
         lambda: SystemConfig.from_json(value),
     )

@@ -41,7 +41,7 @@ def run(backend: str, frames: int, images: int, threads: int) -> dict[str, str]:
     seen = StereoSlam(sequence.rig, None, backend)
     results = [seen.process_features(sequence.observations(FIRST + k)) for k in range(frames)]
     bodies = [body.estimate.T_world_object for result in results for body in result.objects]
-    config = SystemConfig.for_kind(sequence.kind, "surf", backend).with_settings([f"frontend.threads={threads}"])
+    config = SystemConfig.for_kind(sequence.kind).with_settings([f"frontend.threads={threads}"])
     shown = StereoSlam(sequence.rig, "surf", backend, config=config)
     for frame in sequence.frames(FIRST, FIRST + images):
         shown.process(frame)

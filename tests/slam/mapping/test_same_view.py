@@ -25,7 +25,7 @@ def test_a_camera_that_something_large_took_along_comes_back(backend):
     """It stands; something passes, covers all of its view for a second, and moves by more than a metre meanwhile."""
     world, mover = Cloud(150), Cloud(600, seed=9)
     mover.points = mover.points * (3, 0.8, 0.15) + (0, 0, 1.2)
-    system = StereoSlam(RIG, None, backend, config=SystemConfig.for_kind("handheld", None, backend))
+    system = StereoSlam(RIG, None, backend, config=SystemConfig.for_kind("handheld", None))
     results = []
     for k in range(85):
         here, _ = world.features(np.eye(4), k / 30, 0.3)

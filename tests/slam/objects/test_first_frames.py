@@ -70,7 +70,7 @@ def test_landmarks_without_a_right_pixel_are_not_tested_and_few_say_nothing():
 def test_first_sights_are_of_the_frame_in_which_landmarks_joined_the_map():
     """Also of those that are not found again in the next frame; their displacement is taken for the true time."""
     sequence = slam.open_sequence("synthetic:aisle?density=40")
-    system = slam.StereoSlam(sequence.rig, None, "ekf", config=SystemConfig.for_kind(sequence.kind, None, "ekf"))
+    system = slam.StereoSlam(sequence.rig, None, "ekf", config=SystemConfig.for_kind(sequence.kind, None))
     joined = {}
     for k in range(8):
         result = system.process_features(sequence.simulate(k).features)
@@ -98,7 +98,7 @@ def test_boxes_that_move_from_the_first_frame_on_draw_the_camera_less(backend):
 def error_after(frames, seed, backend, tested):
     """Distance of the camera from where it is [m] after so many frames before moving boxes."""
     sequence = slam.open_sequence(f"synthetic:boxes?density=300&sigma=0.2&seed={seed}&layout={seed}")
-    system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, None, backend))
+    system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, None))
     if not tested:
         system.objects.newly_moving = lambda *_: np.zeros(0, np.int64)
     poses = [system.process_features(sequence.simulate(k).features).estimate.T_world_left for k in range(frames + 1)]

@@ -13,7 +13,7 @@ from tests.fuzz.runs import disk_of
 @pytest.fixture(scope="module")
 def steps():
     sequence = slam.open_sequence("synthetic:desk?frames=2")
-    system = slam.StereoSlam(sequence.rig, config=SystemConfig.for_kind("handheld", "surf", "ekf"))
+    system = slam.StereoSlam(sequence.rig, config=SystemConfig.for_kind("handheld"))
     return system, [(frame, system.process(frame)) for frame in sequence]
 
 

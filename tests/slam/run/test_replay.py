@@ -37,7 +37,7 @@ def online(results):
 @pytest.mark.parametrize("rig", ["rectified", "toedin"])
 def test_a_run_replayed_into_the_same_back_end_is_the_same_run(rig):
     desk = slam.open_sequence(f"synthetic:desk?frames={FRAMES}&rig={rig}")
-    config = SystemConfig.for_kind("handheld", None, "ekf").with_settings(["models.pixel_sigma=0.5"])  # the world's
+    config = SystemConfig.for_kind("handheld", None).with_settings(["models.pixel_sigma=0.5"])  # the world's
     system = StereoSlam(desk.rig, None, "ekf", config=config)
     results = [system.process_features(desk.observations(k)) for k in range(FRAMES)]
     recorded = record(results, desk.rig, system.config.models, desk.name, desk.ground_truth)

@@ -80,8 +80,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory):
 
 
 def system_for(sequence, backend: object, settings: tuple[str, ...] = ()) -> slam.StereoSlam:
-    name = backend if isinstance(backend, str) else None
-    config = SystemConfig.for_kind(sequence.kind, None, name).with_settings(
+    config = SystemConfig.for_kind(sequence.kind, None).with_settings(
         ["map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off", "self_calibration.enabled=false",
          *settings]
     )  # fmt: skip

@@ -84,7 +84,7 @@ def test_it_says_how_little_is_known_of_where_that_map_is(run):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_camera_that_sees_another_place_in_each_frame_goes_on(backend):
     """Pictures of a slide show: nothing is ever measured, and no number overflows."""
-    config = slam.config.SystemConfig.for_kind("handheld", None, backend)
+    config = slam.config.SystemConfig.for_kind("handheld", None)
     system = StereoSlam(RIG, None, backend, config=config)
     frames = [Cloud(150, seed=k).features(T, k / 30, 0.3)[0] for k, T in enumerate(path(30))]
     results = [system.process_features(features) for features in frames]
