@@ -140,7 +140,9 @@ def test_swapped_cameras_of_an_unrectified_rig():
     left = PinholeCamera(250.0, 251.0, 170.0, 110.0, 320, 240, "radtan", (-0.1, 0.02, 0.001, 0.0))
     right = PinholeCamera(255.0, 256.0, 150.0, 130.0, 320, 240, "radtan", (-0.12, 0.02, 0.0, 0.001))
     rig = slam.StereoRig(left, right, turn, turn.T @ np.array([-0.12, 0.004, 0.002]))
-    views = [points_of(seen_by(image, c, R)) for image, c, R in ((FRAME.left, left, np.eye(3)), (FRAME.right, right, turn))]
+    views = [
+        points_of(seen_by(image, c, R)) for image, c, R in ((FRAME.left, left, np.eye(3)), (FRAME.right, right, turn))
+    ]
     rig = slam.StereoRig(left, right, turn, RIG.b)
     good, bad = pair_geometry(rig, *views, 1.5), pair_geometry(rig, *views[::-1], 1.5)
     assert good.conclusive and not good.swapped and not good.rows_differ
