@@ -149,7 +149,8 @@ class StereoSlam:
     @property
     def landmarks(self) -> LandmarkTable | None:
         """The landmarks' bookkeeping after the last step; None before the first."""
-        return self._state.landmarks
+        tracks = self._state.tracks
+        return None if tracks is None else tracks.landmarks()
 
     @property
     def atlas(self) -> Atlas:
@@ -320,10 +321,10 @@ class StereoSlam:
         with self._stepping, self._named("the map"):
             if self._state.prior_map is not None:
                 return self._state.prior_map
-            estimate = self._estimate(of_map=True) if self.landmarks is not None else None
-            if estimate is None or self.landmarks is None:
+            estimate, landmarks = self._estimate(of_map=True), self.landmarks
+            if landmarks is None:
                 raise SlamError("there is no map yet: no frame was processed")
-            rows = self.landmarks.in_world(self.atlas.T_map_odom)
+            rows = landmarks.in_world(self.atlas.T_map_odom)
             keyframes = (k.corrected(self.calibration.applied, self._session.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
             return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas)

@@ -15,7 +15,7 @@ from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
 from slam.models import ObjectModels
 from slam.objects.belief import EVEN, BodyBelief, when_measured, when_missed
 from slam.objects.track_kernels import windows_in_body
-from slam.objects.tracks import Tracks
+from slam.tracks.table import Tracks
 
 _YOUNG = 4  # frames in which a body moves as it did when it was found
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side

@@ -11,7 +11,7 @@ from slam.object_data import MovingObject, ObjectEstimate
 from slam.objects.belief import EVEN, BodyBelief
 from slam.objects.bodies import CUT, Body, outermost
 from slam.objects.config import ObjectsConfig
-from slam.objects.tracks import Tracks
+from slam.tracks.table import Tracks
 
 
 def reported(bodies: dict[int, Body], tracks: Tracks, config: ObjectsConfig) -> tuple[MovingObject, ...]:
@@ -47,7 +47,7 @@ def _enclosing(points: Array) -> Array:
 def _report(body: Body, belief: BodyBelief, tracks: Tracks) -> MovingObject:
     estimate = belief.estimate
     mine = tracks.body == body.id
-    rows = tracks.row[mine & tracks.seen]
+    rows = tracks.row[mine & tracks.found]
     points = tracks.local[mine & tracks.sure]
     T, new = estimate.T_world_object, belief.since == estimate.stamp
     motion = np.eye(4) if new else T @ inverse(body.T_before)

@@ -16,7 +16,8 @@ from slam.objects.frame import Frame
 from slam.objects.points import compact
 from slam.objects.regions import Region
 from slam.objects.scene import LAG, Scene, classify_scene, displacements, known_well
-from slam.objects.tracks import Tracks, constant_velocity, fit_velocities
+from slam.objects.fits import constant_velocity, fit_velocities
+from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
@@ -39,7 +40,7 @@ def find_groups(frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]) -> Fou
     """
     c = frame.setup.config
     least = LAG * frame.dt * c.min_speed
-    rows, scene = _classified(frame, tracks, np.flatnonzero(tracks.seen & (tracks.body < 0)))
+    rows, scene = _classified(frame, tracks, np.flatnonzero(tracks.found & (tracks.body < 0)))
     groups = [rows[g.members][~tracks.still[rows[g.members]]] for g in scene.groups]
     moving = [members for g, members in zip(scene.groups, groups) if g.moves(c.group_test, least)]
     parts = [

@@ -7,14 +7,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from slam.chi_square import SIGMAS
-from slam.data import BoolArray, IdArray, IndexArray
+from slam.data import BoolArray, IndexArray
+from slam.geometry.arrays import among
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.frame import Frame
 from slam.objects.pixel_kernels import within_reach
 from slam.objects.regions import Region
 from slam.objects.track_kernels import inverses, predicted_pixels
-from slam.objects.tracks import Tracks
+from slam.tracks.table import Tracks
 from slam.tracks import follow as features_of_tracks
 
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
@@ -22,13 +23,13 @@ _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to 
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 
 
-def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], frame: Frame, landmark: IdArray) -> None:
-    """Find each track's feature in this frame; sets rows, landmarks, descriptors and misses, in place.
+def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], frame: Frame) -> None:
+    """Find the features of the tracks that have none yet; sets rows, looks and misses, in place.
 
-    A feature that was matched to a landmark (`landmark` (N,), −1 for none) continues that landmark's track. The others
-    are looked for where their fit (or their body's motion) says, in windows as wide as that is uncertain. What is left,
-    and was not known for long enough to have a velocity, is looked for where the body or the region takes it on which
-    it lies, and then as far as `max_speed` allows.
+    A landmark that was found has its feature already. The others are looked for where their fit (or their body's
+    motion) says, in windows as wide as that is uncertain. What is left, and was not known for long enough to have a
+    velocity, is looked for where the body or the region takes it on which it lies, and then as far as `max_speed`
+    allows.
 
     Members of bodies take over their feature's descriptor even if `slam.objects.recovery.located` does not confirm the
     match afterwards, because the body's pose is wrong more often than the match. Members of a body that was not
@@ -36,16 +37,14 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], fr
     Features matched with them stay available to free tracks until the body is located. Otherwise nothing that newly
     comes into view of such a body would be detected.
     """
-    tracks.row[:] = -1
-    alive = np.flatnonzero(tracks.ids >= 0)
+    alive = np.flatnonzero(tracks.number >= 0)
     _advance(tracks, bodies, alive, frame.dt)
     lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
-    taken = np.zeros(len(frame.features), bool)
-    _continue_landmarks(tracks, landmark, taken)
+    taken = among(len(frame.features), tracks.row[tracks.row >= 0])
     expected = alive[~lost & (tracks.row[alive] < 0)]
     _look(tracks, frame, expected, tracks.position[expected], tracks.covariance[expected], taken)
     of_lost = alive[lost]
-    held = tracks.row[np.setdiff1d(np.flatnonzero(tracks.seen & (tracks.body >= 0)), of_lost)]
+    held = tracks.row[np.setdiff1d(np.flatnonzero(tracks.found & (tracks.body >= 0)), of_lost)]
     _carried_along(tracks, bodies, regions, frame, taken)
     _far(tracks, frame, taken)
     unclaimed = of_lost[tracks.row[of_lost] < 0]
@@ -55,15 +54,10 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], fr
             np.zeros(len(taken), bool),
         )  # fmt: skip
         tracks.row[unclaimed[np.isin(tracks.row[unclaimed], held)]] = -1
-    seen = np.flatnonzero(tracks.seen)
-    tracks.missed += 1
-    tracks.missed[seen] = 0
-    named = seen[landmark[tracks.row[seen]] >= 0]
-    ids = landmark[tracks.row[named]]
-    tracks.landmark[np.isin(tracks.landmark, ids)] = -1  # one track a landmark
-    tracks.landmark[named] = ids
-    seen = np.setdiff1d(seen, of_lost)
-    tracks.descriptors[seen] = frame.features.descriptors[tracks.row[seen]]
+    found = np.flatnonzero(tracks.found)
+    tracks.unfound[:] += 1
+    tracks.unfound[found] = 0
+    tracks.renew_looks(np.setdiff1d(found, of_lost), frame.features)
 
 
 def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: float) -> None:
@@ -77,16 +71,6 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
         own = inverses(tracks.local_information[mine], 0.0, _UNKNOWN)
         spread = own + J @ body.covariance @ np.swapaxes(J, 1, 2)
         tracks.position[mine], tracks.covariance[mine] = transform(body.T, tracks.local[mine]), R @ spread @ R.T
-
-
-def _continue_landmarks(tracks: Tracks, landmark: IdArray, taken: BoolArray) -> None:
-    """The features of landmarks (N,) that have a track, which are then `taken`."""
-    matched = np.flatnonzero(landmark >= 0)
-    if len(matched):
-        matched = matched[np.argsort(landmark[matched])]
-        row = matched[np.minimum(np.searchsorted(landmark[matched], tracks.landmark), len(matched) - 1)]
-        found = np.flatnonzero(landmark[row] == tracks.landmark)
-        _enter(tracks, found, row[found], taken)
 
 
 def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covariances: Array, taken: BoolArray) -> None:
@@ -147,7 +131,7 @@ def _carried_along(
 
 def _young(tracks: Tracks, most: int) -> IndexArray:
     """Free tracks that were seen in the last frame, not in this, with no more measurements than `most`."""
-    lost = np.flatnonzero((tracks.ids >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.missed == 0))
+    lost = np.flatnonzero((tracks.number >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.unfound == 0))
     return np.asarray(lost[tracks.count(lost) <= most])
 
 

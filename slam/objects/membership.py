@@ -21,7 +21,8 @@ from slam.objects.config import ObjectsConfig
 from slam.objects.frame import Frame
 from slam.objects.points import MAX_REJECTIONS
 from slam.objects.track_kernels import inverses, squares, weighted_means
-from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, times_vectors
+from slam.objects.fits import EXPLAINED, fit_positions, times_vectors
+from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
@@ -110,7 +111,7 @@ def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
         return
     tracks.position[rows] = transform(body.T, tracks.local[rows])
     tracks.forget_past(rows)
-    tracks.missed[rows] = 1
+    tracks.unfound[rows] = 1
 
 
 def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
@@ -135,7 +136,7 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
         gains[body.id] = _expel(body, tracks, config)
     if not bodies:
         return gains
-    free = np.flatnonzero((tracks.body < 0) & tracks.seen & ~tracks.still)
+    free = np.flatnonzero((tracks.body < 0) & tracks.found & ~tracks.still)
     free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
     for body in bodies.values():
@@ -172,7 +173,7 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     That is the `MembershipTest.gain` less what the body's poses, fitted to its members, gain by chance.
     """
     mine = np.flatnonzero(tracks.body == body.id)
-    v, seen = membership_test(body, tracks, mine), tracks.seen[mine]
+    v, seen = membership_test(body, tracks, mine), tracks.found[mine]
     most_fit = v.fits[seen].sum() > _MOST * seen.sum()
     unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
@@ -185,7 +186,7 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
         mine = mine[~wrong]
     if len(mine) > config.max_points:
         worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
-        order = np.lexsort((worth, -tracks.missed[mine]))
+        order = np.lexsort((worth, -tracks.unfound[mine]))
         remove_members(tracks, mine[order[: len(mine) - config.max_points]], body)
     stay = seen & ~wrong
     return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
@@ -206,7 +207,7 @@ def tracks_on_bodies(
     A track inside a body's extent lies on it, unless it is known to stand still. Tracks on a body that is not proven
     yet belong to the second group.
     """
-    seen, known = tracks.seen, tracks.body >= 0
+    seen, known = tracks.found, tracks.body >= 0
     on = np.zeros(len(tracks), bool)
     for body in bodies.values():
         if body.proven:
@@ -226,9 +227,9 @@ def tracks_on_bodies(
 
 def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
     """Rows of the seen tracks that belong to a body, or lie on or near it and belong to none."""
-    free = np.flatnonzero(tracks.seen & (tracks.body < 0))
+    free = np.flatnonzero(tracks.found & (tracks.body < 0))
     near = free[_distances(body, tracks, free, margin) < _NEAR]
-    return np.concatenate([np.flatnonzero(tracks.seen & (tracks.body == body.id)), near])
+    return np.concatenate([np.flatnonzero(tracks.found & (tracks.body == body.id)), near])
 
 
 def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:

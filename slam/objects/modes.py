@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from slam.data import Estimate, IdArray, StereoFeatures
@@ -12,10 +10,7 @@ from slam.geometry.se3 import Array
 from slam.interfaces import Backend
 from slam.object_data import MotionLabels, MovingObject
 from slam.objects.revision import CorrectRows
-
-#: Gives the positions (K, 3) of landmarks in the world [m] by their ids (K,).
-Places = Callable[[IdArray], Array]
-
+from slam.tracks.table import Tracks
 
 class ObjectDetector:
     """What the system asks of a detector of moving objects in every step; by itself it takes everything for still.
@@ -23,21 +18,21 @@ class ObjectDetector:
     `newly_moving` and `suspects` are asked before the back end's update, `step` comes after it.
     """
 
+    #: Number of frames for which the table of tracks keeps what it measured.
+    window: int = 0
     #: Ids of landmarks that may move: they do not measure the camera's next pose.
     suspects: IdArray = np.zeros(0, np.int64)
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
-        T_world_left: Array,
-    ) -> IdArray:  # fmt: skip
+        self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
+    ) -> IdArray:
         """Ids of landmarks that move in the run's first frames, before it is known what moves: see `suspects`.
 
         Args:
+            tracks: the table of tracks, as the last frame left it.
             features: of the frame, before the back end's update.
-            ids: of the landmarks found in it (K,).
+            at: rows in the table of the landmarks found in it (K,).
             rows: of their features (K,).
-            ages: frames since each was last measured, or joined the map (K,).
-            places: gives the positions of landmarks (K, 3) in the world [m] by their ids.
             T_world_left: the camera's pose (4, 4), as far as it is known.
         """
         return np.zeros(0, np.int64)
@@ -45,24 +40,24 @@ class ObjectDetector:
     def restart(self) -> None:
         """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
 
-    def revise(self, correct: CorrectRows) -> None:
+    def revise(self, tracks: Tracks, correct: CorrectRows) -> None:
         """Take note that the rig's correction changes before the next frame.
 
         Args:
+            tracks: the table of tracks.
             correct: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
         """
 
     def step(
-        self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,
-        still: IndexArray,
+        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, still: IndexArray
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Say which features move, before any of them becomes a landmark, and report the bodies.
 
         Args:
             backend: gives the camera's last poses with their joint covariance.
+            tracks: the table of tracks; landmarks that were found have their feature already. Changed in place.
             features: of the frame.
             estimate: the camera's pose after the update.
-            landmark: id of the landmark that each feature was matched to (N,), -1 for none.
             still: rows of features that stay at their pixels while the camera stands.
         """
         none = np.zeros(0, np.intp)

@@ -17,7 +17,8 @@ from slam.objects.config import ObjectsConfig
 from slam.objects.estimator import BodyEstimator
 from slam.objects.frame import Frame
 from slam.objects.points import MIN_POINTS
-from slam.objects.tracks import AGREES, Tracks
+from slam.objects.fits import AGREES
+from slam.tracks.table import Tracks
 from slam.tracks.follow import match_everywhere
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
@@ -39,7 +40,7 @@ def located(
     rig, sigma, config = frame.setup.rig, frame.setup.sigma, frame.setup.config
     measured, seed = frame.local, frame.number
     members = np.flatnonzero(tracks.body == body.id)
-    mine = members[tracks.seen[members]]
+    mine = members[tracks.found[members]]
     rows = tracks.row[mine]
 
     def estimated(mine: NDArray[np.intp], rows: NDArray[np.intp], T: Array | None = None) -> BodyBelief | None:
@@ -66,16 +67,16 @@ def located(
     tracks.row[members] = -1
     if belief is None or not belief.estimate.measured:
         return belief
-    agrees = np.isin(tracks.ids[mine], belief.estimate.used)
-    taken = among(len(features), tracks.row[tracks.seen])
+    agrees = np.isin(tracks.number[mine], belief.estimate.used)
+    taken = among(len(features), tracks.row[tracks.found])
     tracks.row[members] = np.where(taken[followed], -1, followed)  # those that were not seen stay at −1
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     good, matched = mine[agrees], rows[agrees]
     measured_now = among(len(features), matched)
     tracks.row[members[measured_now[followed] & (followed >= 0)]] = -1
-    free = np.flatnonzero((tracks.body < 0) & tracks.seen)
+    free = np.flatnonzero((tracks.body < 0) & tracks.found)
     tracks.give_up(free[measured_now[tracks.row[free]]])
-    tracks.row[good], tracks.missed[good] = matched, 0
+    tracks.row[good], tracks.unfound[good] = matched, 0
     tracks.descriptors[good] = features.descriptors[matched]
     return belief
 
@@ -85,10 +86,10 @@ def observed(
     T: Array | None = None,
 ) -> ObjectObservations:  # fmt: skip
     """A body's tracks (K,) as the features of these rows, with a guess of its pose (4, 4) where there is one."""
-    order = np.argsort(tracks.ids[mine])
+    order = np.argsort(tracks.number[mine])
     rows = rows[order]
     return ObjectObservations(
-        body.id, tracks.ids[mine[order]], features.uv_left[rows], features.uv_right[rows], T, body.velocity,
+        body.id, tracks.number[mine[order]], features.uv_left[rows], features.uv_right[rows], T, body.velocity,
         np.sqrt(body.velocity_covariance.diagonal()),
     )  # fmt: skip
 
@@ -133,7 +134,7 @@ def _by_descriptors(
     For a body whose position is unknown, because it was out of view for long, weaker matches are accepted, and the fit
     decides. Features of free tracks may be matched, too: such tracks may have started on the body's points.
     """
-    taken = among(len(features), tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)])
+    taken = among(len(features), tracks.row[tracks.found & (tracks.body >= 0) & (tracks.body != body.id)])
     free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
     if len(mine) < MIN_POINTS or len(free) < MIN_POINTS:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)

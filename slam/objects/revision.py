@@ -12,7 +12,8 @@ import numpy as np
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.objects.bodies import Body
-from slam.objects.tracks import Tracks, times_vectors
+from slam.objects.fits import times_vectors
+from slam.tracks.table import Tracks
 
 CorrectRows = Callable[[Array], Array]
 
@@ -33,7 +34,7 @@ def revise_tracks(
     rows, slots = np.nonzero(tracks.dof)
     points = tracks.anchor[rows] + tracks.p[rows, slots]
     tracks.p[rows, slots] += _shifts(points, poses[slots], rig, correct)
-    alive = np.flatnonzero(tracks.ids >= 0)
+    alive = np.flatnonzero(tracks.number >= 0)
     shift = _shifts(tracks.position[alive], np.broadcast_to(poses[slot], (len(alive), 4, 4)), rig, correct)
     tracks.position[alive] += shift
     tracks.older_b[alive] += times_vectors(tracks.older_A[alive], shift)

@@ -1,6 +1,6 @@
 """Compiled loops over tracks: 3x3 matrices are worked through in place of many small batches of arrays.
 
-Windows are those of `slam.objects.tracks.Tracks`: information ``A`` (N, W, 3, 3) and points ``p`` (N, W, 3) by slot;
+Windows are those of `slam.tracks.table.Tracks`: information ``A`` (N, W, 3, 3) and points ``p`` (N, W, 3) by slot;
 `rows` (M,) names the tracks. A fixed point fitted to a window is ``(Σ A)⁻¹ Σ A p``; a small share of the trace on the
 diagonal makes information invertible that knows nothing along the ray.
 """
@@ -147,7 +147,7 @@ def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, r
     """How far tracks went from the older to the recent frames of their windows: see `slam.objects.scene`.
 
     Args:
-        A: information by slot, and so on: see `slam.objects.tracks.Tracks`.
+        A: information by slot, and so on: see `slam.tracks.table.Tracks`.
         p: points by slot.
         dof: numbers measured by slot.
         older_A: information of what has left the window.

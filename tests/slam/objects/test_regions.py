@@ -15,7 +15,7 @@ from slam.objects import regions
 from slam.objects.config import ObjectsConfig
 from slam.objects.frame import Frame, Setup
 from slam.objects.regions import follow_regions
-from slam.objects.tracks import ConstantVelocity
+from slam.objects.fits import ConstantVelocity
 
 DT, WINDOW = 0.1, 12
 VELOCITY, START = np.array([0.5, 0.0, 5.0]), np.array([5.0, 0, 20])
