@@ -20,6 +20,7 @@ from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.config import ObjectsConfig
 from slam.objects.estimates import reported
 from slam.objects.estimator import FRAMES, BodyEstimator
+from slam.objects.fits import fit_positions, fit_velocities, make_room, record
 from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.merging import merge
@@ -29,7 +30,6 @@ from slam.objects.recovery import located, observed
 from slam.objects.regions import Region, follow_regions
 from slam.objects.revision import CorrectRows, revise_tracks
 from slam.objects.scene import Scene, displacements, moved_since
-from slam.objects.fits import fit_positions, fit_velocities, make_room, record
 from slam.tracks.table import Tracks
 
 _NONE: IndexArray = np.zeros(0, np.intp)

@@ -12,11 +12,11 @@ from slam.geometry.arrays import among
 from slam.geometry.se3 import Array, points_by_pose
 from slam.objects import membership
 from slam.objects.bodies import Body, in_body_axes, new_body
+from slam.objects.fits import constant_velocity, fit_velocities
 from slam.objects.frame import Frame
 from slam.objects.points import compact
 from slam.objects.regions import Region
 from slam.objects.scene import LAG, Scene, classify_scene, displacements, known_well
-from slam.objects.fits import constant_velocity, fit_velocities
 from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again

@@ -15,8 +15,8 @@ from slam.objects.frame import Frame
 from slam.objects.pixel_kernels import within_reach
 from slam.objects.regions import Region
 from slam.objects.track_kernels import inverses, predicted_pixels
-from slam.tracks.table import Tracks
 from slam.tracks import follow as features_of_tracks
+from slam.tracks.table import Tracks
 
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
@@ -86,23 +86,16 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covaria
     least = np.where(tracks.doubtful[rows], 0.5 * c.search_limit, c.search_radius)
     windows = features_of_tracks.Windows((SIGMAS,), (c.d_match,), c.ratio, c.search_limit, least)
     looks = tracks.descriptors[rows], tracks.laplacian[rows]
-    found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows)
+    found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows, taken)
     m, row = found.tracks, found.features
     # A right pixel off by more says that this is another point, or a false stereo match.
     depth = np.maximum((places[m] - T[:3, 3]) @ T[:3, 2], 1e-3)
     uneven = np.where(tracks.count(rows[m]) < c.min_frames, 1.0, _UNEVEN)
     deviation = np.sqrt(np.maximum(S[m, 2, 2], s.sigma**2))  # rounding may leave a covariance that is not definite
     allowance = _RIGHT_SIGMAS * deviation + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth
-    good = ~(taken[row] | (np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance))  # NaN compares false
-    _enter(tracks, rows[m[good]], row[good], taken)
-
-
-def _enter(tracks: Tracks, rows: IndexArray, features: IndexArray, taken: BoolArray) -> None:
-    """Note features (M,) found for tracks (M,): a track's first; of tracks alike to the bit, the first has it."""
-    _, first = np.unique(rows, return_index=True)
-    features, of_feature = np.unique(features[first], return_index=True)
-    tracks.row[rows[first[of_feature]]] = features
-    taken[features] = True
+    good = ~(np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance)  # NaN compares false
+    tracks.find(rows[m[good]], row[good])
+    taken[row[good]] = True
 
 
 def _carried_along(
@@ -136,7 +129,7 @@ def _young(tracks: Tracks, most: int) -> IndexArray:
 
 
 def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
-    """Look for tracks without a velocity yet anywhere that `max_speed` allows, in features that are not taken (N,)."""
+    """Look for tracks without a velocity yet as far off as `max_speed` allows, in features not `taken` (N,)."""
     s, c = frame.setup, frame.setup.config
     left = _young(tracks, c.min_frames)
     free = np.flatnonzero(~taken & np.isfinite(frame.local[:, 0]))
@@ -150,4 +143,4 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     )  # fmt: skip
     looks, features = (tracks.descriptors[left], tracks.laplacian[left]), frame.features.select(free)
     found = features_of_tracks.match_everywhere(*looks, features, c.wide_d_match, c.wide_ratio, allowed)
-    _enter(tracks, left[found.tracks], free[found.features], taken)
+    tracks.find(left[found.tracks], free[found.features])

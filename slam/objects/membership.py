@@ -18,10 +18,10 @@ from slam.data import BoolArray
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
+from slam.objects.fits import EXPLAINED, fit_positions, times_vectors
 from slam.objects.frame import Frame
 from slam.objects.points import MAX_REJECTIONS
 from slam.objects.track_kernels import inverses, squares, weighted_means
-from slam.objects.fits import EXPLAINED, fit_positions, times_vectors
 from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of fitting poses and points in turn

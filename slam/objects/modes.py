@@ -12,6 +12,7 @@ from slam.object_data import MotionLabels, MovingObject
 from slam.objects.revision import CorrectRows
 from slam.tracks.table import Tracks
 
+
 class ObjectDetector:
     """What the system asks of a detector of moving objects in every step; by itself it takes everything for still.
 

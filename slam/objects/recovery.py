@@ -15,11 +15,11 @@ from slam.objects.belief import BodyBelief
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.estimator import BodyEstimator
+from slam.objects.fits import AGREES
 from slam.objects.frame import Frame
 from slam.objects.points import MIN_POINTS
-from slam.objects.fits import AGREES
-from slam.tracks.table import Tracks
 from slam.tracks.follow import match_everywhere
+from slam.tracks.table import Tracks
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # cost: poses tried for a body that is found again

@@ -17,8 +17,8 @@ from slam.data import BoolArray, IndexArray
 from slam.geometry.kernels import squared_distances
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
-from slam.objects.frame import Frame
 from slam.objects.fits import AGREES, EXPLAINED, MOVES, ConstantVelocity, constant_velocity
+from slam.objects.frame import Frame
 from slam.tracks.table import Tracks
 
 _NEAR = 7.8  # derived: χ²(3) at 95 %, of tracks inside the region

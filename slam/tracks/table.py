@@ -3,6 +3,7 @@
 The landmarks of the map, the members of each body, and what is not decided yet are selections of the rows. A frame's
 step changes the table in place: `Tracks.begun` makes a copy for it, which a step that fails leaves behind.
 """
+# ruff: noqa: RUF009  (what a column is called with is a description, and no value that rows would share)
 
 from __future__ import annotations
 
@@ -143,7 +144,9 @@ class Tracks(LandmarkTable):
     older_age: Array = _column(float)  # fading sum of its ages in frames, each times the trace of its A (N,)
     position: Array = _column(float, 3)  # where it is now, in world coordinates (N, 3)
     covariance: Array = _column(float, 3, 3)  # of the position (N, 3, 3)
-    velocity: Array = _column(float, 3)  # of those that a fixed point does not explain (N, 3) [m/s]; zero for the others
+    velocity: Array = _column(
+        float, 3
+    )  # of those that a fixed point does not explain (N, 3) [m/s]; zero for the others
     velocity_covariance: Array = _column(float, 3, 3)  # (N, 3, 3), of those that have one
     # number of frames in which it was part of a moving group, less those since in which it was not (N,)
     streak: IdArray = _column(np.int64)
@@ -219,11 +222,13 @@ class Tracks(LandmarkTable):
         return np.asarray(np.count_nonzero(self.dof[rows], axis=1))
 
     def find(self, rows: IndexArray, features: IndexArray) -> None:
-        """Rows (K,) are found as these features, in place; of rows alike to the bit, the last one has the feature."""
-        self.row[rows] = features
-        _, last = np.unique(features[::-1], return_index=True)
-        again = np.delete(np.arange(len(rows)), len(rows) - 1 - last)
-        self.row[rows[again]] = -1
+        """Rows (K,) are found as these features, in place: a row as its first, a feature as the first row of several.
+
+        Rows that look alike to the bit may have been matched with the same feature.
+        """
+        _, first = np.unique(rows, return_index=True)
+        features, of_feature = np.unique(features[first], return_index=True)
+        self.row[rows[first[of_feature]]] = features
 
     def enter_landmarks(
         self, frame: int, ids: IdArray, features: StereoFeatures, rows: IndexArray, camera: Array
@@ -254,8 +259,8 @@ class Tracks(LandmarkTable):
         self.renew_looks(rows, features)
 
     def renew_looks(self, rows: IndexArray, features: StereoFeatures) -> None:
-        """Tracks take over the look of their feature, in place; how a landmark's changes is the map's to say."""
-        rows = rows[(self.ids[rows] < 0) | (self.body[rows] >= 0)]
+        """Tracks take over the look of their feature, in place; how a still landmark's changes is the map's to say."""
+        rows = rows[(self.ids[rows] < 0) | (self.body[rows] >= 0) | self.doubtful[rows]]
         self.descriptors[rows] = features.descriptors[self.row[rows]]
         self.laplacian[rows] = features.laplacian[self.row[rows]]
 

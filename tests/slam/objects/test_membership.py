@@ -15,8 +15,8 @@ from slam.geometry.se3 import Array, exp, inverse, transform
 from slam.objects import membership
 from slam.objects.bodies import Body, continued, new_body, with_extent
 from slam.objects.config import ObjectsConfig
-from slam.objects.merging import merge
 from slam.objects.fits import fit_positions
+from slam.objects.merging import merge
 from slam.tracks.table import Tracks
 
 WINDOW = 12
@@ -46,7 +46,9 @@ def table(seen: Array) -> Tracks:
 def enter(tracks: Tracks, rows: Array, slot: int, points: Array) -> None:
     """Tracks measured points in a slot."""
     tracks.p[rows, slot], tracks.A[rows, slot], tracks.dof[rows, slot] = (
-        points - tracks.anchor[rows], np.eye(3) / SIGMA**2, 3
+        points - tracks.anchor[rows],
+        np.eye(3) / SIGMA**2,
+        3,
     )
 
 

@@ -13,9 +13,9 @@ from slam.geometry.rig import StereoRig
 from slam.models import models_for
 from slam.objects import regions
 from slam.objects.config import ObjectsConfig
+from slam.objects.fits import ConstantVelocity
 from slam.objects.frame import Frame, Setup
 from slam.objects.regions import follow_regions
-from slam.objects.fits import ConstantVelocity
 
 DT, WINDOW = 0.1, 12
 VELOCITY, START = np.array([0.5, 0.0, 5.0]), np.array([5.0, 0, 20])
