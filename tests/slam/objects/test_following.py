@@ -67,4 +67,4 @@ def test_landmarks_that_were_found_keep_their_features_wherever_they_were_expect
 def test_of_landmarks_that_were_found_as_one_feature_one_has_it():
     tracks = Tracks.empty(4)
     tracks.find(np.array([3, 5, 8]), np.array([1, 0, 1]))
-    assert np.flatnonzero(tracks.row >= 0).tolist() == [5, 8] and tracks.row[8] == 1
+    assert np.flatnonzero(tracks.row >= 0).tolist() == [3, 5] and tracks.row[3] == 1
