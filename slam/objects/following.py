@@ -57,7 +57,8 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], fr
     found = np.flatnonzero(tracks.found)
     tracks.unfound[:] += 1
     tracks.unfound[found] = 0
-    tracks.renew_looks(np.setdiff1d(found, of_lost), frame.features)
+    found = np.setdiff1d(found, of_lost)
+    tracks.look[found] = frame.features.descriptors[tracks.row[found]]
 
 
 def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: float) -> None:
@@ -85,7 +86,7 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covaria
     z, S = predicted_pixels(s.rig.rectified_parameters, T, places, covariances, s.sigma)
     least = np.where(tracks.doubtful[rows], 0.5 * c.search_limit, c.search_radius)
     windows = features_of_tracks.Windows((SIGMAS,), (c.d_match,), c.ratio, c.search_limit, least)
-    looks = tracks.descriptors[rows], tracks.laplacian[rows]
+    looks = tracks.look[rows], tracks.laplacian[rows]
     found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows, taken)
     m, row = found.tracks, found.features
     # A right pixel off by more says that this is another point, or a false stereo match.
@@ -141,6 +142,6 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
         tracks.position[left], transform(frame.T_world_left, local), np.einsum("nii->n", tracks.covariance[left]),
         deviation**2, c.max_speed * frame.dt, SIGMAS,
     )  # fmt: skip
-    looks, features = (tracks.descriptors[left], tracks.laplacian[left]), frame.features.select(free)
+    looks, features = (tracks.look[left], tracks.laplacian[left]), frame.features.select(free)
     found = features_of_tracks.match_everywhere(*looks, features, c.wide_d_match, c.wide_ratio, allowed)
     tracks.find(left[found.tracks], free[found.features])

@@ -77,7 +77,7 @@ def located(
     free = np.flatnonzero((tracks.body < 0) & tracks.found)
     tracks.give_up(free[measured_now[tracks.row[free]]])
     tracks.row[good], tracks.unfound[good] = matched, 0
-    tracks.descriptors[good] = features.descriptors[matched]
+    tracks.look[good] = features.descriptors[matched]
     return belief
 
 
@@ -145,7 +145,7 @@ def _by_descriptors(
     allowed = np.broadcast_to(near, (len(mine), len(free)))
     lost = body.apart_from is None and not _is_expected(body)
     d_match, ratio = (config.d_match, config.ratio) if lost else (config.wide_d_match, config.wide_ratio)
-    looks = tracks.descriptors[mine], tracks.laplacian[mine]
+    looks = tracks.look[mine], tracks.laplacian[mine]
     found = match_everywhere(*looks, features.select(free), d_match, ratio, allowed)
     return mine[found.tracks], free[found.features]
 

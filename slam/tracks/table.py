@@ -133,6 +133,7 @@ class Tracks(LandmarkTable):
 
     number: IdArray = _column(np.int64, fill=-1)  # of the track (N,), never used twice; −1 for what is not followed
     row: IndexArray = _column(np.intp, fill=-1)  # row of the feature in this frame (N,), −1 where not found
+    look: NDArray[np.float32] = _column(np.float32, 0)  # descriptor as last found (N, D)
     body: IdArray = _column(np.int64, fill=-1)  # id of the body that it belongs to (N,), −1 for none
     unfound: IdArray = _column(np.int64)  # frames since a feature was last found that looks like it (N,)
     anchor: Array = _column(float, 3)  # origin of the track's own coordinates, in world axes (N, 3)
@@ -163,9 +164,9 @@ class Tracks(LandmarkTable):
     @classmethod
     def empty(cls, dimensions: int, window: int = 0, rows: int = _ROOM) -> Tracks:
         """A table of unused rows, for descriptors of `dimensions` numbers and windows of so many frames."""
-        looks = np.zeros((rows, dimensions), np.float32), np.zeros(rows, np.int8)
+        looks, signs = np.zeros((2, rows, dimensions), np.float32), np.zeros(rows, np.int8)
         A, p, dof = np.zeros((rows, window, 3, 3)), np.zeros((rows, window, 3)), np.zeros((rows, window), np.int8)
-        return cls(np.full(rows, -1), *looks, A=A, p=p, dof=dof)
+        return cls(np.full(rows, -1), looks[0], signs, look=looks[1], A=A, p=p, dof=dof)
 
     def begun(self, new: int, window: int) -> Tracks:
         """A copy for another frame: in it there is room for so many `new` rows, and nothing is found yet.
@@ -256,13 +257,7 @@ class Tracks(LandmarkTable):
         self.number[rows], self.unfound[rows], self.expelled[rows] = numbers, 0, False
         self.anchor[rows] = self.position[rows] = points
         self.forget_past(rows)
-        self.renew_looks(rows, features)
-
-    def renew_looks(self, rows: IndexArray, features: StereoFeatures) -> None:
-        """Tracks take over the look of their feature, in place; how a still landmark's changes is the map's to say."""
-        rows = rows[(self.ids[rows] < 0) | (self.body[rows] >= 0) | self.doubtful[rows]]
-        self.descriptors[rows] = features.descriptors[self.row[rows]]
-        self.laplacian[rows] = features.laplacian[self.row[rows]]
+        self.look[rows], self.laplacian[rows] = (x[self.row[rows]] for x in (features.descriptors, features.laplacian))
 
     def give_up(self, rows: IndexArray) -> None:
         """Follow rows no longer, in place; landmarks among them stay in the map."""

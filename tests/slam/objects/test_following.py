@@ -30,12 +30,12 @@ def test_a_body_that_was_not_measured_has_no_claim_to_features(missed, by_both):
 def test_points_of_a_body_that_is_out_of_sight_keep_their_looks(missed, keeps):
     body, tracks, features, _ = scene(4, np.zeros(6), np.random.default_rng(3))
     members = np.flatnonzero(tracks.body == body.id)
-    before = tracks.descriptors[members].copy()
+    before = tracks.look[members].copy()
     features.descriptors[:] = np.roll(features.descriptors, 20, axis=1) * 0.3 + features.descriptors * 0.9
     tracks.row[:] = -1
     follow(tracks, {1: replace(body, missed=missed)}, [], frame_of(features, 25.0))
     assert (tracks.row[members] >= 0).all()
-    np.testing.assert_array_equal(tracks.descriptors[members], before if keeps else features.descriptors)
+    np.testing.assert_array_equal(tracks.look[members], before if keeps else features.descriptors)
 
 
 def test_a_body_takes_points_along_that_are_too_young_for_a_velocity():
