@@ -139,7 +139,7 @@ FAULTS = (
     ),
     Fault(
         "withheld landmarks count as missed", "slam/tracks/table.py",
-        "view = view[~back[view]]", "view = view[:]",
+        "view = in_view[counts[in_view]]", "view = in_view[:]",
         "tests/slam/tracks tests/slam/mapping",
     ),
     Fault(
