@@ -26,8 +26,7 @@ from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.naming import count
 from slam.objects.config import ObjectsConfig
-from slam.objects.detector import MovingObjectDetector
-from slam.objects.modes import ObjectDetector
+from slam.objects.detector import MovingObjectDetector, ObjectDetector
 from slam.papers.procedure1 import Procedure1Detector
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.stages import Stages

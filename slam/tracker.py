@@ -23,7 +23,7 @@ from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Frontend, RestingBackend
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
-from slam.objects.modes import ObjectDetector
+from slam.objects.detector import ObjectDetector
 from slam.rig_error import CommonError, Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
 from slam.third_party import checked

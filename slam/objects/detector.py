@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,26 +16,84 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.objects import finder, membership
-from slam.objects.bodies import Body, advanced, continued, hidden, with_belief, with_evidence, with_extent
+from slam.objects.bodies import (
+    Body,
+    advanced,
+    continued,
+    hidden,
+    reported,
+    with_belief,
+    with_evidence,
+    with_extent,
+)
 from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.config import ObjectsConfig
-from slam.objects.estimates import reported
 from slam.objects.estimator import FRAMES, BodyEstimator
-from slam.objects.fits import fit_positions, fit_velocities, make_room, record
+from slam.objects.fits import fit_positions, fit_velocities, make_room, record, revise_tracks
 from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.merging import merge
-from slam.objects.modes import ObjectDetector
 from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Region, follow_regions
-from slam.objects.revision import CorrectRows, revise_tracks
 from slam.objects.scene import Scene, displacements, moved_since
 from slam.tracks.table import Tracks
 
 _NONE: IndexArray = np.zeros(0, np.intp)
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
+
+
+class ObjectDetector:
+    """What the system asks of a detector of moving objects in every step; by itself it takes everything for still.
+
+    `newly_moving` and `suspects` are asked before the back end's update, `step` comes after it.
+    """
+
+    #: Number of frames for which the table of tracks keeps what it measured.
+    window: int = 0
+    #: Ids of landmarks that may move: they do not measure the camera's next pose.
+    suspects: IdArray = np.zeros(0, np.int64)
+
+    def newly_moving(
+        self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
+    ) -> IdArray:
+        """Ids of landmarks that move in the run's first frames, before it is known what moves: see `suspects`.
+
+        Args:
+            tracks: the table of tracks, as the last frame left it.
+            features: of the frame, before the back end's update.
+            at: rows in the table of the landmarks found in it (K,).
+            rows: of their features (K,).
+            T_world_left: the camera's pose (4, 4), as far as it is known.
+        """
+        return np.zeros(0, np.int64)
+
+    def restart(self) -> None:
+        """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
+
+    def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
+        """Take note that the rig's correction changes before the next frame.
+
+        Args:
+            tracks: the table of tracks.
+            correct: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
+        """
+
+    def step(
+        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, still: IndexArray
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
+        """Say which features move, before any of them becomes a landmark, and report the bodies.
+
+        Args:
+            backend: gives the camera's last poses with their joint covariance.
+            tracks: the table of tracks; landmarks that were found have their feature already. Changed in place.
+            features: of the frame.
+            estimate: the camera's pose after the update.
+            still: rows of features that stay at their pixels while the camera stands.
+        """
+        none = np.zeros(0, np.intp)
+        return MotionLabels(none, none, np.zeros(0, np.int64)), ()
 
 
 class MovingObjectDetector(ObjectDetector):
@@ -55,7 +114,7 @@ class MovingObjectDetector(ObjectDetector):
         self.restart()
 
     def restart(self) -> None:
-        """See `slam.objects.modes.ObjectDetector`."""
+        """See `ObjectDetector`."""
         window = self.window
         self.bodies: dict[int, Body] = {}
         self.suspects = NO_IDS
@@ -65,8 +124,8 @@ class MovingObjectDetector(ObjectDetector):
         self._path: RecentPoses | None = None
         self._regions: list[Region] = []
 
-    def revise(self, tracks: Tracks, correct: CorrectRows) -> None:
-        """See `slam.objects.modes.ObjectDetector`."""
+    def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
+        """See `ObjectDetector`."""
         if self._number >= 0:
             slot = self._number % self.window
             revise_tracks(tracks, self.bodies, self._poses, slot, self.setup.rig, correct)
@@ -74,7 +133,7 @@ class MovingObjectDetector(ObjectDetector):
     def newly_moving(
         self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
     ) -> IdArray:
-        """See `slam.objects.modes.ObjectDetector`."""
+        """See `ObjectDetector`."""
         s, c, now = self.setup, self.setup.config, self._number + 1
         known = tracks.number[at] >= 0
         at, rows = at[known], rows[known]
@@ -91,7 +150,7 @@ class MovingObjectDetector(ObjectDetector):
         self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
         still: IndexArray = _NONE,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
-        """Follow all tracks into this frame, test them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
+        """Follow all tracks into this frame, test them, and find bodies; see `ObjectDetector`."""
         frame = self._begin(backend, tracks, features, estimate)
         self._advance_bodies(tracks, frame)
         follow(tracks, self.bodies, self._regions, frame)

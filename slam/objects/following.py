@@ -12,9 +12,8 @@ from slam.geometry.arrays import among
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.frame import Frame
-from slam.objects.pixel_kernels import within_reach
 from slam.objects.regions import Region
-from slam.objects.track_kernels import inverses, predicted_pixels
+from slam.objects.track_kernels import inverses, predicted_pixels, within_reach
 from slam.tracks import follow as features_of_tracks
 from slam.tracks.table import Tracks
 

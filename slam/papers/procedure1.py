@@ -25,7 +25,7 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
-from slam.objects.modes import ObjectDetector
+from slam.objects.detector import ObjectDetector
 from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
 
