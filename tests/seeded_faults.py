@@ -149,11 +149,6 @@ FAULTS = (
     ),
     # moving bodies
     Fault(
-        "a body's points are compared with where it stands now, not where it stood", "slam/objects/following.py",
-        "local = transform(inverse(body.T_before), places)", "local = transform(inverse(body.T), places)",
-        "tests/slam/objects/test_following.py tests/slam/objects",
-    ),
-    Fault(
         "noise of depth counts as a body's own extent", "slam/objects/points.py",
         "values, axes = np.linalg.eigh(total - noise)", "values, axes = np.linalg.eigh(total)",
         "tests/slam/objects/test_first_sight.py tests/slam/objects",

@@ -153,7 +153,7 @@ class MovingObjectDetector(ObjectDetector):
         """Follow all tracks into this frame, test them, and find bodies; see `ObjectDetector`."""
         frame = self._begin(backend, tracks, features, estimate)
         self._advance_bodies(tracks, frame)
-        follow(tracks, self.bodies, self._regions, frame)
+        follow(tracks, self.bodies, frame)
         self._measure(tracks, frame)
         tracks.still[:] = tracks.found & among(max(len(features), 1), still)[tracks.row]
         self._fit(tracks, frame)

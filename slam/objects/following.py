@@ -9,10 +9,9 @@ import numpy as np
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import among
-from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.geometry.se3 import points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.frame import Frame
-from slam.objects.regions import Region
 from slam.objects.track_kernels import inverses, predicted_pixels, within_reach
 from slam.tracks import follow as features_of_tracks
 from slam.tracks.table import Tracks
@@ -22,13 +21,12 @@ _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to 
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 
 
-def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], frame: Frame) -> None:
+def follow(tracks: Tracks, bodies: Mapping[int, Body], frame: Frame) -> None:
     """Find the features of the tracks that have none yet; sets rows, looks and misses, in place.
 
     A landmark that was found has its feature already. The others are looked for where their fit (or their body's
     motion) says, in windows as wide as that is uncertain. What is left, and was not known for long enough to have a
-    velocity, is looked for where the body or the region takes it on which it lies, and then as far as `max_speed`
-    allows.
+    velocity, is looked for as far off as `max_speed` allows.
 
     Members of bodies take over their feature's descriptor even if `slam.objects.recovery.located` does not confirm the
     match afterwards, because the body's pose is wrong more often than the match. Members of a body that was not
@@ -40,19 +38,12 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], fr
     _advance(tracks, bodies, alive, frame.dt)
     lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
     taken = among(len(frame.features), tracks.row[tracks.row >= 0])
-    expected = alive[~lost & (tracks.row[alive] < 0)]
-    _look(tracks, frame, expected, tracks.position[expected], tracks.covariance[expected], taken)
+    _look(tracks, frame, alive[~lost & (tracks.row[alive] < 0)], taken)
     of_lost = alive[lost]
-    held = tracks.row[np.setdiff1d(np.flatnonzero(tracks.found & (tracks.body >= 0)), of_lost)]
-    _carried_along(tracks, bodies, regions, frame, taken)
+    of_others = np.setdiff1d(np.flatnonzero(tracks.found & (tracks.body >= 0)), of_lost)
+    held = among(len(taken), tracks.row[of_others])
     _far(tracks, frame, taken)
-    unclaimed = of_lost[tracks.row[of_lost] < 0]
-    if len(unclaimed):
-        _look(
-            tracks, frame, unclaimed, tracks.position[unclaimed], tracks.covariance[unclaimed],
-            np.zeros(len(taken), bool),
-        )  # fmt: skip
-        tracks.row[unclaimed[np.isin(tracks.row[unclaimed], held)]] = -1
+    _look(tracks, frame, of_lost[tracks.row[of_lost] < 0], held)
     found = np.flatnonzero(tracks.found)
     tracks.unfound[:] += 1
     tracks.unfound[found] = 0
@@ -73,16 +64,13 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
         tracks.position[mine], tracks.covariance[mine] = transform(body.T, tracks.local[mine]), R @ spread @ R.T
 
 
-def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covariances: Array, taken: BoolArray) -> None:
-    """Look for tracks (M,) in windows about places (M, 3) in the world that have covariances (M, 3, 3).
-
-    Features that are `taken` (N,) are not found; those that are found are entered there. A track may be looked for at
-    several places: the first at which it is found counts.
-    """
+def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> None:
+    """Look for tracks (M,) where they are expected, among features that are not `taken` (N,); these are then."""
     if not len(rows):
         return
     s, c, f, T = frame.setup, frame.setup.config, frame.features, frame.T_world_left
-    z, S = predicted_pixels(s.rig.rectified_parameters, T, places, covariances, s.sigma)
+    places = tracks.position[rows]
+    z, S = predicted_pixels(s.rig.rectified_parameters, T, places, tracks.covariance[rows], s.sigma)
     least = np.where(tracks.doubtful[rows], 0.5 * c.search_limit, c.search_radius)
     windows = features_of_tracks.Windows((SIGMAS,), (c.d_match,), c.ratio, c.search_limit, least)
     looks = tracks.look[rows], tracks.laplacian[rows]
@@ -98,40 +86,11 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covaria
     taken[row[good]] = True
 
 
-def _carried_along(
-    tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], frame: Frame, taken: BoolArray
-) -> None:
-    """Look for young tracks on what moves where it takes them."""
-    s, dt = frame.setup, frame.dt
-    young = _young(tracks, s.config.min_frames - 1)
-    places = tracks.position[young]
-    found = [(young[:0], places[:0], tracks.covariance[:0])]
-    for body in bodies.values():
-        size = s.config.margin * body.across
-        local = transform(inverse(body.T_before), places)
-        on = np.flatnonzero(((local > body.lower - size) & (local < body.upper + size)).all(axis=1))
-        R = body.T[:3, :3]
-        more = R @ body.covariance[3:, 3:] @ R.T
-        found.append((young[on], transform(body.T, local[on]), tracks.covariance[young[on]] + more))
-    for region in regions:
-        middle = region.state[:3]
-        on = np.flatnonzero(np.linalg.norm(places - middle, axis=1) < s.radius(np.linalg.norm(middle - frame.eye)))
-        P = tracks.covariance[young[on]] + dt**2 * region.covariance[3:, 3:]
-        found.append((young[on], places[on] + dt * region.state[3:], P))
-    rows, ahead, covariances = (np.concatenate(column) for column in zip(*found))
-    _look(tracks, frame, rows, ahead, covariances, taken)
-
-
-def _young(tracks: Tracks, most: int) -> IndexArray:
-    """Free tracks that were seen in the last frame, not in this, with no more measurements than `most`."""
-    lost = np.flatnonzero((tracks.number >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.unfound == 0))
-    return np.asarray(lost[tracks.count(lost) <= most])
-
-
 def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     """Look for tracks without a velocity yet as far off as `max_speed` allows, in features not `taken` (N,)."""
     s, c = frame.setup, frame.setup.config
-    left = _young(tracks, c.min_frames)
+    left = np.flatnonzero((tracks.number >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.unfound == 0))
+    left = left[tracks.count(left) <= c.min_frames]
     free = np.flatnonzero(~taken & np.isfinite(frame.local[:, 0]))
     if not len(left) or not len(free):
         return

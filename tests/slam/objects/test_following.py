@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.data import StereoFeatures
 from slam.geometry.se3 import transform
 from slam.objects.following import follow
 from slam.tracks.table import Tracks
-from tests.slam.objects.test_recovery import POINTS, RIG, begin, frame_of, scene
+from tests.slam.objects.test_recovery import POINTS, begin, frame_of, scene
 
 
 @pytest.mark.parametrize(("missed", "by_both"), [(1, False), (2, True)])
@@ -20,7 +19,7 @@ def test_a_body_that_was_not_measured_has_no_claim_to_features(missed, by_both):
     members = np.flatnonzero(tracks.body == body.id)
     free = begin(tracks, features, np.arange(4), transform(truth, POINTS))
     tracks.row[:] = -1
-    follow(tracks, {1: replace(body, missed=missed)}, [], frame_of(features, 25.0))
+    follow(tracks, {1: replace(body, missed=missed)}, frame_of(features, 25.0))
     assert (np.sort(np.append(tracks.row[members], tracks.row[free])) >= 0).sum() == (8 if by_both else 4)
     if by_both:
         assert tracks.row[free].tolist() == tracks.row[members].tolist() == [0, 1, 2, 3]
@@ -33,24 +32,9 @@ def test_points_of_a_body_that_is_out_of_sight_keep_their_looks(missed, keeps):
     before = tracks.look[members].copy()
     features.descriptors[:] = np.roll(features.descriptors, 20, axis=1) * 0.3 + features.descriptors * 0.9
     tracks.row[:] = -1
-    follow(tracks, {1: replace(body, missed=missed)}, [], frame_of(features, 25.0))
+    follow(tracks, {1: replace(body, missed=missed)}, frame_of(features, 25.0))
     assert (tracks.row[members] >= 0).all()
     np.testing.assert_array_equal(tracks.look[members], before if keeps else features.descriptors)
-
-
-def test_a_body_takes_points_along_that_are_too_young_for_a_velocity():
-    body, tracks, _, _ = scene(4, np.zeros(6), np.random.default_rng(3))
-    before = body.T.copy()
-    before[0, 3] -= 3.0  # 140 px: its speed and the noise of depth allow 1.9 m
-    points = np.append(POINTS, [[0.1, 0.1, 0.0]], axis=0)
-    uv, uv_right = RIG.project(transform(body.T, points))
-    features = StereoFeatures(
-        0.0, uv, uv_right, np.ones(5), np.zeros(5), np.ones(5), np.ones(5, np.int8), np.eye(5, 64, dtype=np.float32)
-    )
-    (young,) = begin(tracks, features, np.array([4]), transform(before, points[4:]))
-    tracks.row[:] = -1
-    follow(tracks, {1: replace(body, T_before=before)}, [], frame_of(features, 1.0))
-    assert tracks.row[young] == 4
 
 
 def test_landmarks_that_were_found_keep_their_features_wherever_they_were_expected():
@@ -60,7 +44,7 @@ def test_landmarks_that_were_found_keep_their_features_wherever_they_were_expect
     free = begin(tracks, features, np.arange(4), transform(truth, POINTS))
     tracks.row[:] = -1
     tracks.find(np.array([free[0], free[1], members[2]]), np.array([1, 0, 3]))
-    follow(tracks, {1: replace(body, missed=2)}, [], frame_of(features, 25.0))
+    follow(tracks, {1: replace(body, missed=2)}, frame_of(features, 25.0))
     assert tracks.row[[free[0], free[1], members[2]]].tolist() == [1, 0, 3]
 
 
