@@ -78,7 +78,8 @@ class Tracker:
         if tracks is None or (tracks.descriptors.shape[1] != features.descriptors.shape[1] and not len(tracks.mapped)):
             tracks = Tracks.empty(features.descriptors.shape[1])
         tracks = tracks.begun(len(features), self.objects.window)
-        landmarks = tracks.landmarks()
+        landmarks, backend = tracks.landmarks(), state.backend
+        positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks))
 
         def elsewhere() -> Array | None:
             nonlocal place
@@ -86,7 +87,7 @@ class Tracker:
             return None if place is None else place.T_odom_left
 
         localizer, index, tracking = self._session.localizer, state.index + 1, state.tracking
-        search = Search(localizer, prediction, landmarks, _positions(state, landmarks.ids), corrected, index)
+        search = Search(localizer, prediction, landmarks, positions, corrected, index)
         if state.begins_at(index):
             matches = search.match()
         else:
@@ -97,8 +98,7 @@ class Tracker:
             matches = LandmarkMatches.nothing()
         aligned = features
         if self._aligning is not None:
-            rig, positions = self._session.rig, state.backend.positions
-            aligned = align(rig, self._aligning, features, matches, tracks, positions)
+            aligned = align(self._session.rig, self._aligning, features, matches, tracks, backend.positions)
         if aligned is not features:
             corrected = _shifted_as(corrected, features, aligned)
         step = Step(
@@ -184,11 +184,6 @@ def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFe
         return now
     left, right = now.uv_left - before.uv_left, now.uv_right - before.uv_right
     return replace(corrected, uv_left=corrected.uv_left + left, uv_right=corrected.uv_right + right)
-
-
-def _positions(state: State, ids: IdArray) -> Array:
-    """Landmarks' positions (N, 3) [m] in the world."""
-    return np.asarray(checked(state.backend, "positions", state.backend.positions(ids), n=len(ids)))
 
 
 def frame_result(

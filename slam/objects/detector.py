@@ -158,19 +158,19 @@ class MovingObjectDetector(ObjectDetector):
         tracks.still[:] = tracks.found & among(max(len(features), 1), still)[tracks.row]
         self._fit(tracks, frame)
         self._change_members(tracks, frame)
-        found = finder.find_groups(frame, tracks, self.bodies)
-        for group in found.groups:
+        scene, suspects, groups = finder.find_groups(frame, tracks, self.bodies)
+        for group in groups:
             moving = finder.lasting(group, tracks, frame)
             new = finder.moving_group(frame, tracks, moving) if len(moving) else None
             if new is not None:
                 self._found(new, tracks, frame, group[0])
         if self.setup.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.objects.regions`
             self._follow_regions(tracks, frame)
-        self._prove(tracks, frame, found.scene)
+        self._prove(tracks, frame, scene)
         unproven = np.isin(tracks.body, [body.id for body in self.bodies.values() if not body.proven])
         c = self.setup.config  # of a body that was dropped: nothing is known of these until a group could be found
         unproven |= tracks.expelled & tracks.found & (tracks.count(np.arange(len(tracks))) < c.min_frames + c.confirm)
-        suspected = np.concatenate([tracks.ids[found.suspects], tracks.ids[unproven]])
+        suspected = np.concatenate([tracks.ids[suspects], tracks.ids[unproven]])
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(tracks, frame)
         self._begin_tracks(tracks, frame)

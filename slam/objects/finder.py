@@ -23,20 +23,16 @@ _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What the finder says of a frame."""
-
-    scene: Scene  # the still world, as it appears to move
-    suspects: IndexArray  # rows of tracks in groups that may move
-    # tracks that have moved alike for some frames, each with the id of the body that they are a part of, or None
-    groups: list[tuple[int | None, IndexArray]]
-
-
-def find_groups(frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]) -> Found:
+def find_groups(
+    frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]
+) -> tuple[Scene, IndexArray, list[tuple[int | None, IndexArray]]]:
     """Test the free tracks against the world, and the tracks on bodies against these; notes in place what is in doubt.
 
     What moves otherwise than the body on which it lies is a part of that.
+
+    Returns:
+        the still world, as it appears to move; rows of tracks in groups that may move; and those that have moved alike
+        for some frames, each group with the id of the body that it is a part of, or None.
     """
     c = frame.setup.config
     least = LAG * frame.dt * c.min_speed
@@ -60,7 +56,7 @@ def find_groups(frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]) -> Fou
     alike = of_parts | among(len(tracks), np.concatenate([np.zeros(0, np.intp), *moving]))
     tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
     alone = [(None, members) for members in groups if 2 * of_parts[members].sum() <= len(members)]
-    return Found(scene, suspects, [*parts, *alone])
+    return scene, suspects, [*parts, *alone]
 
 
 def lasting(group: tuple[int | None, IndexArray], tracks: Tracks, frame: Frame) -> IndexArray:
