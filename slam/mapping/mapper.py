@@ -64,12 +64,13 @@ class Mapper:
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
         known = known_features(view, landmarks, step.features, self.config)
+        erased = landmarks.ids[bad]
         tracks.erase_landmarks(rows[bad])
         step = self._add(backend, step, known)
-        rows = tracks.mapped
-        surplus = rows[surplus_landmarks(tracks.landmarks(), self.config)]
-        erased = np.concatenate([landmarks.ids[bad], tracks.ids[surplus]])
-        tracks.erase_landmarks(surplus)
+        if len(tracks.mapped) > self.config.max_landmarks:
+            surplus = tracks.mapped[surplus_landmarks(tracks.landmarks(), self.config)]
+            erased = np.concatenate([erased, tracks.ids[surplus]])
+            tracks.erase_landmarks(surplus)
         if len(erased):  # once a frame: it costs a filter a copy of its covariance
             backend.remove(erased)
         return replace(step, erased=erased)

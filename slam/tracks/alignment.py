@@ -88,7 +88,8 @@ def take_patches(
     Raises:
         SlamError: the front end returns no patches, or not one for each landmark.
     """
-    at = np.flatnonzero(isin(landmarks.ids, seen.ids) & ~landmarks.has_patch)
+    at = np.flatnonzero((landmarks.ids >= 0) & ~landmarks.has_patch)
+    at = at[isin(landmarks.ids[at], seen.ids)]
     if features.images is None or not len(at):
         return
     rows, sizes = seen.rows_of(landmarks.ids[at]), {"n": len(at)}

@@ -8,6 +8,7 @@ step changes the table in place: `Tracks.begun` makes a copy for it, which a ste
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -202,9 +203,9 @@ class Tracks(LandmarkTable):
         """Which are followed, and were found in this frame (N,)."""
         return (self.row >= 0) & (self.number >= 0)
 
-    @property
+    @cached_property
     def mapped(self) -> IndexArray:
-        """Rows of the landmarks (M,), by ascending id."""
+        """Rows of the landmarks (M,), by ascending id; found again after landmarks have joined or left."""
         rows = np.flatnonzero(self.ids >= 0)
         return np.asarray(rows[np.argsort(self.ids[rows], kind="stable")])
 
@@ -247,10 +248,12 @@ class Tracks(LandmarkTable):
         self.row[at] = rows
         for name in LandmarkTable.__dataclass_fields__:
             getattr(self, name)[at] = getattr(new, name)
+        vars(self).pop("mapped", None)
 
     def erase_landmarks(self, rows: IndexArray) -> None:
         """Landmarks (K,) leave the map, in place; their tracks go on."""
         self.ids[rows], self.patches[rows] = -1, None
+        vars(self).pop("mapped", None)
 
     def begin(self, rows: IndexArray, numbers: IdArray, features: StereoFeatures, points: Array) -> None:
         """Begin to follow rows (K,) that have a feature each, at `points` (K, 3) in world coordinates, in place."""
