@@ -320,10 +320,10 @@ class StereoSlam:
         with self._stepping, self._named("the map"):
             if self._state.prior_map is not None:
                 return self._state.prior_map
-            estimate, landmarks = self._estimate(of_map=True), self.landmarks
-            if landmarks is None:
+            if self._state.tracks is None:
                 raise SlamError("there is no map yet: no frame was processed")
-            rows = landmarks.in_world(self.atlas.T_map_odom)
+            estimate = self._estimate(of_map=True)
+            rows = self._state.tracks.landmarks().in_world(self.atlas.T_map_odom)
             keyframes = (k.corrected(self.calibration.applied, self._session.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
             return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas)

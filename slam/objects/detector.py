@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.data import Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
+from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
@@ -167,9 +167,10 @@ class MovingObjectDetector(ObjectDetector):
         if self.setup.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.objects.regions`
             self._follow_regions(tracks, frame)
         self._prove(tracks, frame, scene)
-        unproven = np.isin(tracks.body, [body.id for body in self.bodies.values() if not body.proven])
-        c = self.setup.config  # of a body that was dropped: nothing is known of these until a group could be found
-        unproven |= tracks.expelled & tracks.found & (tracks.count(np.arange(len(tracks))) < c.min_frames + c.confirm)
+        unproven = (tracks.body >= 0) & ~self._of_proven(tracks)
+        c, expelled = self.setup.config, np.flatnonzero(tracks.expelled & tracks.found)
+        # of a body that was dropped: nothing is known of these until a group could be found
+        unproven[expelled[tracks.count(expelled) < c.min_frames + c.confirm]] = True
         suspected = np.concatenate([tracks.ids[suspects], tracks.ids[unproven]])
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(tracks, frame)
@@ -329,11 +330,14 @@ class MovingObjectDetector(ObjectDetector):
         self._record(tracks, new, frame)
         fit_positions(tracks, new)
 
+    def _of_proven(self, tracks: Tracks) -> BoolArray:
+        """Which tracks (N,) belong to a body that has moved for certain."""
+        return np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
+
     def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
         n = len(frame.features)
         on, near = membership.tracks_on_bodies(self.bodies, tracks, self.setup.config.margin)
-        proven = np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
         moving = among(n, tracks.row[on])
         undecided = among(n, tracks.row[near]) | among(n, tracks.row[tracks.found & tracks.doubtful])
-        landmarks = np.sort(tracks.ids[proven & (tracks.ids >= 0)])
+        landmarks = np.sort(tracks.ids[self._of_proven(tracks) & (tracks.ids >= 0)])
         return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks)

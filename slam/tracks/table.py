@@ -7,6 +7,7 @@ step changes the table in place: `Tracks.begun` makes a copy for it, which a ste
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -174,11 +175,12 @@ class Tracks(LandmarkTable):
 
         What is followed is shared with the copy, unless it has windows of another number of frames.
         """
-        own = {name: getattr(self, name).copy() for name in LandmarkTable.__dataclass_fields__}
+        tracks = self
         if self.dof.shape[1] != window:
-            tracks = replace(Tracks.empty(self.descriptors.shape[1], window, len(self)), **own)
-        else:
-            tracks = replace(self, **own)
+            empty = Tracks.empty(self.descriptors.shape[1], window, len(self))
+            tracks = replace(empty, **{name: getattr(self, name) for name in LandmarkTable.__dataclass_fields__})
+        tracks = copy(tracks)
+        vars(tracks).update({name: getattr(self, name).copy() for name in LandmarkTable.__dataclass_fields__})
         missing = new - int((~self.used).sum())
         if missing > 0:
             tracks = tracks.joined(Tracks.empty(self.descriptors.shape[1], window, max(len(self), missing)))
