@@ -226,13 +226,9 @@ class Tracks(LandmarkTable):
         return np.asarray(np.count_nonzero(self.dof[rows], axis=1))
 
     def find(self, rows: IndexArray, features: IndexArray) -> None:
-        """Rows (K,) are found as these features, in place: a row as its first, a feature as the first row of several.
-
-        Rows that look alike to the bit may have been matched with the same feature.
-        """
-        _, first = np.unique(rows, return_index=True)
-        features, of_feature = np.unique(features[first], return_index=True)
-        self.row[rows[first[of_feature]]] = features
+        """Rows (K,) are found as these features, in place; of rows alike to the bit, the first has the feature."""
+        features, first = np.unique(features, return_index=True)
+        self.row[rows[first]] = features
 
     def enter_landmarks(
         self, frame: int, ids: IdArray, features: StereoFeatures, rows: IndexArray, camera: Array
