@@ -130,7 +130,7 @@ class Tracks(LandmarkTable):
     """All rows: `ids` are −1 for what is no landmark, `number` for what is not followed; a row with neither is unused.
 
     Every measurement of what is followed is kept as a point in world coordinates with its information: the point ``p``
-    that the pixels say, relative to the track's own anchor, and ``A = Jᵀ J / σ²``; `slam.objects.tracks` fits them.
+    that the pixels say, relative to the track's own anchor, and ``A = Jᵀ J / σ²``; `slam.objects.fits` fits them.
     """
 
     number: IdArray = _column(np.int64, fill=-1)  # of the track (N,), never used twice; −1 for what is not followed
@@ -147,9 +147,7 @@ class Tracks(LandmarkTable):
     older_age: Array = _column(float)  # fading sum of its ages in frames, each times the trace of its A (N,)
     position: Array = _column(float, 3)  # where it is now, in world coordinates (N, 3)
     covariance: Array = _column(float, 3, 3)  # of the position (N, 3, 3)
-    velocity: Array = _column(
-        float, 3
-    )  # of those that a fixed point does not explain (N, 3) [m/s]; zero for the others
+    velocity: Array = _column(float, 3)  # (N, 3) [m/s], zero for those that a fixed point explains
     velocity_covariance: Array = _column(float, 3, 3)  # (N, 3, 3), of those that have one
     # number of frames in which it was part of a moving group, less those since in which it was not (N,)
     streak: IdArray = _column(np.int64)
