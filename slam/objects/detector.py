@@ -317,7 +317,8 @@ class MovingObjectDetector(ObjectDetector):
     def _begin_tracks(self, tracks: Tracks, frame: Frame) -> None:
         """Follow landmarks and stereo features that are not followed yet; give up what was not found for long."""
         f, deep = frame.features, np.isfinite(frame.local[:, 0])
-        tracks.give_up(np.flatnonzero((tracks.unfound > self.setup.config.patience) & (tracks.body < 0)))
+        lost = (tracks.number >= 0) & (tracks.body < 0) & (tracks.unfound > self.setup.config.patience)
+        tracks.give_up(np.flatnonzero(lost))
         found = np.flatnonzero(tracks.row >= 0)
         anew = found[(tracks.number[found] < 0) & deep[tracks.row[found]]]
         rows = np.flatnonzero(~among(len(f), tracks.row[found]) & deep)

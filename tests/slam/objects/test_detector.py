@@ -123,6 +123,21 @@ def test_settings_are_checked():
             ObjectsConfig(**{name: value})
 
 
+def test_landmarks_that_were_lost_from_view_are_followed_again_once_they_are_found():
+    """Also those that have joined the map beside the track of another landmark."""
+    sequence = slam.open_sequence("synthetic:desk?density=150")
+    system, again, lost = system_for(sequence), 0, set()
+    for k in (*range(20), *range(30, 40)):
+        result = system.process_features(sequence.simulate(k).features)
+        tracks = system._state.tracks
+        deep = result.features.has_stereo[result.matched_features]
+        at = tracks.rows(np.setdiff1d(result.matched[deep], result.erased))
+        assert (tracks.number[at] >= 0).all()
+        again += len(lost & set(tracks.ids[at].tolist()))
+        lost = set(tracks.ids[(tracks.ids >= 0) & (tracks.number < 0)].tolist())
+    assert again
+
+
 def test_what_leaves_the_window_is_remembered_and_nothing_else():
     """Longer than the window, without a body: the slot of the present frame holds only what this frame measured."""
     sequence = slam.open_sequence("synthetic:desk?density=150")
