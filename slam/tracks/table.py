@@ -191,6 +191,7 @@ class Tracks(LandmarkTable):
         rows = np.flatnonzero(~tracks.used)[: len(landmarks)]
         for name in LandmarkTable.__dataclass_fields__:
             getattr(tracks, name)[rows] = getattr(landmarks, name)
+        vars(tracks).pop("mapped", None)
         return tracks
 
     @property

@@ -68,6 +68,7 @@ def test_a_frame_s_copy_has_room_and_leaves_the_landmarks_of_the_frame_before_as
 def test_landmarks_of_a_saved_map_take_unused_rows():
     tracks = followed(3)
     looks = features(6)
+    assert not len(tracks.mapped)
     tracks = tracks.with_landmarks(LandmarkTable(np.arange(6) + 9, looks.descriptors, looks.laplacian))
     assert tracks.landmarks().ids.tolist() == list(range(9, 15)) and (tracks.ids[:3] < 0).all()
     np.testing.assert_array_equal(tracks.landmarks().descriptors, looks.descriptors)
