@@ -40,7 +40,7 @@ from slam.rig_error import CommonError
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
-from slam.tracks.table import LandmarkTable
+from slam.tracks.table import Tracks
 
 #: Standard deviations of the initial pose [m], [rad] of a back end that starts in a map. They are wide, because the
 #: back end measures the landmarks that gave that pose once more: a narrow prior would count them twice.
@@ -55,7 +55,7 @@ class State:
     """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end."""
 
     backend: Backend  # holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`.
-    landmarks: LandmarkTable | None = None  # the map's bookkeeping; None before the first frame
+    tracks: Tracks | None = None  # the table of all that is followed or in the map; None before the first frame
     atlas: Atlas = field(default_factory=Atlas)  # keyframes and loops
     index: int = -1  # of the last frame
     stamp: float = -np.inf  # its time [s]
@@ -79,7 +79,7 @@ class State:
         """The state after one more frame."""
         located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
         return replace(
-            self, landmarks=step.landmarks, views=step.views, atlas=step.atlas, index=step.index,
+            self, tracks=step.tracks, views=step.views, atlas=step.atlas, index=step.index,
             stamp=step.features.stamp, tracking=step.tracking,
             standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, mapped=self.mapped or len(step.added) > 0,
@@ -146,7 +146,8 @@ class Session:
         _fill(first, prior_map)
         atlas = Atlas.of_earlier_run(prior_map.keyframes, prior_map.keyframe_poses, prior_map.loops)
         dimensions, mapped = prior_map.dimensions if len(prior_map) else None, len(prior_map) > 0
-        return State(first, prior_map.rows, atlas, dimensions=dimensions, mapped=mapped, prior_map=prior_map)
+        tracks = Tracks.empty(prior_map.descriptors.shape[1]).with_landmarks(prior_map.rows)
+        return State(first, tracks, atlas, dimensions=dimensions, mapped=mapped, prior_map=prior_map)
 
     def can_restart(self, state: State) -> bool:
         """Whether another back end can take over."""
@@ -178,12 +179,13 @@ class Session:
             if place is None:
                 return None
             T = place.T_odom_left
-        new, landmarks = self._start(T), state.landmarks
+        new, tracks = self._start(T), state.tracks
         _fill(new, saved)
         self.mapper.next_id = saved.next_id
         if place is not None:
-            landmarks = self.mapper.insert(new, saved.rows, place)
-        return replace(state, backend=new, landmarks=landmarks, prior_map=None)
+            assert tracks is not None
+            tracks = self.mapper.insert(new, tracks, place)
+        return replace(state, backend=new, tracks=tracks, prior_map=None)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
         """State and result after a frame in which the camera was not found in the prior map."""
@@ -217,7 +219,7 @@ class Session:
         earlier landmarks remain in the atlas only.
         """
         old, T, stamp = state.backend, elsewhere.T_world_left, features.stamp
-        landmarks: LandmarkTable | None = None
+        tracks = None
         if T is None:
             before = self.rig_error.added_to(old, old.estimate(landmarks=False))
             T, standing, common = before.T_world_left, Standing(), self.rig_error.common(old, as_reported=False)
@@ -226,12 +228,12 @@ class Session:
             after = new.estimate(landmarks=False)
             atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
         else:
-            new, seen_at, landmarks = self._start(T), None, state.landmarks
+            new, seen_at, tracks = self._start(T), None, state.tracks
             whole = self.rig_error.added_to(old, old.estimate())
             new.insert(whole.ids, whole.positions, definite(whole.covariances))  # type: ignore[attr-defined]
             if elsewhere.place is not None:
-                assert landmarks is not None
-                landmarks = self.mapper.insert(new, landmarks, elsewhere.place)
+                assert tracks is not None
+                tracks = self.mapper.insert(new, tracks, elsewhere.place)
                 seen_at = elsewhere.place.stamp
             prediction = new.predict(stamp)
             standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
@@ -239,7 +241,7 @@ class Session:
         path = old.trajectory().select(slice(None, -1))
         hidden = elsewhere.T_world_left is None and state.tracking.stood and self._models.motion.wheels
         state = replace(
-            state, backend=new, landmarks=landmarks, atlas=atlas, standing=standing,
+            state, backend=new, tracks=tracks, atlas=atlas, standing=standing,
             tracking=state.tracking.believing(T, stamp, T if hidden else None), past=(*state.past, path),
             restarted=(*state.restarted, state.index + 1),
         )  # fmt: skip
@@ -251,12 +253,12 @@ class Session:
         `before` is the state after the last frame; `begun` that in which the step began, without landmarks where a new
         map did.
         """
-        if before.landmarks is None or begun is before:
+        if before.tracks is None or begun is before:
             return step
-        if begun.landmarks is None:
-            gone = np.setdiff1d(before.landmarks.ids, step.landmarks.ids)
+        if begun.tracks is None:
+            gone = before.tracks.landmarks().ids
             return replace(step, erased=np.concatenate([gone, step.erased]))
-        joined = np.setdiff1d(begun.landmarks.ids, before.landmarks.ids)
+        joined = np.setdiff1d(begun.tracks.landmarks().ids, before.tracks.landmarks().ids)
         return replace(step, joined=np.union1d(step.joined, joined))
 
     def _start(self, T_world_left: Array) -> Backend:

@@ -26,8 +26,7 @@ from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.naming import count
 from slam.objects.config import ObjectsConfig
-from slam.objects.detector import MovingObjectDetector
-from slam.objects.modes import ObjectDetector
+from slam.objects.detector import MovingObjectDetector, ObjectDetector
 from slam.papers.procedure1 import Procedure1Detector
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.stages import Stages
@@ -151,7 +150,8 @@ class StereoSlam:
     @property
     def landmarks(self) -> LandmarkTable | None:
         """The landmarks' bookkeeping after the last step; None before the first."""
-        return self._state.landmarks
+        tracks = self._state.tracks
+        return None if tracks is None else tracks.landmarks()
 
     @property
     def atlas(self) -> Atlas:
@@ -322,10 +322,10 @@ class StereoSlam:
         with self._stepping, self._named("the map"):
             if self._state.prior_map is not None:
                 return self._state.prior_map
-            estimate = self._estimate(of_map=True) if self.landmarks is not None else None
-            if estimate is None or self.landmarks is None:
+            if self._state.tracks is None:
                 raise SlamError("there is no map yet: no frame was processed")
-            rows = self.landmarks.in_world(self.atlas.T_map_odom)
+            estimate = self._estimate(of_map=True)
+            rows = self._state.tracks.landmarks().in_world(self.atlas.T_map_odom)
             keyframes = (k.corrected(self.calibration.applied, self._session.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
             return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas, self.rig)

@@ -23,15 +23,15 @@ from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Frontend, RestingBackend
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
-from slam.objects.modes import ObjectDetector
+from slam.objects.detector import ObjectDetector
 from slam.rig_error import CommonError, Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
 from slam.third_party import checked
-from slam.tracks.alignment import align, with_new_patches
+from slam.tracks.alignment import align, take_patches
 from slam.tracks.localizer import LandmarkMatches, Search
 from slam.tracks.standing import Standing
 from slam.tracks.state import HIDDEN
-from slam.tracks.table import LandmarkTable
+from slam.tracks.table import Tracks
 
 
 class Tracker:
@@ -56,8 +56,8 @@ class Tracker:
     def revise(self, state: State) -> Revision | None:
         """Apply the present estimate of the rig's error, also to earlier measurements if the back end can."""
         change = self._session.rig_error.apply(state.backend)
-        if change is not None:
-            self.objects.revise(change.rows)
+        if change is not None and state.tracks is not None:
+            self.objects.revise(state.tracks, change.rows)
         return self._session.rig_error.revise(state.backend, restarted=bool(state.past))
 
     def predict(self, state: State, features: StereoFeatures) -> tuple[Standing, Prediction]:
@@ -74,7 +74,12 @@ class Tracker:
     ) -> Step | Elsewhere:
         """Match landmarks with features, and align the features with earlier images."""
         corrected, place = self._session.calibration.correct(features), None
-        landmarks = state.landmarks or LandmarkTable.empty(features.descriptors.shape[1])
+        tracks = state.tracks
+        if tracks is None or (tracks.descriptors.shape[1] != features.descriptors.shape[1] and not len(tracks.mapped)):
+            tracks = Tracks.empty(features.descriptors.shape[1])
+        tracks = tracks.begun(len(features), self.objects.window)
+        landmarks, backend = tracks.landmarks(), state.backend
+        positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks))
 
         def elsewhere() -> Array | None:
             nonlocal place
@@ -82,7 +87,7 @@ class Tracker:
             return None if place is None else place.T_odom_left
 
         localizer, index, tracking = self._session.localizer, state.index + 1, state.tracking
-        search = Search(localizer, prediction, landmarks, _positions(state, landmarks.ids), corrected, index)
+        search = Search(localizer, prediction, landmarks, positions, corrected, index)
         if state.begins_at(index):
             matches = search.match()
         else:
@@ -91,30 +96,29 @@ class Tracker:
             if self._session.can_restart(state):
                 return Elsewhere(matches.T_world_left, place)
             matches = LandmarkMatches.nothing()
-        landmarks = landmarks.with_returning(matches.returning)
+        tracks.count_returning(matches.returning)
         aligned = features
         if self._aligning is not None:
-            rig, positions = self._session.rig, state.backend.positions
-            aligned, landmarks = align(rig, self._aligning, features, matches, landmarks, positions)
+            aligned = align(self._session.rig, self._aligning, features, matches, tracks, backend.positions)
         if aligned is not features:
             corrected = _shifted_as(corrected, features, aligned)
         step = Step(
-            index, aligned, replace(corrected, images=None), prediction, landmarks, matches, standing, tracking,
+            index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking,
             state.atlas, state.views,
         )  # fmt: skip
-        suspects = self._suspects(state, step)
+        suspects = self._suspects(step)
         moving = isin(matches.ids, suspects)
-        return replace(step, matches=matches.select(~moving), withheld=matches.select(moving), suspects=suspects)
+        matches, withheld = matches.select(~moving), matches.select(moving)
+        tracks.find(tracks.rows(matches.ids), matches.rows)
+        return replace(step, matches=matches, withheld=withheld, suspects=suspects)
 
-    def _suspects(self, state: State, step: Step) -> IdArray:
+    def _suspects(self, step: Step) -> IdArray:
         """Ids of landmarks that may move; while the camera stands, all matched ones that do not stay where they are."""
         ids, rows = step.matches.ids, step.matches.rows
         if step.standing.stands:
             return ids[~isin(rows, step.standing.witnesses)]
-        ages = step.index - step.landmarks.last_seen[step.landmarks.rows(ids)]
-        moving = self.objects.newly_moving(
-            step.features, ids, rows, ages, lambda ids: _positions(state, ids), step.pose
-        )
+        at = step.tracks.rows(ids)
+        moving = self.objects.newly_moving(step.tracks, step.features, at, rows, step.pose)
         return np.union1d(self.objects.suspects, moving)
 
     def update(self, state: State, step: Step) -> Step | Elsewhere:
@@ -126,7 +130,7 @@ class Tracker:
             step.tracking, step.prediction, step.features, matches, report, standing.stands
         )
         if state.begins_at(step.index):
-            report = replace(report, reason=report.reason if len(step.landmarks) else NEW_MAP)
+            report = replace(report, reason=report.reason if len(step.tracks.mapped) else NEW_MAP)
         elif not standing.holds(tracking.lost) and self._session.may_begin_new_map(state, tracking):
             return Elsewhere(None)
         return replace(step, report=report, tracking=tracking)
@@ -139,19 +143,18 @@ class Tracker:
 
     def sort(self, state: State, step: Step) -> Step:
         """Which features move, and the moving bodies."""
-        landmark, standing = step.matches.landmark_of(len(step.features)), step.standing
-        labels, objects = self.objects.step(state.backend, step.features, step.estimate, landmark, standing.witnesses)
-        labels = labels.with_undecided(standing.leaving(len(step.features)))
+        features, standing = step.features, step.standing
+        labels, objects = self.objects.step(state.backend, step.tracks, features, step.estimate, standing.witnesses)
+        labels = labels.with_undecided(standing.leaving(len(features)))
         return replace(step, labels=labels, objects=objects)
 
     def manage(self, state: State, step: Step) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
         step = self._session.mapper.update(state.backend, step)
-        seen, T = step.matches.joined(step.added), step.estimate.T_world_left
-        landmarks = step.landmarks
         if self._aligning is not None:
-            landmarks = with_new_patches(self._aligning, step.measured, seen, landmarks, T)
-        return replace(step, landmarks=landmarks)
+            seen, T = step.matches.joined(step.added), step.estimate.T_world_left
+            take_patches(self._aligning, step.measured, seen, step.tracks, T)
+        return step
 
     def close_loops(self, state: State, step: Step) -> Step:
         """Make the frame a keyframe where it differs; a loop corrects the path.
@@ -168,7 +171,7 @@ class Tracker:
         self.objects.restart()
         if state.prior_map is not None or not np.isfinite(self.advanced):  # that back end has not begun
             return state
-        return replace(state, landmarks=self._session.mapper.reconcile(state.backend, state.landmarks))
+        return replace(state, tracks=self._session.mapper.reconcile(state.backend, state.tracks))
 
     def whole_estimate(self, state: State) -> Estimate:
         """Pose and map of the back end, with the rig's uncertainty."""
@@ -182,11 +185,6 @@ def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFe
         return now
     left, right = now.uv_left - before.uv_left, now.uv_right - before.uv_right
     return replace(corrected, uv_left=corrected.uv_left + left, uv_right=corrected.uv_right + right)
-
-
-def _positions(state: State, ids: IdArray) -> Array:
-    """Landmarks' positions (N, 3) [m] in the world."""
-    return np.asarray(checked(state.backend, "positions", state.backend.positions(ids), n=len(ids)))
 
 
 def frame_result(
@@ -210,7 +208,7 @@ def frame_result(
     return FrameResult(
         step.index, status, reason, estimate, step.report, step.features,
         len(step.prediction.ids), step.matches.ids, step.matches.rows, step.added.ids, step.added.rows, step.erased,
-        len(step.landmarks), dict(milliseconds), step.labels.moving, objects, revision=revision,
+        len(step.tracks.mapped), dict(milliseconds), step.labels.moving, objects, revision=revision,
         T_map_odom=atlas.T_map_odom, loop=loop, refused_loop=refused_loop,
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
         returned=step.joined,

@@ -27,7 +27,7 @@ from slam.mapping.monocular import depths_by_motion, frame_covariance, unclaimed
 from slam.mapping.step import Step
 from slam.third_party import checked
 from slam.tracks.localizer import LandmarkMatches, Localizer
-from slam.tracks.table import LandmarkTable
+from slam.tracks.table import Tracks
 from slam.tracks.visibility import MapView, expected_landmarks
 
 
@@ -54,73 +54,80 @@ class Mapper:
 
     def update(self, backend: Backend, step: Step) -> Step:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
-        view = self._view(backend, step.landmarks, step)
-        landmarks = self._count(step.landmarks, view, step)
+        tracks = step.tracks
+        view = self._view(backend, step)
+        self._count(view, step)
+        rows, landmarks = tracks.mapped, tracks.landmarks()
         bad = isin(landmarks.ids, step.labels.landmarks)
         if step.features.has_stereo.any() or not len(step.features):  # else nothing can take their place
             bad |= bad_landmarks(landmarks, self.config)
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
         known = known_features(view, landmarks, step.features, self.config)
-        erased, landmarks = landmarks.ids[bad], landmarks.select(~bad)
-        step = self._add(backend, replace(step, landmarks=landmarks), known)
-        surplus = surplus_landmarks(step.landmarks, self.config)
-        erased = np.concatenate([erased, step.landmarks.ids[surplus]])
+        erased = landmarks.ids[bad]
+        tracks.erase_landmarks(rows[bad])
+        step = self._add(backend, step, known)
+        if len(tracks.mapped) > self.config.max_landmarks:
+            surplus = tracks.mapped[surplus_landmarks(tracks.landmarks(), self.config)]
+            erased = np.concatenate([erased, tracks.ids[surplus]])
+            tracks.erase_landmarks(surplus)
         if len(erased):  # once a frame: it costs a filter a copy of its covariance
             backend.remove(erased)
-        return replace(step, landmarks=step.landmarks.select(~surplus), erased=erased)
+        return replace(step, erased=erased)
 
-    def insert(self, backend: Backend, landmarks: LandmarkTable, place: Found) -> LandmarkTable:
+    def insert(self, backend: Backend, tracks: Tracks, place: Found) -> Tracks:
         """Add landmarks of an old place to the map, as from a saved map; those already in it are unchanged."""
         assert isinstance(backend, MapBackend)  # only such back ends start in a map
         old = place.landmarks.ids
-        new = np.flatnonzero(~np.isin(old, landmarks.ids) | (old < 0))
+        new = np.flatnonzero(~np.isin(old, tracks.ids) | (old < 0))
         ids, without = old[new], old[new] < 0
         ids[without] = self._new_ids(int(without.sum()))
         backend.insert(ids, place.positions[new], place.covariances[new])
-        return landmarks.joined(replace(place.landmarks.select(new), ids=ids))
+        return tracks.with_landmarks(replace(place.landmarks.select(new), ids=ids))
 
-    def reconcile(self, backend: Backend, landmarks: LandmarkTable | None) -> LandmarkTable | None:
-        """Make rows and back end agree after an interrupted step: landmarks that only one of them has are erased.
+    def reconcile(self, backend: Backend, tracks: Tracks | None) -> Tracks | None:
+        """Make table and back end agree after an interrupted step: landmarks that only one of them has are erased.
 
-        The back end is as that step left it, the rows are those before it; those that stay are returned.
+        The back end is as that step left it, the landmarks are those before it; those that stay are returned.
         """
         known = backend.estimate().ids
-        kept = np.zeros(0, np.int64) if landmarks is None else landmarks.ids
-        strangers = np.setdiff1d(known, kept)
+        strangers = known if tracks is None else np.setdiff1d(known, tracks.ids)
         if len(strangers):
             backend.remove(strangers)
-        return None if landmarks is None else landmarks.select(np.isin(kept, known))
+        if tracks is not None:
+            tracks = tracks.begun(0, tracks.dof.shape[1])
+            tracks.erase_landmarks(np.flatnonzero(~np.isin(tracks.ids, known)))
+        return tracks
 
-    def _view(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapView:
+    def _view(self, backend: Backend, step: Step) -> MapView:
         """The map as the camera sees it."""
-        positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks))
-        pose = step.estimate.T_world_left
-        return MapView.of(self.rig, pose, positions, step.features, self._localizer.pixel_sigma)
+        ids = step.tracks.ids[step.tracks.mapped]
+        positions = checked(backend, "positions", backend.positions(ids), n=len(ids))
+        return MapView.of(self.rig, step.estimate.T_world_left, positions, step.features, self._localizer.pixel_sigma)
 
-    def _count(self, landmarks: LandmarkTable, view: MapView, step: Step) -> LandmarkTable:
-        """Count landmarks as seen or missed, unless the frame's pose was not measured."""
-        m, matches = self.config, step.matches
-        measured = isin(matches.ids, step.report.used)
-        expected = landmarks.ids[:0]
+    def _count(self, view: MapView, step: Step) -> None:
+        """Count landmarks as seen or missed, in place, unless the frame's pose was not measured."""
+        m, tracks, rows, matches = self.config, step.tracks, step.tracks.mapped, step.matches
+        matches = matches.select(isin(matches.ids, step.report.used))
+        expected = rows[:0]
         if not step.tracking.unmatched:
             size = (self.rig.width, self.rig.height)
             shown = expected_landmarks(view, step.features, size, m.view_margin, m.occlusion_radius)
-            shown &= self._localizer.similar_view(view.T_world_left, landmarks, view.positions)
-            expected = landmarks.ids[shown]
-        ids, rows = matches.ids[measured], matches.rows[measured]
-        place = view.T_world_left[:3, 3], view.in_image, self._localizer.config.rematch_after
-        return landmarks.after_frame(
-            step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.suspects
-        )
+            shown &= self._localizer.similar_view(view.T_world_left, tracks.seen_from[rows], view.positions)
+            expected = rows[shown]
+        tracks.count_frame(
+            step.index, expected, tracks.rows(matches.ids), step.features, matches.rows, m.descriptor_update,
+            view.T_world_left[:3, 3], rows[~view.in_image], self._localizer.config.rematch_after,
+            rows[isin(tracks.ids[rows], step.suspects)],
+        )  # fmt: skip
 
     def _add(self, backend: Backend, step: Step, known: BoolArray) -> Step:
         """Turn features that are no landmarks yet into landmarks, unless the pose is unknown.
 
         Features that move, or whose motion label is undecided, are left out.
         """
-        landmarks, features, matches = step.landmarks, step.features, step.matches
-        if len(landmarks) >= MINIMAL_POINTS and not step.tracking.may_add(self.config.restart_after):
+        features, matches = step.features, step.matches
+        if len(step.tracks.mapped) >= MINIMAL_POINTS and not step.tracking.may_add(self.config.restart_after):
             return step
         free = ~known
         free[matches.rows] = free[step.labels.moving] = free[step.labels.undecided] = False
@@ -136,9 +143,9 @@ class Mapper:
 
     def _add_monocular(self, backend: Backend, step: Step, rows: IndexArray) -> Step:
         """Turn features `rows` without a stereo match into landmarks once two views give depth (paper B, 2.2)."""
-        landmarks, features, matches = step.landmarks, step.features, step.matches
+        landmarks, features, matches = step.tracks.landmarks(), step.features, step.matches
         T, sigma = step.estimate.T_world_left, self._localizer.pixel_sigma
-        view = self._view(backend, landmarks, step)
+        view = self._view(backend, step)
         rows = unclaimed(view, landmarks, features, rows)
         there = isin(matches.ids, landmarks.ids)
         local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
@@ -157,8 +164,8 @@ class Mapper:
     def _with_new(self, step: Step, rows: IndexArray) -> Step:
         """A step whose features `rows` (M,) are landmarks, with ids that were never used."""
         ids = self._new_ids(len(rows))
-        landmarks = step.landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
-        return replace(step, landmarks=landmarks, added=step.added.joined(LandmarkMatches(ids, rows)))
+        step.tracks.enter_landmarks(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
+        return replace(step, added=step.added.joined(LandmarkMatches(ids, rows)))
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

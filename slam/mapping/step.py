@@ -15,7 +15,7 @@ from slam.rig_error import CommonError, Correction
 from slam.tracks.localizer import LandmarkMatches
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
-from slam.tracks.table import LandmarkTable
+from slam.tracks.table import Tracks
 
 _NONE = np.zeros(0, np.int64)
 _NOWHERE = Estimate(-np.inf, np.eye(4), np.eye(6), _NONE, np.zeros((0, 3)), np.zeros((0, 3, 3)))
@@ -29,7 +29,7 @@ class Step:
     measured: StereoFeatures  # the features as measured; those of landmarks aligned with earlier images
     features: StereoFeatures  # the same, corrected by the calibration
     prediction: Prediction  # of the back end
-    landmarks: LandmarkTable  # the map
+    tracks: Tracks  # the table of all that is followed or in the map; each stage changes it in place
     matches: LandmarkMatches  # landmarks and the features that show them, without the withheld ones
     standing: Standing  # whether the camera stands
     tracking: TrackingState  # whether the pose is known

@@ -1,4 +1,4 @@
-"""A moving rigid body as the detector keeps it: its pose over the window, and which tracks belong to it."""
+"""A moving rigid body as the detector keeps it: its pose over the window, its extent, and what is reported of it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
 from slam.models import ObjectModels
+from slam.object_data import MovingObject, ObjectEstimate
 from slam.objects.belief import EVEN, BodyBelief, when_measured, when_missed
+from slam.objects.config import ObjectsConfig
 from slam.objects.track_kernels import windows_in_body
-from slam.objects.tracks import Tracks
+from slam.tracks.table import Tracks
 
 _YOUNG = 4  # frames in which a body moves as it did when it was found
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
@@ -206,3 +208,47 @@ def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Ar
     t = tracks
     points, A, known = windows_in_body(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
     return points, A, known
+
+
+def reported(bodies: dict[int, Body], tracks: Tracks, config: ObjectsConfig) -> tuple[MovingObject, ...]:
+    """The bodies that are worth reporting, by ascending id; that they are is counted in place."""
+    out = []
+    for id, body in sorted(bodies.items()):
+        if body.belief is None or not (body.proven and body.moved):
+            continue
+        if _worth_reporting(body, body.belief.estimate, config):
+            count = "reported" if body.belief.estimate.measured else "reported_unmeasured"
+            bodies[id] = replace(body, **{count: getattr(body, count) + 1})
+            out.append(_report(body, body.belief, tracks))
+    return tuple(out)
+
+
+def _worth_reporting(body: Body, estimate: ObjectEstimate, config: ObjectsConfig) -> bool:
+    """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
+    short = estimate.stamp - body.measured_at <= config.report_unmeasured
+    seldom = body.reported_unmeasured + 1 <= config.unmeasured_share * body.reported
+    return estimate.measured or (short and seldom and body.existence > EVEN)
+
+
+def _enclosing(points: Array) -> Array:
+    """Lower and upper corner (2, 3) of a box about points (K, 3), false ones among them left out.
+
+    The percentiles are widened by what they cut off evenly spread points, at most to the outermost point.
+    """
+    lower, upper = outermost(points)
+    more = CUT / (1.0 - 2.0 * CUT) * (upper - lower)
+    return np.stack([np.maximum(lower - more, points.min(axis=0)), np.minimum(upper + more, points.max(axis=0))])
+
+
+def _report(body: Body, belief: BodyBelief, tracks: Tracks) -> MovingObject:
+    estimate = belief.estimate
+    mine = tracks.body == body.id
+    rows = tracks.row[mine & tracks.found]
+    points = tracks.local[mine & tracks.sure]
+    T, new = estimate.T_world_object, belief.since == estimate.stamp
+    motion = np.eye(4) if new else T @ inverse(body.T_before)
+    extent = _enclosing(points) if len(points) > 1 else np.zeros((2, 3))
+    return MovingObject(
+        body.id, np.sort(rows), estimate, motion, T @ inverse(belief.T_begun), extent, body.moving, belief.since,
+        body.measured_at, body.existence,
+    )  # fmt: skip

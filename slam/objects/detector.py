@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from slam.data import Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
+from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
@@ -15,26 +16,84 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.objects import finder, membership
-from slam.objects.bodies import Body, advanced, continued, hidden, with_belief, with_evidence, with_extent
+from slam.objects.bodies import (
+    Body,
+    advanced,
+    continued,
+    hidden,
+    reported,
+    with_belief,
+    with_evidence,
+    with_extent,
+)
 from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.config import ObjectsConfig
-from slam.objects.estimates import reported
 from slam.objects.estimator import FRAMES, BodyEstimator
+from slam.objects.fits import fit_positions, fit_velocities, make_room, record, revise_tracks
 from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
-from slam.objects.measurement import measure
 from slam.objects.merging import merge
-from slam.objects.modes import ObjectDetector, Places
 from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Region, follow_regions
-from slam.objects.revision import CorrectRows, revise_tracks
 from slam.objects.scene import Scene, displacements, moved_since
-from slam.objects.tracks import Tracks, fit_positions, fit_velocities, make_room, record
+from slam.tracks.table import Tracks
 
 _NONE: IndexArray = np.zeros(0, np.intp)
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
+
+
+class ObjectDetector:
+    """What the system asks of a detector of moving objects in every step; by itself it takes everything for still.
+
+    `newly_moving` and `suspects` are asked before the back end's update, `step` comes after it.
+    """
+
+    #: Number of frames for which the table of tracks keeps what it measured.
+    window: int = 0
+    #: Ids of landmarks that may move: they do not measure the camera's next pose.
+    suspects: IdArray = np.zeros(0, np.int64)
+
+    def newly_moving(
+        self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
+    ) -> IdArray:
+        """Ids of landmarks that move in the run's first frames, before it is known what moves: see `suspects`.
+
+        Args:
+            tracks: the table of tracks, as the last frame left it.
+            features: of the frame, before the back end's update.
+            at: rows in the table of the landmarks found in it (K,).
+            rows: of their features (K,).
+            T_world_left: the camera's pose (4, 4), as far as it is known.
+        """
+        return np.zeros(0, np.int64)
+
+    def restart(self) -> None:
+        """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
+
+    def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
+        """Take note that the rig's correction changes before the next frame.
+
+        Args:
+            tracks: the table of tracks.
+            correct: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
+        """
+
+    def step(
+        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, still: IndexArray
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
+        """Say which features move, before any of them becomes a landmark, and report the bodies.
+
+        Args:
+            backend: gives the camera's last poses with their joint covariance.
+            tracks: the table of tracks; landmarks that were found have their feature already. Changed in place.
+            features: of the frame.
+            estimate: the camera's pose after the update.
+            still: rows of features that stay at their pixels while the camera stands.
+        """
+        none = np.zeros(0, np.intp)
+        return MotionLabels(none, none, np.zeros(0, np.int64)), ()
 
 
 class MovingObjectDetector(ObjectDetector):
@@ -48,92 +107,92 @@ class MovingObjectDetector(ObjectDetector):
 
     def __init__(self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> None:
         self.setup = Setup(rig, config, models)
+        self.window = config.window
         self._estimator = BodyEstimator(rig, models)
         self._next_track = 0
         self._next_body = 1
         self.restart()
 
     def restart(self) -> None:
-        """See `slam.objects.modes.ObjectDetector`."""
-        window = self.setup.config.window
+        """See `ObjectDetector`."""
+        window = self.window
         self.bodies: dict[int, Body] = {}
-        self.tracks = Tracks.empty(0, window)
         self.suspects = NO_IDS
         self._stamps = np.full(window, np.nan)
         self._poses = np.tile(np.eye(4), (window, 1, 1))  # of the left camera in the window's frames
         self._number = -1
-        self._first: dict[int, tuple[int, Array]] = {}  # landmarks by id: frame and place of the first sight
         self._path: RecentPoses | None = None
         self._regions: list[Region] = []
 
-    def revise(self, correct: CorrectRows) -> None:
-        """See `slam.objects.modes.ObjectDetector`."""
-        slot = self._number % self.setup.config.window
-        revise_tracks(self.tracks, self.bodies, self._poses, slot, self.setup.rig, correct)
+    def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
+        """See `ObjectDetector`."""
+        if self._number >= 0:
+            slot = self._number % self.window
+            revise_tracks(tracks, self.bodies, self._poses, slot, self.setup.rig, correct)
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
-        T_world_left: Array,
-    ) -> IdArray:  # fmt: skip
-        """See `slam.objects.modes.ObjectDetector`."""
+        self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
+    ) -> IdArray:
+        """See `ObjectDetector`."""
         s, c, now = self.setup, self.setup.config, self._number + 1
-        if not 0 < now < c.window or not len(ids):
+        known = tracks.number[at] >= 0
+        at, rows = at[known], rows[known]
+        if not 0 < now < c.window or not len(at):
             return NO_IDS
-        new = np.flatnonzero([id not in self._first for id in ids.tolist()])
-        self._first.update(zip(ids[new].tolist(), zip(np.maximum(now - ages[new], 0), places(ids[new]))))
-        frames, points = map(np.array, zip(*(self._first[id] for id in ids.tolist())))
+        first = (tracks.dof[at] > 0).argmax(axis=1)  # slots are frames as long as the window is not full
         pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-        return ids[moved_since(
-            s.rig, T_world_left, points, now - frames.astype(float), pixels, s.sigma, c.doubtful, c.suspect,
+        return tracks.ids[at[moved_since(
+            s.rig, T_world_left, tracks.anchor[at], now - first.astype(float), pixels, s.sigma, c.doubtful, c.suspect,
             c.min_support,
-        )]  # fmt: skip
+        )]]  # fmt: skip
 
     def step(
-        self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,
+        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
         still: IndexArray = _NONE,
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
-        """Follow all tracks into this frame, test them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
-        frame = self._begin(backend, features, estimate, landmark)
-        tracks = self.tracks
-        self._advance_bodies(frame)
-        follow(tracks, self.bodies, self._regions, frame, landmark)
-        self._measure(frame)
-        tracks.still[:] = tracks.seen & among(max(len(features), 1), still)[tracks.row]
-        self._fit(frame)
-        self._change_members(frame)
-        found = finder.find_groups(frame, tracks, self.bodies)
-        for group in found.groups:
+        """Follow all tracks into this frame, test them, and find bodies; see `ObjectDetector`."""
+        frame = self._begin(backend, tracks, features, estimate)
+        self._advance_bodies(tracks, frame)
+        follow(tracks, self.bodies, frame)
+        self._measure(tracks, frame)
+        tracks.still[:] = tracks.found & among(max(len(features), 1), still)[tracks.row]
+        self._fit(tracks, frame)
+        self._change_members(tracks, frame)
+        scene, suspects, groups = finder.find_groups(frame, tracks, self.bodies)
+        for group in groups:
             moving = finder.lasting(group, tracks, frame)
             new = finder.moving_group(frame, tracks, moving) if len(moving) else None
             if new is not None:
-                self._found(new, frame, group[0])
+                self._found(new, tracks, frame, group[0])
         if self.setup.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.objects.regions`
-            self._follow_regions(frame)
-        self._prove(frame, found.scene)
-        unproven = np.isin(tracks.body, [body.id for body in self.bodies.values() if not body.proven])
-        c = self.setup.config  # of a body that was dropped: nothing is known of these until a group could be found
-        unproven |= tracks.expelled & tracks.seen & (tracks.count(np.arange(len(tracks))) < c.min_frames + c.confirm)
-        suspected = np.concatenate([tracks.landmark[found.suspects], tracks.landmark[unproven]])
+            self._follow_regions(tracks, frame)
+        self._prove(tracks, frame, scene)
+        unproven = (tracks.body >= 0) & ~self._of_proven(tracks)
+        c, expelled = self.setup.config, np.flatnonzero(tracks.expelled & tracks.found)
+        # of a body that was dropped: nothing is known of these until a group could be found
+        unproven[expelled[tracks.count(expelled) < c.min_frames + c.confirm]] = True
+        suspected = np.concatenate([tracks.ids[suspects], tracks.ids[unproven]])
         self.suspects = np.unique(suspected[suspected >= 0])
-        self._begin_estimates(frame)
-        self._begin_tracks(frame, landmark)
-        return self._motion_labels(frame), reported(self.bodies, tracks, self.setup.config)
+        self._begin_estimates(tracks, frame)
+        self._begin_tracks(tracks, frame)
+        return self._motion_labels(tracks, frame), reported(self.bodies, tracks, self.setup.config)
 
-    def _begin(self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Frame:
-        """Move on by a frame."""
-        s, dimensions = self.setup, features.descriptors.shape[1]
-        if self.tracks.descriptors.shape[1] != dimensions:  # of frames without features
-            self.tracks = Tracks.empty(dimensions, s.config.window)
+    def _begin(self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate) -> Frame:
+        """Move on by a frame; nothing is followed into the first one."""
+        s = self.setup
         self._number += 1
+        measured = among(len(features), tracks.row[tracks.row >= 0])
+        if self._number == 0:
+            tracks.number[:], tracks.body[:], tracks.dof[:] = -1, -1, 0
         slot = self._number % s.config.window
         self._stamps[slot], self._poses[slot] = features.stamp, estimate.T_world_left
         local = s.rig.triangulate(features.uv_left, features.uv_right)
-        measuring = local[(landmark >= 0) & np.isfinite(local[:, 0])]
+        measuring = local[measured & np.isfinite(local[:, 0])]
         self._path = with_estimate(self._path, estimate, s.rig, s.sigma, measuring, FRAMES + 1)
         cameras = recent_poses(backend, FRAMES + 1, self._path, estimate.covariance)
         return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
 
-    def _advance_bodies(self, frame: Frame) -> None:
+    def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:
         """Predict all bodies; forget those that were not seen for long."""
         now, dt = frame.features.stamp, frame.dt
         for body in list(self.bodies.values()):
@@ -141,15 +200,15 @@ class MovingObjectDetector(ObjectDetector):
             too_long = now - body.seen_at > self.setup.config.forget_after
             if too_long or (fresh and body.missed >= _PATIENCE + body.seen):
                 del self.bodies[body.id]
-                self.tracks.give_up(np.flatnonzero(self.tracks.body == body.id))
+                tracks.give_up(np.flatnonzero(tracks.body == body.id))
             else:
                 self.bodies[body.id] = advanced(body, dt, frame.slot, self.setup.models)
 
-    def _measure(self, frame: Frame) -> None:
+    def _measure(self, tracks: Tracks, frame: Frame) -> None:
         """Estimate the bodies, and add this frame's measurements to the tracks, in world coordinates."""
-        tracks, f = self.tracks, frame.features
+        f = frame.features
         for body in list(self.bodies.values()):
-            mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
+            mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
             front = (other for other in self.bodies.values() if other.proven and other.id != body.id)
             tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
             belief = located(body, tracks, frame, self._estimator)
@@ -161,57 +220,56 @@ class MovingObjectDetector(ObjectDetector):
             mine = np.flatnonzero(tracks.body == body.id)
             tracks.position[mine] = transform(body.T, tracks.local[mine])
         make_room(tracks, frame.slot)
-        self._record(frame, np.flatnonzero(tracks.seen))
+        self._record(tracks, np.flatnonzero(tracks.found), frame)
 
-    def _record(self, frame: Frame, seen: IndexArray) -> None:
-        """Add what tracks measured in this frame."""
-        tracks, f = self.tracks, frame.features
-        z = measurement_rows(f.uv_left[tracks.row[seen]], f.uv_right[tracks.row[seen]])
-        what = measure(self.setup.rig, frame.T_world_left, tracks.position[seen], z, self.setup.sigma)
-        record(tracks, seen, frame.slot, *what)
+    def _record(self, tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
+        """Add what tracks (K,) measured in this frame."""
+        record(tracks, rows, frame.slot, self.setup.rig, frame.T_world_left, frame.features, self.setup.sigma)
 
-    def _fit(self, frame: Frame) -> None:
+    def _fit(self, tracks: Tracks, frame: Frame) -> None:
         """Positions of free tracks, and velocities of those that may move."""
-        tracks, c = self.tracks, self.setup.config
-        free = np.flatnonzero((tracks.body < 0) & tracks.seen)
+        c = self.setup.config
+        free = np.flatnonzero((tracks.body < 0) & tracks.found)
         count = tracks.count(free)
         unsure = (count < c.min_frames) | tracks.doubtful[free] | tracks.velocity[free].any(axis=1)
         fit_positions(tracks, free)
         fit_velocities(tracks, free[unsure & (count > 1)], frame.times, c.max_speed)
 
-    def _change_members(self, frame: Frame) -> None:
+    def _change_members(self, tracks: Tracks, frame: Frame) -> None:
         """Update the bodies' members; bodies that do not move are dropped."""
-        tracks = self.tracks
         gains = membership.update_members(self.bodies, frame, tracks)
         for id, body in list(self.bodies.items()):
             typical = median(gains[id]) if len(gains.get(id, ())) else 0.0
             body = self.bodies[id] = with_evidence(body, typical)
             if id in gains and typical <= 0 and not body.proven:
-                self._drop(body)
+                self._drop(tracks, body)
             elif id in gains:
                 mine = np.flatnonzero((tracks.body == id) & tracks.sure)
                 self.bodies[id] = with_extent(body, tracks.local[mine])
         merge(self.bodies, tracks)
 
-    def _follow_regions(self, frame: Frame) -> None:
+    def _follow_regions(self, tracks: Tracks, frame: Frame) -> None:
         """Follow the regions that may move; one that has moved for certain becomes a body."""
-        self._regions = follow_regions(self._regions, frame, self.tracks)
+        self._regions = follow_regions(self._regions, frame, tracks)
         for region in [r for r in self._regions if r.has_moved(frame)]:
             self._regions.remove(region)
-            self._found(finder.region_group(frame, self.tracks, region), frame, far=True)
+            self._found(finder.region_group(frame, tracks, region), tracks, frame, far=True)
 
-    def _found(self, group: finder.MovingGroup, frame: Frame, whole: int | None = None, far: bool = False) -> None:
+    def _found(
+        self, group: finder.MovingGroup, tracks: Tracks, frame: Frame, whole: int | None = None, far: bool = False
+    ) -> None:
         """Make a body of tracks with a common twist, or continue with them one that was out of view.
 
         That keeps its id, but not its points. Where the tracks belong to another body, both are merged later.
 
         Args:
-            group: the tracks.
+            group: the tracks that move.
+            tracks: all tracks.
             frame: the present one.
             whole: id of the body that they are a part of, with a motion of their own; None for none.
             far: whether they were followed for farther than they are wide already.
         """
-        tracks, members = self.tracks, group.members
+        members = group.members
         body = replace(group.body(self._next_body, frame, tracks), far=far)
         parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
         known = membership.reappeared(parts, body)
@@ -222,13 +280,13 @@ class MovingObjectDetector(ObjectDetector):
         membership.add_members(body, tracks, members, sure=True)
         self.bodies[body.id] = with_extent(replace(body, apart_from=whole), tracks.local[members])
 
-    def _prove(self, frame: Frame, scene: Scene) -> None:
+    def _prove(self, tracks: Tracks, frame: Frame, scene: Scene) -> None:
         """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
-        s, tracks = self.setup, self.tracks
+        s = self.setup
         for body in list(self.bodies.values()):
             if not body.measured:
                 continue
-            members = np.flatnonzero((tracks.body == body.id) & tracks.seen)
+            members = np.flatnonzero((tracks.body == body.id) & tracks.found)
             members = members[tracks.count(members) >= s.config.min_frames - 1]
             moved = displacements(tracks, members, frame.ages, frame.poses[:, :3, 3], s.slide)
             way = Way.of(body, frame)
@@ -238,44 +296,49 @@ class MovingObjectDetector(ObjectDetector):
             body = replace(body, evidence=evidence, certain=certain, proven=body.proven or certain >= PROOF)
             self.bodies[body.id] = body
             if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
-                self._drop(body)
+                self._drop(tracks, body)
 
-    def _drop(self, body: Body) -> None:
+    def _drop(self, tracks: Tracks, body: Body) -> None:
         """Let a body's tracks go; they stay suspected for a while, and need proof to become members of another one."""
-        mine = np.flatnonzero(self.tracks.body == body.id)
-        membership.remove_members(self.tracks, mine, body)
-        self.tracks.expelled[mine] = True
+        mine = np.flatnonzero(tracks.body == body.id)
+        membership.remove_members(tracks, mine, body)
+        tracks.expelled[mine] = True
         del self.bodies[body.id]
 
-    def _begin_estimates(self, frame: Frame) -> None:
+    def _begin_estimates(self, tracks: Tracks, frame: Frame) -> None:
         """Begin the estimates of bodies that have none."""
-        tracks = self.tracks
         for id, body in list(self.bodies.items()):
             if body.belief is None and body.measured:
-                mine = np.flatnonzero((tracks.body == id) & tracks.seen)
+                mine = np.flatnonzero((tracks.body == id) & tracks.found)
                 seen = observed(body, tracks, mine, tracks.row[mine], frame.features, body.T)
                 belief = self._estimator.updated(None, id, seen, frame.cameras)
                 self.bodies[id] = replace(body, belief=belief, measured_at=frame.features.stamp)
 
-    def _begin_tracks(self, frame: Frame, landmark: IdArray) -> None:
-        """New tracks at stereo features that continue none; give up tracks not seen for long."""
-        tracks, f = self.tracks, frame.features
-        tracks.give_up(np.flatnonzero((tracks.missed > self.setup.config.patience) & (tracks.body < 0)))
-        taken = among(len(f), tracks.row[tracks.seen])
-        rows = np.flatnonzero(~taken & np.isfinite(frame.local[:, 0]))
-        ids = np.arange(self._next_track, self._next_track + len(rows), dtype=np.int64)
-        self._next_track += len(rows)
-        new = tracks.begin(ids, f, rows, transform(frame.T_world_left, frame.local[rows]))
-        tracks.landmark[new] = landmark[rows]
-        self._record(frame, new)
+    def _begin_tracks(self, tracks: Tracks, frame: Frame) -> None:
+        """Follow landmarks and stereo features that are not followed yet; give up what was not found for long."""
+        f, deep = frame.features, np.isfinite(frame.local[:, 0])
+        lost = (tracks.number >= 0) & (tracks.body < 0) & (tracks.unfound > self.setup.config.patience)
+        tracks.give_up(np.flatnonzero(lost))
+        found = np.flatnonzero(tracks.row >= 0)
+        anew = found[(tracks.number[found] < 0) & deep[tracks.row[found]]]
+        rows = np.flatnonzero(~among(len(f), tracks.row[found]) & deep)
+        unused = np.flatnonzero(~tracks.used)[: len(rows)]
+        tracks.row[unused] = rows
+        new = np.concatenate([anew, unused])
+        numbers = np.arange(self._next_track, self._next_track + len(new))
+        self._next_track += len(new)
+        tracks.begin(new, numbers, f, transform(frame.T_world_left, frame.local[tracks.row[new]]))
+        self._record(tracks, new, frame)
         fit_positions(tracks, new)
 
-    def _motion_labels(self, frame: Frame) -> MotionLabels:
-        tracks, n = self.tracks, len(frame.features)
+    def _of_proven(self, tracks: Tracks) -> BoolArray:
+        """Which tracks (N,) belong to a body that has moved for certain."""
+        return np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
+
+    def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
+        n = len(frame.features)
         on, near = membership.tracks_on_bodies(self.bodies, tracks, self.setup.config.margin)
-        proven = np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
-        landmarks = np.unique(tracks.landmark[proven])
-        tracks.landmark[proven] = -1
         moving = among(n, tracks.row[on])
-        undecided = among(n, tracks.row[near]) | among(n, tracks.row[tracks.seen & tracks.doubtful])
-        return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks[landmarks >= 0])
+        undecided = among(n, tracks.row[near]) | among(n, tracks.row[tracks.found & tracks.doubtful])
+        landmarks = np.sort(tracks.ids[self._of_proven(tracks) & (tracks.ids >= 0)])
+        return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks)

@@ -12,34 +12,31 @@ from slam.geometry.arrays import among
 from slam.geometry.se3 import Array, points_by_pose
 from slam.objects import membership
 from slam.objects.bodies import Body, in_body_axes, new_body
+from slam.objects.fits import constant_velocity, fit_velocities
 from slam.objects.frame import Frame
 from slam.objects.points import compact
 from slam.objects.regions import Region
 from slam.objects.scene import LAG, Scene, classify_scene, displacements, known_well
-from slam.objects.tracks import Tracks, constant_velocity, fit_velocities
+from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What the finder says of a frame."""
-
-    scene: Scene  # the still world, as it appears to move
-    suspects: IndexArray  # rows of tracks in groups that may move
-    # tracks that have moved alike for some frames, each with the id of the body that they are a part of, or None
-    groups: list[tuple[int | None, IndexArray]]
-
-
-def find_groups(frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]) -> Found:
+def find_groups(
+    frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]
+) -> tuple[Scene, IndexArray, list[tuple[int | None, IndexArray]]]:
     """Test the free tracks against the world, and the tracks on bodies against these; notes in place what is in doubt.
 
     What moves otherwise than the body on which it lies is a part of that.
+
+    Returns:
+        the still world, as it appears to move; rows of tracks in groups that may move; and those that have moved alike
+        for some frames, each group with the id of the body that it is a part of, or None.
     """
     c = frame.setup.config
     least = LAG * frame.dt * c.min_speed
-    rows, scene = _classified(frame, tracks, np.flatnonzero(tracks.seen & (tracks.body < 0)))
+    rows, scene = _classified(frame, tracks, np.flatnonzero(tracks.found & (tracks.body < 0)))
     groups = [rows[g.members][~tracks.still[rows[g.members]]] for g in scene.groups]
     moving = [members for g, members in zip(scene.groups, groups) if g.moves(c.group_test, least)]
     parts = [
@@ -59,7 +56,7 @@ def find_groups(frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]) -> Fou
     alike = of_parts | among(len(tracks), np.concatenate([np.zeros(0, np.intp), *moving]))
     tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
     alone = [(None, members) for members in groups if 2 * of_parts[members].sum() <= len(members)]
-    return Found(scene, suspects, [*parts, *alone])
+    return scene, suspects, [*parts, *alone]
 
 
 def lasting(group: tuple[int | None, IndexArray], tracks: Tracks, frame: Frame) -> IndexArray:

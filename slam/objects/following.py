@@ -7,28 +7,26 @@ from collections.abc import Mapping
 import numpy as np
 
 from slam.chi_square import SIGMAS
-from slam.data import BoolArray, IdArray, IndexArray
-from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.data import BoolArray, IndexArray
+from slam.geometry.arrays import among
+from slam.geometry.se3 import points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.frame import Frame
-from slam.objects.pixel_kernels import within_reach
-from slam.objects.regions import Region
-from slam.objects.track_kernels import inverses, predicted_pixels
-from slam.objects.tracks import Tracks
+from slam.objects.track_kernels import inverses, predicted_pixels, within_reach
 from slam.tracks import follow as features_of_tracks
+from slam.tracks.table import Tracks
 
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 
 
-def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], frame: Frame, landmark: IdArray) -> None:
-    """Find each track's feature in this frame; sets rows, landmarks, descriptors and misses, in place.
+def follow(tracks: Tracks, bodies: Mapping[int, Body], frame: Frame) -> None:
+    """Find the features of the tracks that have none yet; sets rows, looks and misses, in place.
 
-    A feature that was matched to a landmark (`landmark` (N,), −1 for none) continues that landmark's track. The others
-    are looked for where their fit (or their body's motion) says, in windows as wide as that is uncertain. What is left,
-    and was not known for long enough to have a velocity, is looked for where the body or the region takes it on which
-    it lies, and then as far as `max_speed` allows.
+    A landmark that was found has its feature already. The others are looked for where their fit (or their body's
+    motion) says, in windows as wide as that is uncertain. What is left, and was not known for long enough to have a
+    velocity, is looked for as far off as `max_speed` allows.
 
     Members of bodies take over their feature's descriptor even if `slam.objects.recovery.located` does not confirm the
     match afterwards, because the body's pose is wrong more often than the match. Members of a body that was not
@@ -36,34 +34,21 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], fr
     Features matched with them stay available to free tracks until the body is located. Otherwise nothing that newly
     comes into view of such a body would be detected.
     """
-    tracks.row[:] = -1
-    alive = np.flatnonzero(tracks.ids >= 0)
+    alive = np.flatnonzero(tracks.number >= 0)
     _advance(tracks, bodies, alive, frame.dt)
     lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
-    taken = np.zeros(len(frame.features), bool)
-    _continue_landmarks(tracks, landmark, taken)
-    expected = alive[~lost & (tracks.row[alive] < 0)]
-    _look(tracks, frame, expected, tracks.position[expected], tracks.covariance[expected], taken)
+    taken = among(len(frame.features), tracks.row[tracks.row >= 0])
+    _look(tracks, frame, alive[~lost & (tracks.row[alive] < 0)], taken)
     of_lost = alive[lost]
-    held = tracks.row[np.setdiff1d(np.flatnonzero(tracks.seen & (tracks.body >= 0)), of_lost)]
-    _carried_along(tracks, bodies, regions, frame, taken)
+    of_others = np.setdiff1d(np.flatnonzero(tracks.found & (tracks.body >= 0)), of_lost)
+    held = among(len(taken), tracks.row[of_others])
     _far(tracks, frame, taken)
-    unclaimed = of_lost[tracks.row[of_lost] < 0]
-    if len(unclaimed):
-        _look(
-            tracks, frame, unclaimed, tracks.position[unclaimed], tracks.covariance[unclaimed],
-            np.zeros(len(taken), bool),
-        )  # fmt: skip
-        tracks.row[unclaimed[np.isin(tracks.row[unclaimed], held)]] = -1
-    seen = np.flatnonzero(tracks.seen)
-    tracks.missed += 1
-    tracks.missed[seen] = 0
-    named = seen[landmark[tracks.row[seen]] >= 0]
-    ids = landmark[tracks.row[named]]
-    tracks.landmark[np.isin(tracks.landmark, ids)] = -1  # one track a landmark
-    tracks.landmark[named] = ids
-    seen = np.setdiff1d(seen, of_lost)
-    tracks.descriptors[seen] = frame.features.descriptors[tracks.row[seen]]
+    _look(tracks, frame, of_lost[tracks.row[of_lost] < 0], held)
+    found = np.flatnonzero(tracks.found)
+    tracks.unfound[:] += 1
+    tracks.unfound[found] = 0
+    found = np.setdiff1d(found, of_lost)
+    tracks.look[found] = frame.features.descriptors[tracks.row[found]]
 
 
 def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: float) -> None:
@@ -79,82 +64,33 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: IndexArray, dt: 
         tracks.position[mine], tracks.covariance[mine] = transform(body.T, tracks.local[mine]), R @ spread @ R.T
 
 
-def _continue_landmarks(tracks: Tracks, landmark: IdArray, taken: BoolArray) -> None:
-    """The features of landmarks (N,) that have a track, which are then `taken`."""
-    matched = np.flatnonzero(landmark >= 0)
-    if len(matched):
-        matched = matched[np.argsort(landmark[matched])]
-        row = matched[np.minimum(np.searchsorted(landmark[matched], tracks.landmark), len(matched) - 1)]
-        found = np.flatnonzero(landmark[row] == tracks.landmark)
-        _enter(tracks, found, row[found], taken)
-
-
-def _look(tracks: Tracks, frame: Frame, rows: IndexArray, places: Array, covariances: Array, taken: BoolArray) -> None:
-    """Look for tracks (M,) in windows about places (M, 3) in the world that have covariances (M, 3, 3).
-
-    Features that are `taken` (N,) are not found; those that are found are entered there. A track may be looked for at
-    several places: the first at which it is found counts.
-    """
+def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> None:
+    """Look for tracks (M,) where they are expected, among features that are not `taken` (N,); these are then."""
     if not len(rows):
         return
     s, c, f, T = frame.setup, frame.setup.config, frame.features, frame.T_world_left
-    z, S = predicted_pixels(s.rig.rectified_parameters, T, places, covariances, s.sigma)
+    places = tracks.position[rows]
+    z, S = predicted_pixels(s.rig.rectified_parameters, T, places, tracks.covariance[rows], s.sigma)
     least = np.where(tracks.doubtful[rows], 0.5 * c.search_limit, c.search_radius)
     windows = features_of_tracks.Windows((SIGMAS,), (c.d_match,), c.ratio, c.search_limit, least)
-    looks = tracks.descriptors[rows], tracks.laplacian[rows]
-    found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows)
+    looks = tracks.look[rows], tracks.laplacian[rows]
+    found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows, taken)
     m, row = found.tracks, found.features
     # A right pixel off by more says that this is another point, or a false stereo match.
     depth = np.maximum((places[m] - T[:3, 3]) @ T[:3, 2], 1e-3)
     uneven = np.where(tracks.count(rows[m]) < c.min_frames, 1.0, _UNEVEN)
     deviation = np.sqrt(np.maximum(S[m, 2, 2], s.sigma**2))  # rounding may leave a covariance that is not definite
     allowance = _RIGHT_SIGMAS * deviation + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth
-    good = ~(taken[row] | (np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance))  # NaN compares false
-    _enter(tracks, rows[m[good]], row[good], taken)
-
-
-def _enter(tracks: Tracks, rows: IndexArray, features: IndexArray, taken: BoolArray) -> None:
-    """Note features (M,) found for tracks (M,): a track's first; of tracks alike to the bit, the first has it."""
-    _, first = np.unique(rows, return_index=True)
-    features, of_feature = np.unique(features[first], return_index=True)
-    tracks.row[rows[first[of_feature]]] = features
-    taken[features] = True
-
-
-def _carried_along(
-    tracks: Tracks, bodies: Mapping[int, Body], regions: list[Region], frame: Frame, taken: BoolArray
-) -> None:
-    """Look for young tracks on what moves where it takes them."""
-    s, dt = frame.setup, frame.dt
-    young = _young(tracks, s.config.min_frames - 1)
-    places = tracks.position[young]
-    found = [(young[:0], places[:0], tracks.covariance[:0])]
-    for body in bodies.values():
-        size = s.config.margin * body.across
-        local = transform(inverse(body.T_before), places)
-        on = np.flatnonzero(((local > body.lower - size) & (local < body.upper + size)).all(axis=1))
-        R = body.T[:3, :3]
-        more = R @ body.covariance[3:, 3:] @ R.T
-        found.append((young[on], transform(body.T, local[on]), tracks.covariance[young[on]] + more))
-    for region in regions:
-        middle = region.state[:3]
-        on = np.flatnonzero(np.linalg.norm(places - middle, axis=1) < s.radius(np.linalg.norm(middle - frame.eye)))
-        P = tracks.covariance[young[on]] + dt**2 * region.covariance[3:, 3:]
-        found.append((young[on], places[on] + dt * region.state[3:], P))
-    rows, ahead, covariances = (np.concatenate(column) for column in zip(*found))
-    _look(tracks, frame, rows, ahead, covariances, taken)
-
-
-def _young(tracks: Tracks, most: int) -> IndexArray:
-    """Free tracks that were seen in the last frame, not in this, with no more measurements than `most`."""
-    lost = np.flatnonzero((tracks.ids >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.missed == 0))
-    return np.asarray(lost[tracks.count(lost) <= most])
+    good = ~(np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance)  # NaN compares false
+    tracks.find(rows[m[good]], row[good])
+    taken[row[good]] = True
 
 
 def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
-    """Look for tracks without a velocity yet anywhere that `max_speed` allows, in features that are not taken (N,)."""
+    """Look for tracks without a velocity yet as far off as `max_speed` allows, in features not `taken` (N,)."""
     s, c = frame.setup, frame.setup.config
-    left = _young(tracks, c.min_frames)
+    left = np.flatnonzero((tracks.number >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.unfound == 0))
+    left = left[tracks.count(left) <= c.min_frames]
     free = np.flatnonzero(~taken & np.isfinite(frame.local[:, 0]))
     if not len(left) or not len(free):
         return
@@ -164,6 +100,6 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
         tracks.position[left], transform(frame.T_world_left, local), np.einsum("nii->n", tracks.covariance[left]),
         deviation**2, c.max_speed * frame.dt, SIGMAS,
     )  # fmt: skip
-    looks, features = (tracks.descriptors[left], tracks.laplacian[left]), frame.features.select(free)
+    looks, features = (tracks.look[left], tracks.laplacian[left]), frame.features.select(free)
     found = features_of_tracks.match_everywhere(*looks, features, c.wide_d_match, c.wide_ratio, allowed)
-    _enter(tracks, left[found.tracks], free[found.features], taken)
+    tracks.find(left[found.tracks], free[found.features])

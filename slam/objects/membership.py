@@ -18,10 +18,11 @@ from slam.data import BoolArray
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
+from slam.objects.fits import EXPLAINED, fit_positions, times_vectors
 from slam.objects.frame import Frame
 from slam.objects.points import MAX_REJECTIONS
 from slam.objects.track_kernels import inverses, squares, weighted_means
-from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, times_vectors
+from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
@@ -59,7 +60,7 @@ def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Membe
     """Compare the fit of tracks to a body with that to the still world, over the window."""
     points, A, known = in_body_axes(body, tracks, rows)
     dof = np.where(known, tracks.dof[rows], 0)
-    fixed, still, count = _squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
+    fixed, still, count = squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
     limit = _limits(3 * dof.shape[1])[np.maximum(dof.sum(axis=1) - 3, 1)]
     fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
     return MembershipTest(still - fixed, fits, count)
@@ -78,14 +79,14 @@ def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Bod
     """
     body = _with_poses_fitted(replace(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
     points, A, _ = in_body_axes(body, tracks, rows)
-    return with_extent(replace(body, T=body.history[slot]), _means(points, A))
+    return with_extent(replace(body, T=body.history[slot]), weighted_means(points, A))
 
 
 def _with_poses_fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
     """A body with its poses over the window fitted to what tracks measured."""
     for _ in range(_ROUNDS):
         points, A, _ = in_body_axes(body, tracks, rows)
-        y = _means(points, A)
+        y = weighted_means(points, A)
         J = -points_by_pose(y)
         JA = np.swapaxes(J, 1, 2)[:, None] @ A
         normal = (JA @ J[:, None]).sum(axis=0) + np.diag([_TURN**-2] * 3 + [_SHIFT**-2] * 3)
@@ -100,7 +101,7 @@ def add_members(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool =
         return
     points, A, _ = in_body_axes(body, tracks, rows)
     tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.doubtful[rows] = body.id, 0, 0, False
-    tracks.local[rows], tracks.local_information[rows] = _means(points, A), A.sum(axis=1)
+    tracks.local[rows], tracks.local_information[rows] = weighted_means(points, A), A.sum(axis=1)
     tracks.sure[rows] = sure
 
 
@@ -110,7 +111,7 @@ def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
         return
     tracks.position[rows] = transform(body.T, tracks.local[rows])
     tracks.forget_past(rows)
-    tracks.missed[rows] = 1
+    tracks.unfound[rows] = 1
 
 
 def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
@@ -135,7 +136,7 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
         gains[body.id] = _expel(body, tracks, config)
     if not bodies:
         return gains
-    free = np.flatnonzero((tracks.body < 0) & tracks.seen & ~tracks.still)
+    free = np.flatnonzero((tracks.body < 0) & tracks.found & ~tracks.still)
     free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
     for body in bodies.values():
@@ -172,7 +173,7 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     That is the `MembershipTest.gain` less what the body's poses, fitted to its members, gain by chance.
     """
     mine = np.flatnonzero(tracks.body == body.id)
-    v, seen = membership_test(body, tracks, mine), tracks.seen[mine]
+    v, seen = membership_test(body, tracks, mine), tracks.found[mine]
     most_fit = v.fits[seen].sum() > _MOST * seen.sum()
     unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
@@ -185,7 +186,7 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
         mine = mine[~wrong]
     if len(mine) > config.max_points:
         worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
-        order = np.lexsort((worth, -tracks.missed[mine]))
+        order = np.lexsort((worth, -tracks.unfound[mine]))
         remove_members(tracks, mine[order[: len(mine) - config.max_points]], body)
     stay = seen & ~wrong
     return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
@@ -206,7 +207,7 @@ def tracks_on_bodies(
     A track inside a body's extent lies on it, unless it is known to stand still. Tracks on a body that is not proven
     yet belong to the second group.
     """
-    seen, known = tracks.seen, tracks.body >= 0
+    seen, known = tracks.found, tracks.body >= 0
     on = np.zeros(len(tracks), bool)
     for body in bodies.values():
         if body.proven:
@@ -226,9 +227,9 @@ def tracks_on_bodies(
 
 def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
     """Rows of the seen tracks that belong to a body, or lie on or near it and belong to none."""
-    free = np.flatnonzero(tracks.seen & (tracks.body < 0))
+    free = np.flatnonzero(tracks.found & (tracks.body < 0))
     near = free[_distances(body, tracks, free, margin) < _NEAR]
-    return np.concatenate([np.flatnonzero(tracks.seen & (tracks.body == body.id)), near])
+    return np.concatenate([np.flatnonzero(tracks.found & (tracks.body == body.id)), near])
 
 
 def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
@@ -244,9 +245,9 @@ def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.int
         near = _distances(replace(body, reach=np.inf), tracks, rows, _MERGED) < _NEAR
         if not body.measured or 2 * near.sum() <= len(rows):
             continue
-        alone = float(_squares(*in_body_axes(own, tracks, rows)[:2]).sum())
+        alone = float(squares(*in_body_axes(own, tracks, rows)[:2]).sum())
         points, A, known = in_body_axes(body, tracks, rows)
-        fixed = float(_squares(points, A).sum())
+        fixed = float(squares(points, A).sum())
         still = float(_still(tracks, rows, known).sum())
         by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
         certain = _squares_with_pose_error(points, A, body)
@@ -261,11 +262,11 @@ def _squares_with_pose_error(points: Array, A: Array, body: Body) -> float:
 
     In every frame the points share the displacement by the error of the body's pose, of known covariance.
     """
-    y = _means(points, A)
+    y = weighted_means(points, A)
     shared = np.linalg.inv(_spread_of_place(body, y.mean(axis=0)))
     pull = times_vectors(A, points - y[:, None]).sum(axis=0)
     explained = (pull * np.linalg.solve(A.sum(axis=0) + shared, pull[..., None])[..., 0]).sum()
-    return float(_squares(points, A).sum() - explained)
+    return float(squares(points, A).sum() - explained)
 
 
 def _spread_of_place(body: Body, y: Array) -> Array:
@@ -310,7 +311,7 @@ def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
         return False
     points, A, known = in_body_axes(whole, tracks, rows)
     still = float(_still(tracks, rows, known).sum())
-    return float(_squares(points, A).sum()) < _PART_EXPLAINED * still
+    return float(squares(points, A).sum()) < _PART_EXPLAINED * still
 
 
 def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
@@ -324,7 +325,7 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     one, other = replace(one, known=both), replace(other, known=both)
 
     def left(body: Body, rows: NDArray[np.intp]) -> float:
-        return float(_squares(*in_body_axes(_with_poses_fitted(body, tracks, rows), tracks, rows)[:2]).sum())
+        return float(squares(*in_body_axes(_with_poses_fitted(body, tracks, rows), tracks, rows)[:2]).sum())
 
     every = np.concatenate([ones, others])
     more = left(one, every) - left(one, ones) - left(other, others)
@@ -359,16 +360,6 @@ def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     t.local[mine] += times_vectors(inverses(total, _RIDGE, 0.0), times_vectors(turned, gap))
 
 
-def _squares(points: Array, A: Array) -> Array:
-    """χ² (N,) of "one fixed point" for points by slot (N, W, 3) with information (N, W, 3, 3)."""
-    return np.asarray(squares(points, A))
-
-
 def _still(tracks: Tracks, rows: NDArray[np.intp], known: BoolArray) -> Array:
     """χ² (N,) of "one fixed point in the world" in the slots of tracks that are `known` (N, W)."""
-    return _squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))
-
-
-def _means(points: Array, A: Array) -> Array:
-    """Means (N, 3) of points by slot (N, W, 3), weighted by their information (N, W, 3, 3)."""
-    return np.asarray(weighted_means(points, A))
+    return squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from slam.geometry.se3 import inverse
 from slam.objects import membership
 from slam.objects.bodies import Body, continued
-from slam.objects.tracks import Tracks
+from slam.tracks.table import Tracks
 
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
@@ -75,7 +75,7 @@ def _told_apart(body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray
 
 def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks) -> Body:
     """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
-    tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
+    tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.found))
     grown = continued(body, known)
     own = np.flatnonzero(tracks.body == body.id)
     membership.take_to(tracks, own, inverse(grown.T) @ body.T)
@@ -85,4 +85,4 @@ def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks
 
 def _members(tracks: Tracks, id: int) -> NDArray[np.intp]:
     """Rows of a body's seen members."""
-    return np.flatnonzero((tracks.body == id) & tracks.seen)
+    return np.flatnonzero((tracks.body == id) & tracks.found)

@@ -27,9 +27,10 @@ from slam.data import IndexArray
 from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, points_by_pose
 from slam.objects.bodies import Body
+from slam.objects.fits import EXPLAINED, times_vectors
 from slam.objects.frame import Frame
 from slam.objects.scene import Displacements, Scene
-from slam.objects.tracks import EXPLAINED, Tracks, times_vectors
+from slam.tracks.table import Tracks
 
 PROVEN = 12.0  #: −log10 of the chance from which a body has moved for certain if it went farther than the camera; at 8
 #: the same bodies are found in `boxes` and on drives, and twice as many pieces of a walker

@@ -17,8 +17,9 @@ from slam.data import BoolArray, IndexArray
 from slam.geometry.kernels import squared_distances
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.objects.fits import AGREES, EXPLAINED, MOVES, ConstantVelocity, constant_velocity
 from slam.objects.frame import Frame
-from slam.objects.tracks import AGREES, EXPLAINED, MOVES, ConstantVelocity, Tracks, constant_velocity
+from slam.tracks.table import Tracks
 
 _NEAR = 7.8  # derived: χ²(3) at 95 %, of tracks inside the region
 _FRAMES = 4  # in which a region has had the tracks that fix a motion
@@ -97,7 +98,7 @@ class _Moving:
 def _moving_tracks(frame: Frame, tracks: Tracks) -> _Moving:
     """Free tracks whose depth is known better than to within a region."""
     s, c = frame.setup, frame.setup.config
-    rows = np.flatnonzero(tracks.seen & (tracks.body < 0) & ~tracks.still)
+    rows = np.flatnonzero(tracks.found & (tracks.body < 0) & ~tracks.still)
     rows = rows[tracks.count(rows) >= c.min_frames - 1]
     m = constant_velocity(tracks, rows, frame.times, c.max_speed)
     depth = (m.position - frame.eye) @ frame.T_world_left[:3, 2]

@@ -28,9 +28,8 @@ from slam.data import BoolArray, IndexArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, hat, inverse, transform
 from slam.objects import scene_kernels as kernels
-from slam.objects.measurement import measure
+from slam.objects.fits import Tracks, measure, times_vectors
 from slam.objects.track_kernels import displaced
-from slam.objects.tracks import Tracks, times_vectors
 
 LAG = 4  #: frames between the older and the recent measurements, about
 _RECENT = 5  # frames that are recent, at most; of short tracks the later half

@@ -1,6 +1,6 @@
 """Compiled loops over tracks: 3x3 matrices are worked through in place of many small batches of arrays.
 
-Windows are those of `slam.objects.tracks.Tracks`: information ``A`` (N, W, 3, 3) and points ``p`` (N, W, 3) by slot;
+Windows are those of `slam.tracks.table.Tracks`: information ``A`` (N, W, 3, 3) and points ``p`` (N, W, 3) by slot;
 `rows` (M,) names the tracks. A fixed point fitted to a window is ``(Σ A)⁻¹ Σ A p``; a small share of the trace on the
 diagonal makes information invertible that knows nothing along the ray.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.linear import column_times, invert_symmetric, multiply, row_times, square, trace, turn, turn_back
-from slam.kernels.se3 import transform_back
+from slam.kernels.se3 import transform, transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import helper, kernel
 
@@ -147,7 +147,7 @@ def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, r
     """How far tracks went from the older to the recent frames of their windows: see `slam.objects.scene`.
 
     Args:
-        A: information by slot, and so on: see `slam.objects.tracks.Tracks`.
+        A: information by slot, and so on: see `slam.tracks.table.Tracks`.
         p: points by slot.
         dof: numbers measured by slot.
         older_A: information of what has left the window.
@@ -301,4 +301,56 @@ def squares(points, A):
     out, mean = np.empty(len(points)), np.empty(3)
     for m in range(len(points)):
         out[m] = _square(points[m], A[m], mean)
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- pixels
+
+
+@kernel
+def points_on_rays(camera, T_world_left, points, measured, sigma, far, steps):
+    """Points (N, 3) on the measured rays, their information (N, 3, 3), and numbers measured (N,).
+
+    See `slam.objects.fits.measure`; `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, `far`
+    [px] how far off an expected point may be, and `steps` how often it is linearised at most.
+    """
+    fu, fv, u0, v0, right_fu, _, shift = camera
+    out, A, dof = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3)), np.zeros(len(points), np.int8)
+    place, r, J, g = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
+    for n in range(len(points)):
+        x, y = (measured[n, 0] - u0) / fu, (measured[n, 1] - v0) / fv
+        transform_back(T_world_left, points[n], place)
+        met, stereo, front = place[2], not np.isnan(measured[n, 2]), False
+        for _ in range(steps):
+            depth = met
+            place[0], place[1], place[2] = x * depth, y * depth, depth
+            front = residual(camera, place, measured[n], r, J) and r[0] + r[1] == r[0] + r[1]
+            if not (front and stereo):
+                break
+            met = depth - r[2] * depth * depth / (right_fu * shift)  # on the ray uR changes by f' b / z
+            if abs(r[2]) <= far:
+                break
+        if not front:
+            transform(T_world_left, np.zeros(3), out[n])
+            continue
+        place[0], place[1], place[2] = x * met, y * met, met
+        transform(T_world_left, place, out[n])
+        dof[n] = 3 if stereo else 2
+        for k in range(dof[n]):
+            by_point(J[k], T_world_left, g)
+            for i in range(3):
+                for j in range(3):
+                    A[n, i, j] += g[i] * g[j] / (sigma * sigma)
+    return out, A, dof
+
+
+@kernel
+def within_reach(start, found, start_variance, found_variance, way, sigmas):
+    """Which places (M, 3) are no farther than `way` [m] from the starts (N, 3), given the variances [m²]: (N, M)."""
+    out = np.empty((len(start), len(found)), np.bool_)
+    for n in range(len(start)):
+        x, y, z = start[n]
+        for m in range(len(found)):
+            square = (found[m, 0] - x) ** 2 + (found[m, 1] - y) ** 2 + (found[m, 2] - z) ** 2
+            out[n, m] = square < (way + sigmas * np.sqrt(start_variance[n] + found_variance[m])) ** 2
     return out

@@ -15,17 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.archives import array, unpack
-from slam.data import Estimate, IdArray, StereoFeatures
+from slam.data import Estimate, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.files import read_bytes, whole_file
+from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, angles, inverse, log, pose, transform
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
-from slam.objects.modes import ObjectDetector
+from slam.objects.detector import ObjectDetector
 from slam.tracks.follow import match_everywhere
+from slam.tracks.table import Tracks
 
 _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # guard: of its numbers
@@ -241,7 +243,7 @@ class Procedure1Detector(ObjectDetector):
         self._last = None
 
     def step(
-        self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray, *_: object
+        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, *_: object
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Recognise the object's features and find its motion; no other feature is classified.
 
@@ -266,7 +268,7 @@ class Procedure1Detector(ObjectDetector):
             R = estimate.T_world_left[:3, :3]
             noise = R @ self.rig.triangulation_covariance(local[at], self.sigma) @ R.T
             self._covariance = motion_covariance(points[at], d.points[self.motion.database], d.origin, noise)
-        moved = np.unique(landmark[rows][landmark[rows] >= 0])
+        moved = np.sort(tracks.ids[(tracks.ids >= 0) & isin(tracks.row, rows)])
         return MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved), self._reported(features)
 
     def _reported(self, features: StereoFeatures) -> tuple[MovingObject, ...]:

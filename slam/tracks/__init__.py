@@ -1,6 +1,6 @@
-"""Tracks: the table of landmarks, the features that continue them, and the camera's pose on which these agree.
+"""Tracks: the table of all that is followed or in the map, and the camera's pose on which landmarks agree.
 
-`table` holds the landmarks' bookkeeping, `follow` matches it with a frame, `localizer` keeps the matches that agree on
+`table` is that table, `follow` finds the features that continue its rows, `localizer` keeps the matches that agree on
 one camera pose, `state` says whether the camera is tracked, `standing` whether it stands; `alignment` moves features to
 the points first seen. May import `slam.geometry`, `slam.runtime` and the data.
 """

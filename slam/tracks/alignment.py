@@ -29,8 +29,10 @@ _FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
 def align(
     rig: StereoRig, frontend: AligningFrontend, features: StereoFeatures, matches: LandmarkMatches,
     landmarks: LandmarkTable, positions: Callable[[IdArray], Array],
-) -> tuple[StereoFeatures, LandmarkTable]:  # fmt: skip
+) -> StereoFeatures:  # fmt: skip
     """Move landmarks' features to where the landmarks' patches are found; those without a patch are unchanged.
+
+    Patches that are to be taken anew are dropped, in place.
 
     Args:
         rig: the cameras.
@@ -40,18 +42,14 @@ def align(
         landmarks: the map.
         positions: returns landmarks' positions (M, 3) [m] in the world by their ids (M,).
 
-    Returns:
-        the features, and the map without the patches that are to be taken anew.
-
     Raises:
         SlamError: the front end does not return pixels.
     """
-    has_patch = landmarks.has_patch
-    landmarks = landmarks.with_patches(np.flatnonzero(has_patch & (landmarks.unseen > _FORGOTTEN)), None)
+    landmarks.patches[landmarks.unseen > _FORGOTTEN] = None
     at = landmarks.rows(matches.ids)
-    usable = (has_patch & (landmarks.unseen <= _FORGOTTEN))[at]
+    usable = landmarks.has_patch[at]
     if matches.T_world_left is None or features.images is None or not usable.any():
-        return features, landmarks
+        return features
     rows, at = matches.rows[usable], at[usable]
     names = ("image", "centre", "size", "T_world_left")
     images, centres, size, poses = (np.array([getattr(p, name) for p in landmarks.patches[at]]) for name in names)
@@ -70,14 +68,15 @@ def align(
     right[~stereo] = np.nan
     uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
     uv_left[rows[aligned]], uv_right[rows[aligned]] = left[aligned], right[aligned]
-    return replace(features, uv_left=uv_left, uv_right=uv_right), landmarks.with_patches(at[~aligned | outgrown], None)
+    landmarks.patches[at[~aligned | outgrown]] = None
+    return replace(features, uv_left=uv_left, uv_right=uv_right)
 
 
-def with_new_patches(
+def take_patches(
     frontend: AligningFrontend, features: StereoFeatures, seen: LandmarkMatches, landmarks: LandmarkTable,
     T_world_left: Array,
-) -> LandmarkTable:  # fmt: skip
-    """The map, in which landmarks that were seen and have no patch get one.
+) -> None:  # fmt: skip
+    """Landmarks that were seen and have no patch get one, in place.
 
     Args:
         frontend: which made the features.
@@ -89,18 +88,17 @@ def with_new_patches(
     Raises:
         SlamError: the front end returns no patches, or not one for each landmark.
     """
-    at = np.flatnonzero(isin(landmarks.ids, seen.ids) & ~landmarks.has_patch)
+    at = np.flatnonzero((landmarks.ids >= 0) & ~landmarks.has_patch)
+    at = at[isin(landmarks.ids[at], seen.ids)]
     if features.images is None or not len(at):
-        return landmarks
+        return
     rows, sizes = seen.rows_of(landmarks.ids[at]), {"n": len(at)}
     one = next((patch for patch in landmarks.patches.tolist() if patch is not None), None)
     if one is not None:
         sizes["s"] = len(one.image)
     answer = frontend.patches(features.images, features.uv_left[rows], features.scale[rows])
     taken: Patches = checked(frontend, "patches", answer, **sizes)
-    return landmarks.with_patches(
-        at, [Patch(*each, T_world_left) for each in zip(taken.images, taken.centres, taken.size)]
-    )
+    landmarks.patches[at] = [Patch(*each, T_world_left) for each in zip(taken.images, taken.centres, taken.size)]
 
 
 def warps_of(rig: StereoRig, poses: Array, T_world_left: Array, positions: Array) -> Array:

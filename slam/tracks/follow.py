@@ -48,7 +48,7 @@ class Windows:
 
 def follow(
     pixels: Array, innovation: Array, descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures,
-    windows: Windows,
+    windows: Windows, taken: BoolArray | None = None,
 ) -> Matches:  # fmt: skip
     """Match tracks to features inside windows around where the tracks are expected.
 
@@ -59,6 +59,7 @@ def follow(
         laplacian: signs of their Laplacians (M,).
         features: of the frame.
         windows: where to look, and what is a match.
+        taken: which of the features (N,) are no candidates; None for none.
     """
     from slam.tracks import follow_kernels
 
@@ -68,9 +69,15 @@ def follow(
         np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), least, windows.most / sizes[0], sizes,
         np.array(windows.d_match, np.float32), np.float32(windows.ratio), np.ascontiguousarray(descriptors), laplacian,
         np.ascontiguousarray(features.uv_left), features.descriptors, features.laplacian,
-        np.argsort(features.uv_left[:, 0], kind="stable"), pairs,
+        _by_column(features.uv_left, taken), pairs,
     )  # fmt: skip
     return Matches(pairs[0, :count], pairs[1, :count])
+
+
+def _by_column(uv: Array, taken: BoolArray | None) -> NDArray[np.intp]:
+    """Rows of pixels (N, 2) that are not `taken` (N,), by column."""
+    order = np.argsort(uv[:, 0], kind="stable")
+    return order if taken is None else order[~taken[order]]
 
 
 def match_everywhere(

@@ -70,35 +70,31 @@ def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, go
 
 @kernel
 def mutual_best(products, allowed, signs, feature_signs, d_match, ratio, best):
-    """Features (N,) into `best` that are each other's nearest with a track, −1 for none.
+    """Features (N,) into `best` that belong to tracks by `best_pairs`, −1 for none, wherever they lie.
 
     Given are the inner products of descriptors, tracks by features (N, M), which pairs are `allowed` (N, M; all where
-    that is empty), and both signs of the Laplacian. A match must be nearer than `d_match`, and than `ratio` times the
-    second.
+    that is empty), and both signs of the Laplacian.
     """
-    tracks, features = products.shape
-    nearest, second = np.empty(tracks, np.float32), np.empty(tracks, np.float32)
-    of_column, most = np.empty(features, np.float32), np.float32(np.inf)
-    for m in range(features):
-        of_column[m] = most
     limit = d_match / ratio  # farther features affect neither best nor ratio
     least = np.float32(1.0) - np.float32(0.5) * limit * limit
-    for n in range(tracks):
-        best[n], nearest[n], second[n] = -1, most, most
-        for m in range(features):
+    count, room = 0, 4 * len(products) + 64
+    rows, columns, distance = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.float32)
+    for n in range(products.shape[0]):
+        best[n] = -1
+        for m in range(products.shape[1]):
             if products[n, m] <= least or signs[n] != feature_signs[m] or (allowed.size > 0 and not allowed[n, m]):
                 continue
+            if count == room:
+                room *= 2
+                rows, columns, distance = grown(rows, room), grown(columns, room), grown(distance, room)
             d = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * products[n, m], np.float32(0.0)))
-            if d < nearest[n]:
-                best[n], second[n], nearest[n] = m, nearest[n], d
-            elif d < second[n]:
-                second[n] = d
-            if d < of_column[m]:
-                of_column[m] = d
-    for n in range(tracks):
-        d = nearest[n]
-        if best[n] >= 0 and not (d < d_match and d < ratio * second[n] and d <= of_column[best[n]]):
-            best[n] = -1
+            rows[count], columns[count], distance[count] = n, m, d
+            count += 1
+    every, good = np.ones(count, np.bool_), np.empty(count, np.bool_)
+    best_pairs(rows, columns, distance, every, count, products.shape, d_match, ratio, good)
+    for p in range(count):
+        if good[p] and best[rows[p]] < 0:
+            best[rows[p]] = columns[p]
 
 
 @helper

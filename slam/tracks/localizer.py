@@ -95,10 +95,10 @@ class Localizer:
         """Landmarks whose features agree with one camera pose; for arguments see `Search`, whose `match` it is."""
         return Search(self, prediction, landmarks, positions, features, seed).match()
 
-    def similar_view(self, T_world_left: Array, landmarks: LandmarkTable, positions: Array) -> BoolArray:
-        """Which landmarks (N,) at `positions` are seen from this pose (4, 4) much as they were at first sight."""
+    def similar_view(self, T_world_left: Array, seen_from: Array, positions: Array) -> BoolArray:
+        """Which landmarks (N,) at `positions` are seen from this pose (4, 4) much as from the places of first sight."""
         limits = self.config.view_angle, self.config.view_ratio
-        return similar_view(positions, landmarks.seen_from, T_world_left[:3, 3], *limits)
+        return similar_view(positions, seen_from, T_world_left[:3, 3], *limits)
 
     def state_after(
         self, tracking: TrackingState, prediction: Prediction, features: StereoFeatures, matches: LandmarkMatches,
@@ -250,7 +250,7 @@ class Search:
 
     def _searched_for(self, T_world_left: Array) -> BoolArray:
         """Which landmarks (N,) are searched for in windows: those in a similar view, and those long out of view."""
-        alike = self.localizer.similar_view(T_world_left, self.landmarks, self.positions)
+        alike = self.localizer.similar_view(T_world_left, self.landmarks.seen_from, self.positions)
         return alike | self.landmarks.long_out_of_view(self.config.rematch_after)
 
     def _in_windows(self, uv: Array, innovation: Array, rows: NDArray[np.intp]) -> Matches:

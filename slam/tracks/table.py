@@ -1,18 +1,26 @@
-"""The map's bookkeeping: landmarks' descriptors and how often they are seen. Positions are the back end's alone."""
+"""The table of tracks: each point that is followed, or is in the map, has one row of it for as long as it lasts.
+
+The landmarks of the map, the members of each body, and what is not decided yet are selections of the rows. A frame's
+step changes the table in place: `Tracks.begun` makes a copy for it, which a step that fails leaves behind.
+"""
+# ruff: noqa: RUF009  (what a column is called with is a description, and no value that rows would share)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Self
+from copy import copy
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.geometry.arrays import Table, among, ascending, isin
+from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
+from slam.geometry.arrays import Table, among
 from slam.geometry.se3 import Array, transform
 from slam.naming import count
+
+_ROOM = 1000  # cost: rows that a table begins with
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,128 +33,248 @@ class Patch:
     T_world_left: Array  # pose of the left camera (4, 4)
 
 
+def _column(dtype: Any, *shape: int, fill: Any = 0) -> Any:
+    """A column with an array of this shape in each row; where it is not given, it is filled."""
+    return field(default=None, metadata={"blank": (dtype, shape, fill)})
+
+
 @dataclass(frozen=True, eq=False)
 class LandmarkTable(Table):
-    """Landmarks in the map, a row each, ids ascending."""
+    """What the map keeps of points, a row each; in a selection of landmarks alone ids ascend.
+
+    Positions are the back end's alone.
+    """
 
     ids: IdArray  # landmark ids (N,)
     descriptors: NDArray[np.float32]  # (N, D)
     laplacian: NDArray[np.int8]  # signs of the Laplacian (N,)
-    seen: IdArray  # number of frames in which it was measured (N,)
-    in_view: IdArray  # number of frames in which it should have been detected or was (N,)
-    missed: IdArray  # number of such frames since it was last measured (N,)
-    last_seen: IdArray  # frame index (N,)
-    seen_from: Array = None  # type: ignore[assignment]  # camera at first sight (N, 3) [m], in the world; NaN: unknown
-    out_of_view: IdArray = None  # type: ignore[assignment]  # frames outside of the image since last measured (N,)
+    seen: IdArray = _column(np.int64)  # number of frames in which it was measured (N,)
+    in_view: IdArray = _column(np.int64)  # number of frames in which it should have been detected or was (N,)
+    missed: IdArray = _column(np.int64)  # number of such frames since it was last measured (N,)
+    last_seen: IdArray = _column(np.int64)  # frame index (N,)
+    seen_from: Array = _column(float, 3, fill=np.nan)  # camera at first sight (N, 3) [m], in the world; NaN: unknown
+    out_of_view: IdArray = _column(np.int64)  # frames outside of the image since last measured (N,)
     # frames since it was last measured (N,), of those in which some landmark was measured and this one not withheld
     # as possibly moving
-    unseen: IdArray = None  # type: ignore[assignment]
+    unseen: IdArray = _column(np.int64)
     # of those long out of view: frames up to the last in which it was found, in succession, without counting (N,)
-    returning: IdArray = None  # type: ignore[assignment]
-    patches: NDArray[np.object_] = None  # type: ignore[assignment]  # `Patch` at first sight (N,), or None
+    returning: IdArray = _column(np.int64)
+    patches: NDArray[np.object_] = _column(object, fill=None)  # `Patch` at first sight (N,), or None
 
     def __post_init__(self) -> None:
-        n = len(self.ids)
-        empty = {"seen_from": np.full((n, 3), np.nan), "patches": np.full(n, None)}
-        for name in ("seen_from", "out_of_view", "unseen", "returning", "patches"):
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, empty.get(name, np.zeros(n, np.int64)))
+        for f in fields(self):
+            if getattr(self, f.name) is None:
+                dtype, shape, fill = f.metadata["blank"]
+                object.__setattr__(self, f.name, np.full((len(self.ids), *shape), fill, dtype))
 
     def __repr__(self) -> str:
-        return f"LandmarkTable({count(len(self), 'landmark')}, {self.descriptors.shape[1]}-D)"
+        return f"{type(self).__name__}({count(int((self.ids >= 0).sum()), 'landmark')}, {self.descriptors.shape[1]}-D)"
 
-    @classmethod
-    def empty(cls, dimensions: int) -> LandmarkTable:
-        """No landmarks, for descriptors of `dimensions` numbers."""
-        none = np.zeros(0, np.int64)
-        return cls(none, np.zeros((0, dimensions), np.float32), np.zeros(0, np.int8), none, none, none, none)
-
-    def rows(self, ids: IdArray) -> NDArray[np.intp]:
+    def rows(self, ids: IdArray) -> IndexArray:
         """Row numbers of ids that are in the map."""
         return np.searchsorted(self.ids, ids)
 
-    def after_frame(
-        self,
-        frame: int,
-        in_view: IdArray,
-        measured: IdArray,
-        features: StereoFeatures,
-        feature_rows: NDArray[np.intp],
-        descriptor_update: float = 1.0,
-        camera: Array | None = None,
-        in_image: BoolArray | None = None,
-        rematch_after: int = 0,
-        withheld: IdArray | None = None,
-    ) -> LandmarkTable:
-        """The rows after a frame, given which ids were in view, which were measured, and by which features.
-
-        `descriptor_update` is the weight of the new descriptors in the landmarks' own: 1 keeps the newest, 0 the first.
-        `in_image` says which landmarks (N,) lie inside the image. If the camera's position (3,) [m] is given, landmarks
-        seen again after `rematch_after` frames outside the image count as first seen now, from there. For landmarks
-        `withheld` from the update, the frame counts as neither missed nor seen.
-        """
-        back = np.zeros(len(self), bool) if withheld is None else isin(self.ids, withheld)
-        view, hit = self.rows(in_view), self.rows(measured)
-        view = view[~back[view]]
-        seen, missed, last_seen = self.seen.copy(), self.missed.copy(), self.last_seen.copy()
-        views = self.in_view + (among(len(self), view) | among(len(self), hit))
-        missed[view] += 1
-        seen[hit] += 1
-        missed[hit] = 0
-        last_seen[hit] = frame
-        descriptors = self.descriptors.copy()
-        look = (1 - descriptor_update) * descriptors[hit] + descriptor_update * features.descriptors[feature_rows]
-        descriptors[hit] = look / np.maximum(np.linalg.norm(look, axis=1, keepdims=True), 1e-6)
-        seen_from = self.seen_from.copy()
-        if camera is not None:
-            again = self.long_out_of_view(rematch_after)[hit]
-            seen_from[hit[again]] = camera
-            descriptors[hit[again]] = features.descriptors[feature_rows[again]]
-        out_of_view = self.out_of_view + (0 if in_image is None else ~in_image)
-        unseen = self.unseen + (~back if len(hit) else 0)
-        out_of_view[hit] = unseen[hit] = 0
-        return replace(
-            self, descriptors=descriptors, seen=seen, in_view=views, missed=missed, last_seen=last_seen,
-            seen_from=seen_from, out_of_view=out_of_view, unseen=unseen,
-        )  # fmt: skip
-
     @property
     def has_patch(self) -> BoolArray:
-        """Which landmarks have a patch (N,)."""
-        return np.array([patch is not None for patch in self.patches], bool)
-
-    def with_patches(self, rows: NDArray[np.intp], patches: Sequence[Patch] | None) -> LandmarkTable:
-        """A copy in which the landmarks at some rows (M,) have other patches; None for none."""
-        if not len(rows):
-            return self
-        column = self.patches.copy()
-        column[rows] = patches
-        return replace(self, patches=column)
+        """Which have a patch (N,)."""
+        return np.asarray(self.patches != np.array(None), bool)
 
     def long_out_of_view(self, after: int) -> BoolArray:
-        """Which landmarks (N,) were outside of the image for `after` frames, or are of an earlier run."""
+        """Which (N,) were outside of the image for `after` frames, or are of an earlier run."""
         return np.asarray((self.last_seen < 0) | (self.out_of_view >= after))
 
-    def with_returning(self, ids: IdArray) -> LandmarkTable:
-        """After a frame in which some landmarks (M,) long out of view were found without counting."""
-        if not (len(ids) or self.returning.any()):
-            return self
-        return replace(self, returning=np.where(isin(self.ids, ids), self.returning + 1, 0))
-
-    def with_new(
-        self, frame: int, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], camera: Array | None = None
-    ) -> LandmarkTable:
-        """The rows with new landmarks, by their ids (M,) and rows of features, seen from `camera` (3,)."""
-        once = np.ones(len(ids), np.int64)
-        seen_from = np.full((len(ids), 3), np.nan) if camera is None else np.tile(camera, (len(ids), 1))
-        looks = features.descriptors[rows], features.laplacian[rows]
-        return self.joined(LandmarkTable(ids, *looks, once, once, 0 * once, frame * once, seen_from))
-
-    def joined(self, other: Self) -> Self:
-        """These and others, ids ascending; none may be in both."""
-        whole = super().joined(other)
-        return whole if ascending(whole.ids) else whole.select(np.argsort(whole.ids, kind="stable"))
+    def count_returning(self, ids: IdArray) -> None:
+        """Count a frame in which some landmarks (M,) long out of view were found without counting, in place."""
+        rows = self.rows(ids)
+        successive = self.returning[rows] + 1
+        self.returning[:] = 0
+        self.returning[rows] = successive
 
     def in_world(self, T: Array) -> LandmarkTable:
         """The same in another world frame; `T` (4, 4) transforms coordinates to it."""
         return replace(self, seen_from=transform(T, self.seen_from))
+
+    def count_frame(
+        self,
+        frame: int,
+        in_view: IndexArray,
+        measured: IndexArray,
+        features: StereoFeatures,
+        feature_rows: IndexArray,
+        descriptor_update: float = 1.0,
+        camera: Array | None = None,
+        outside: IndexArray | slice = slice(0),
+        rematch_after: int = 0,
+        withheld: IndexArray | slice = slice(0),
+    ) -> None:
+        """Count a frame, in place, given which rows were in view, which were measured, and by which features.
+
+        `descriptor_update` is the weight of the new descriptors in the landmarks' own: 1 keeps the newest, 0 the first.
+        Rows `outside` lie outside of the image. If the camera's position (3,) [m] is given, landmarks seen again after
+        `rematch_after` frames outside the image count as first seen now, from there. For landmarks `withheld` from the
+        update, the frame counts as neither missed nor seen.
+        """
+        counts = np.ones(len(self), bool)
+        counts[withheld] = False
+        view = in_view[counts[in_view]]
+        again = self.long_out_of_view(rematch_after)[measured]
+        self.in_view[among(len(self), view) | among(len(self), measured)] += 1
+        self.missed[view] += 1
+        self.seen[measured] += 1
+        self.last_seen[measured] = frame
+        look = (1 - descriptor_update) * self.descriptors[measured]
+        look += descriptor_update * features.descriptors[feature_rows]
+        self.descriptors[measured] = look / np.maximum(np.linalg.norm(look, axis=1, keepdims=True), 1e-6)
+        if camera is not None:
+            self.seen_from[measured[again]] = camera
+            self.descriptors[measured[again]] = features.descriptors[feature_rows[again]]
+        self.out_of_view[outside] += 1
+        self.unseen[counts & (len(measured) > 0)] += 1
+        for column in (self.missed, self.out_of_view, self.unseen):
+            column[measured] = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks(LandmarkTable):
+    """All rows: `ids` are −1 for what is no landmark, `number` for what is not followed; a row with neither is unused.
+
+    Every measurement of what is followed is kept as a point in world coordinates with its information: the point ``p``
+    that the pixels say, relative to the track's own anchor, and ``A = Jᵀ J / σ²``; `slam.objects.fits` fits them.
+    """
+
+    number: IdArray = _column(np.int64, fill=-1)  # of the track (N,), never used twice; −1 for what is not followed
+    row: IndexArray = _column(np.intp, fill=-1)  # row of the feature in this frame (N,), −1 where not found
+    look: NDArray[np.float32] = _column(np.float32, 0)  # descriptor as last found (N, D)
+    body: IdArray = _column(np.int64, fill=-1)  # id of the body that it belongs to (N,), −1 for none
+    unfound: IdArray = _column(np.int64)  # frames since a feature was last found that looks like it (N,)
+    anchor: Array = _column(float, 3)  # origin of the track's own coordinates, in world axes (N, 3)
+    A: Array = _column(float, 0, 3, 3)  # information (N, W, 3, 3), zero without measurement; slot ``frame % W``
+    p: Array = _column(float, 0, 3)  # the point that the pixels say (N, W, 3), relative to the anchor
+    dof: NDArray[np.int8] = _column(np.int8, 0)  # numbers measured (N, W): 3, 2 or 0
+    older_A: Array = _column(float, 3, 3)  # fading sum of A of what has left the window (N, 3, 3)
+    older_b: Array = _column(float, 3)  # fading sum of its ``A p`` (N, 3)
+    older_age: Array = _column(float)  # fading sum of its ages in frames, each times the trace of its A (N,)
+    position: Array = _column(float, 3)  # where it is now, in world coordinates (N, 3)
+    covariance: Array = _column(float, 3, 3)  # of the position (N, 3, 3)
+    velocity: Array = _column(float, 3)  # (N, 3) [m/s], zero for those that a fixed point explains
+    velocity_covariance: Array = _column(float, 3, 3)  # (N, 3, 3), of those that have one
+    # number of frames in which it was part of a moving group, less those since in which it was not (N,)
+    streak: IdArray = _column(np.int64)
+    doubtful: BoolArray = _column(bool)  # not still for certain (N,)
+    local: Array = _column(float, 3)  # point in the body's coordinates (N, 3)
+    local_information: Array = _column(float, 3, 3)  # its information (N, 3, 3)
+    misfit: IdArray = _column(np.int64)  # how often lately it disagreed with its body (N,)
+    sure: BoolArray = _column(bool)  # whether its motion with the body is certain (N,)
+    # whether it was removed from a body (N,): then it needs proof of its motion to become a member again
+    expelled: BoolArray = _column(bool)
+    # whether its feature stays at its pixel while the camera stands (N,): it belongs to no body
+    still: BoolArray = _column(bool)
+
+    @classmethod
+    def empty(cls, dimensions: int, window: int = 0, rows: int = _ROOM) -> Tracks:
+        """A table of unused rows, for descriptors of `dimensions` numbers and windows of so many frames."""
+        looks, signs = np.zeros((2, rows, dimensions), np.float32), np.zeros(rows, np.int8)
+        A, p, dof = np.zeros((rows, window, 3, 3)), np.zeros((rows, window, 3)), np.zeros((rows, window), np.int8)
+        return cls(np.full(rows, -1), looks[0], signs, look=looks[1], A=A, p=p, dof=dof)
+
+    def begun(self, new: int, window: int) -> Tracks:
+        """A copy for another frame: in it there is room for so many `new` rows, and nothing is found yet.
+
+        What is followed is shared with the copy, unless it has windows of another number of frames.
+        """
+        tracks = self
+        if self.dof.shape[1] != window:
+            empty = Tracks.empty(self.descriptors.shape[1], window, len(self))
+            tracks = replace(empty, **{name: getattr(self, name) for name in LandmarkTable.__dataclass_fields__})
+        tracks = copy(tracks)
+        vars(tracks).update({name: getattr(self, name).copy() for name in LandmarkTable.__dataclass_fields__})
+        missing = new - int((~self.used).sum())
+        if missing > 0:
+            tracks = tracks.joined(Tracks.empty(self.descriptors.shape[1], window, max(len(self), missing)))
+        tracks.row[:] = -1
+        return tracks
+
+    def with_landmarks(self, landmarks: LandmarkTable) -> Tracks:
+        """A copy with more landmarks, which are not in it yet."""
+        tracks = self.begun(len(landmarks), self.dof.shape[1])
+        rows = np.flatnonzero(~tracks.used)[: len(landmarks)]
+        for name in LandmarkTable.__dataclass_fields__:
+            getattr(tracks, name)[rows] = getattr(landmarks, name)
+        vars(tracks).pop("mapped", None)
+        return tracks
+
+    @property
+    def used(self) -> BoolArray:
+        """Which rows are in use (N,)."""
+        return (self.ids >= 0) | (self.number >= 0)
+
+    @property
+    def found(self) -> BoolArray:
+        """Which are followed, and were found in this frame (N,)."""
+        return (self.row >= 0) & (self.number >= 0)
+
+    @cached_property
+    def mapped(self) -> IndexArray:
+        """Rows of the landmarks (M,), by ascending id; found again after landmarks have joined or left."""
+        rows = np.flatnonzero(self.ids >= 0)
+        return np.asarray(rows[np.argsort(self.ids[rows], kind="stable")])
+
+    def landmarks(self) -> LandmarkTable:
+        """The rows `mapped`, as they are now."""
+        rows = self.mapped
+        return LandmarkTable(*(getattr(self, name)[rows] for name in LandmarkTable.__dataclass_fields__))
+
+    def rows(self, ids: IdArray) -> IndexArray:
+        """Row numbers of landmarks (K,), by their ids."""
+        mapped = self.mapped
+        return mapped[np.searchsorted(self.ids[mapped], ids)]
+
+    def count(self, rows: IndexArray) -> IdArray:
+        """Number of measurements of tracks in the window (M,)."""
+        return np.asarray(np.count_nonzero(self.dof[rows], axis=1))
+
+    def find(self, rows: IndexArray, features: IndexArray) -> None:
+        """Rows (K,) are found as these features, in place; of rows alike to the bit, the first has the feature."""
+        features, first = np.unique(features, return_index=True)
+        self.row[rows[first]] = features
+
+    def enter_landmarks(
+        self, frame: int, ids: IdArray, features: StereoFeatures, rows: IndexArray, camera: Array
+    ) -> None:
+        """Features `rows` (K,) become landmarks, seen from `camera` (3,), in place.
+
+        The tracks that they continue are theirs; where there is none, or it is another landmark's, a row begins.
+        """
+        of_feature, own = np.full(len(features), -1), np.flatnonzero((self.row >= 0) & (self.ids < 0))
+        of_feature[self.row[own]] = own
+        at = of_feature[rows]
+        at[at < 0] = np.flatnonzero(~self.used)[: int((at < 0).sum())]
+        new = LandmarkTable(ids, features.descriptors[rows], features.laplacian[rows])
+        new.seen[:], new.in_view[:], new.last_seen[:], new.seen_from[:] = 1, 1, frame, camera
+        self.row[at] = rows
+        for name in LandmarkTable.__dataclass_fields__:
+            getattr(self, name)[at] = getattr(new, name)
+        vars(self).pop("mapped", None)
+
+    def erase_landmarks(self, rows: IndexArray) -> None:
+        """Landmarks (K,) leave the map, in place; their tracks go on."""
+        self.ids[rows], self.patches[rows] = -1, None
+        vars(self).pop("mapped", None)
+
+    def begin(self, rows: IndexArray, numbers: IdArray, features: StereoFeatures, points: Array) -> None:
+        """Begin to follow rows (K,) that have a feature each, at `points` (K, 3) in world coordinates, in place."""
+        self.number[rows], self.unfound[rows], self.expelled[rows] = numbers, 0, False
+        self.anchor[rows] = self.position[rows] = points
+        self.forget_past(rows)
+        self.look[rows], self.laplacian[rows] = (x[self.row[rows]] for x in (features.descriptors, features.laplacian))
+
+    def give_up(self, rows: IndexArray) -> None:
+        """Follow rows no longer, in place; landmarks among them stay in the map."""
+        self.number[rows] = self.row[rows] = self.body[rows] = -1
+        self.dof[rows] = 0
+
+    def forget_past(self, rows: IndexArray) -> None:
+        """Make tracks free and without measurements, in place."""
+        self.body[rows], self.misfit[rows], self.streak[rows], self.doubtful[rows] = -1, 0, 0, False
+        for array in (self.A, self.p, self.dof, self.older_A, self.older_b, self.older_age, self.velocity):
+            array[rows] = 0

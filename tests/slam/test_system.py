@@ -11,7 +11,7 @@ from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
-from slam.objects.modes import ObjectDetector
+from slam.objects.detector import ObjectDetector
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 

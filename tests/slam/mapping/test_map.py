@@ -85,8 +85,8 @@ def test_frames_unseen_are_counted_though_the_others_are_seen_in_every_one():
     features = features_at(np.zeros((80, 2)))
     for frame in range(1, 7):
         assert not bad_landmarks(rows, MapConfig(confirmed=6)).any()
-        rows = rows.after_frame(2 * frame, others, others, features, np.arange(80))
-        rows = rows.after_frame(2 * frame + 1, none, none, features_at(np.zeros((0, 2))), none.astype(np.intp))
+        rows.count_frame(2 * frame, others, others, features, np.arange(80))
+        rows.count_frame(2 * frame + 1, none, none, features_at(np.zeros((0, 2))), none.astype(np.intp))
     assert rows.unseen.tolist() == [6] + [0] * 80
     assert np.flatnonzero(bad_landmarks(rows, MapConfig(confirmed=6))).tolist() == [0]
     earlier = LandmarkTable(**{**vars(rows), "last_seen": rows.last_seen - (np.arange(81) == 0)})
@@ -95,16 +95,16 @@ def test_frames_unseen_are_counted_though_the_others_are_seen_in_every_one():
 
 def test_what_is_held_back_is_neither_missed_nor_seen():
     rows = rows_with(seen=[5, 5, 5], in_view=[5, 5, 5], missed=[4, 4, 4], unseen=[4, 4, 4])
-    after = rows.after_frame(
+    rows.count_frame(
         9, np.array([0, 1, 2]), np.array([2]), features_at([(1, 1)]), np.array([0]), withheld=np.array([0])
     )
-    assert [getattr(after, name).tolist() for name in ("seen", "in_view", "missed", "unseen")] == [
+    assert [getattr(rows, name).tolist() for name in ("seen", "in_view", "missed", "unseen")] == [
         [5, 5, 6],
         [5, 6, 6],
         [4, 5, 0],
         [4, 5, 0],
     ]
-    assert bad_landmarks(after, MapConfig(confirmed=0)).tolist() == [False, True, False]
+    assert bad_landmarks(rows, MapConfig(confirmed=0)).tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,10 @@ from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.objects.bodies import hidden, new_body
 from slam.objects.config import ObjectsConfig
 from slam.objects.detector import MovingObjectDetector
+from slam.tracks.table import Tracks
 from tests.slam.scene import RIG
 
 HERE = Estimate(0.0, np.eye(4), np.eye(6), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-NONE = np.zeros(0, np.int64)
 NO_BACKEND: Any = SimpleNamespace()  # the camera's last poses are then the online ones
 
 
@@ -26,11 +26,12 @@ def test_a_body_is_predicted_by_its_own_motion_model() -> None:
         objects=ObjectModels(acceleration=2.0, angular_acceleration=0.5),
     )
     detector, dt = MovingObjectDetector(RIG, ObjectsConfig(), models), 0.1
-    detector.step(NO_BACKEND, StereoFeatures.empty(0.0), HERE, NONE)
+    tracks = Tracks.empty(64, detector.window)
+    detector.step(NO_BACKEND, tracks, StereoFeatures.empty(0.0), HERE)
     times = np.zeros(detector.setup.config.window)
     body = new_body(1, np.array([0, 0, 3.0]), np.array([0, 0.2, 0, 1.0, 0, 0]), times, 0.0, 0.1)
     detector.bodies[1] = body
-    detector.step(NO_BACKEND, StereoFeatures.empty(dt), replace(HERE, stamp=dt), NONE)
+    detector.step(NO_BACKEND, tracks, StereoFeatures.empty(dt), replace(HERE, stamp=dt))
     grown = np.diag(detector.bodies[1].covariance - body.covariance)
     np.testing.assert_allclose(grown, dt**3 * np.array([0.5] * 3 + [2.0] * 3) ** 2, rtol=1e-9)
     np.testing.assert_allclose(detector.bodies[1].T[:3, 3], [dt, 0, 3.0])

@@ -67,17 +67,19 @@ def test_landmarks_without_a_right_pixel_are_not_tested_and_few_say_nothing():
     assert not moved(first[:8], pixels[:8]).any()
 
 
-def test_first_sights_are_of_the_frame_in_which_landmarks_joined_the_map():
-    """Also of those that are not found again in the next frame; their displacement is taken for the true time."""
+def test_a_landmark_s_first_sight_is_its_track_s():
+    """No later than it joined the map, but for the few that were given up and begun again since."""
     sequence = slam.open_sequence("synthetic:aisle?density=40")
     system = slam.StereoSlam(sequence.rig, None, "ekf", config=SystemConfig.for_kind(sequence.kind, None))
     joined = {}
     for k in range(8):
         result = system.process_features(sequence.simulate(k).features)
         joined.update(dict.fromkeys(result.added.tolist(), k))
-    first = {id: frame for id, (frame, _) in system.objects._first.items()}
-    assert len(first) > 20 and any(frame > 0 for frame in first.values())
-    assert first == {id: joined[id] for id in first}
+    tracks = system._state.tracks
+    followed = np.flatnonzero((tracks.ids >= 0) & (tracks.number >= 0))
+    first = (tracks.dof[followed] > 0).argmax(axis=1)
+    assert len(first) > 20 and (first > 0).any()
+    assert (first <= [joined[id] for id in tracks.ids[followed].tolist()]).mean() > 0.8
 
 
 def test_a_large_group_does_not_hide_single_landmarks_that_move():

@@ -15,8 +15,9 @@ from slam.geometry.se3 import Array, exp, inverse, transform
 from slam.objects import membership
 from slam.objects.bodies import Body, continued, new_body, with_extent
 from slam.objects.config import ObjectsConfig
+from slam.objects.fits import fit_positions
 from slam.objects.merging import merge
-from slam.objects.tracks import Tracks, fit_positions, record
+from slam.tracks.table import Tracks
 
 WINDOW = 12
 SLOT = WINDOW - 1
@@ -33,13 +34,22 @@ def table(seen: Array) -> Tracks:
         0.0, np.zeros((n, 2)), np.zeros((n, 2)), np.ones(n), np.zeros(n), np.ones(n), np.ones(n, np.int8),
         np.zeros((n, 16), np.float32), (320, 240),
     )  # fmt: skip
-    tracks = Tracks.empty(16, WINDOW)
-    rows = tracks.begin(np.arange(n), features, np.arange(n), seen[:, 0])
-    information = np.broadcast_to(np.eye(3) / SIGMA**2, (n, 3, 3))
+    tracks, rows = Tracks.empty(16, WINDOW), np.arange(n)
+    tracks.row[rows] = rows
+    tracks.begin(rows, rows, features, seen[:, 0])
     for slot in range(WINDOW):
-        record(tracks, rows, slot, seen[:, slot], information, np.full(n, 3, np.int8))
+        enter(tracks, rows, slot, seen[:, slot])
     fit_positions(tracks, rows)
     return tracks
+
+
+def enter(tracks: Tracks, rows: Array, slot: int, points: Array) -> None:
+    """Tracks measured points in a slot."""
+    tracks.p[rows, slot], tracks.A[rows, slot], tracks.dof[rows, slot] = (
+        points - tracks.anchor[rows],
+        np.eye(3) / SIGMA**2,
+        3,
+    )
 
 
 def path(velocity: Array) -> Array:
@@ -89,7 +99,7 @@ def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> No
     assert (tracks.body[:12] == 1).all()
     assert (tracks.body[lid] == -1).all() and tracks.expelled[lid].all()
     assert len(gains[1]) == 12
-    record(tracks, lid, SLOT, seen[lid, SLOT], np.broadcast_to(np.eye(3) / SIGMA**2, (4, 3, 3)), np.full(4, 3, np.int8))
+    enter(tracks, lid, SLOT, seen[lid, SLOT])
     membership.update_members({1: body}, FRAME, tracks)
     assert (tracks.body[lid] == -1).all()
 
@@ -134,7 +144,7 @@ def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() ->
     bodies = {1: few, 2: more}
     merge(bodies, tracks)
     assert list(bodies) == [1]
-    assert (tracks.body == np.where(tracks.ids >= 0, 1, -1)).all()
+    assert (tracks.body == np.where(tracks.number >= 0, 1, -1)).all()
     grown = bodies[1]
     np.testing.assert_allclose(grown.T[:3, :3], few.T[:3, :3])  # the older one's axes, at its own place
     np.testing.assert_allclose(grown.history @ inverse(grown.T), more.history @ inverse(more.T), atol=1e-12)

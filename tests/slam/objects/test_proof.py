@@ -12,7 +12,7 @@ import pytest
 from slam.geometry.se3 import points_by_pose
 from slam.objects.proof import PROVEN, Way, by_left_image, with_frame
 from slam.objects.scene import Displacements, Scene
-from slam.objects.tracks import Tracks
+from slam.tracks.table import Tracks
 
 
 def scene(sigma: float = 1e-6) -> Scene:

@@ -18,7 +18,7 @@ from slam.objects.config import ObjectsConfig
 from slam.objects.estimator import BodyEstimator
 from slam.objects.frame import Frame, Setup
 from slam.objects.recovery import located
-from slam.objects.tracks import Tracks
+from slam.tracks.table import Tracks
 
 RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
 WINDOW = 12
@@ -43,7 +43,7 @@ def scene(seen, off, rng, deviation=0.5):
         np.ones(seen, np.int8), np.eye(seen, 64, dtype=np.float32),
     )  # fmt: skip
     tracks = Tracks.empty(64, WINDOW)
-    rows = tracks.begin(np.arange(seen), features, np.arange(seen), transform(T, POINTS[:seen]))
+    rows = begin(tracks, features, np.arange(seen), transform(T, POINTS[:seen]))
     body = new_body(1, T[:3, 3], np.zeros(6), np.zeros(WINDOW), 0.0, 2.0)
     body = with_extent(replace(body, covariance=np.diag([0.05**2] * 3 + [deviation**2] * 3)), POINTS)
     membership.add_members(body, tracks, rows)
@@ -54,6 +54,14 @@ def scene(seen, off, rng, deviation=0.5):
     first = RecentPoses(np.array([-0.1]), np.eye(4)[None], 1e-10 * np.eye(6))
     body = replace(body, belief=ESTIMATOR.updated(None, 1, before, first))
     return body, tracks, features, truth
+
+
+def begin(tracks, features, rows, points):
+    """Tracks of features (K,) at points (K, 3); their rows in the table."""
+    at = np.flatnonzero(~tracks.used)[: len(rows)]
+    tracks.row[at] = rows
+    tracks.begin(at, at, features, points)
+    return at
 
 
 def frame_of(features, max_speed=40.0):
@@ -103,11 +111,11 @@ FAR = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 1.0])
 def test_a_body_seen_again_takes_its_points_from_the_tracks_that_follow_them():
     body, tracks, features, truth = scene(4, FAR, np.random.default_rng(6), deviation=2.0)
     tracks.row[:4] = -1
-    followers = tracks.begin(np.arange(10, 14), features, np.arange(4), transform(truth, POINTS))
+    followers = begin(tracks, features, np.arange(4), transform(truth, POINTS))
     T = place(body, tracks, features)
     assert T is not None and np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.5
     assert tracks.row[:4].tolist() == [0, 1, 2, 3]
-    assert (tracks.ids[followers] == -1).all()
+    assert (tracks.number[followers] == -1).all()
 
 
 def test_what_looks_like_a_body_where_that_cannot_have_gone_is_not_it():

@@ -13,9 +13,9 @@ from slam.geometry.rig import StereoRig
 from slam.models import models_for
 from slam.objects import regions
 from slam.objects.config import ObjectsConfig
+from slam.objects.fits import ConstantVelocity
 from slam.objects.frame import Frame, Setup
 from slam.objects.regions import follow_regions
-from slam.objects.tracks import ConstantVelocity
 
 DT, WINDOW = 0.1, 12
 VELOCITY, START = np.array([0.5, 0.0, 5.0]), np.array([5.0, 0, 20])
@@ -41,7 +41,7 @@ def step(monkeypatch, r, points, velocities, rng, still=(), test=50.0, dt=DT, ca
     )  # fmt: skip
     monkeypatch.setattr(regions, "constant_velocity", lambda *_: motion)
     yes, no = np.ones(n, bool), np.zeros(n, bool)
-    tracks: Any = SimpleNamespace(seen=yes, body=np.full(n, -1), still=no, count=lambda rows: np.full(len(rows), 4))
+    tracks: Any = SimpleNamespace(found=yes, body=np.full(n, -1), still=no, count=lambda rows: np.full(len(rows), 4))
     now = frame(dt, camera)
     r = follow_regions(r, now, tracks)
     return r, [one for one in r if one.has_moved(now)]

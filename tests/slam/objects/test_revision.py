@@ -12,7 +12,8 @@ from slam.geometry.se3 import inverse, transform
 from slam.models import models_for
 from slam.objects.config import ObjectsConfig
 from slam.objects.detector import MovingObjectDetector
-from slam.objects.tracks import constant_velocity
+from slam.objects.fits import constant_velocity
+from slam.tracks.table import Tracks
 
 RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
 CHANGE = 0.4  # of all disparities [px]
@@ -42,17 +43,19 @@ def velocities(revised):
     rng = np.random.default_rng(0)
     points = rng.uniform([-8, -2, 40], [8, 2, 50], (40, 3))
     detector = MovingObjectDetector(RIG, ObjectsConfig(max_speed=25.0, size=2.0), models_for("driving"))
+    tracks = Tracks.empty(64)
     for k in range(FRAMES):
         T = np.eye(4)
         T[2, 3] = 0.8 * k
         if k == AT and revised:
-            detector.revise(mend)
+            detector.revise(tracks, mend)
         features = features_at(T, points, k)
         estimate = Estimate(features.stamp, T, 1e-6 * np.eye(6), *NO_LANDMARKS)
-        detector.step(NO_BACKEND, features, estimate, np.full(len(points), -1))
-    rows = np.flatnonzero(detector.tracks.seen)
+        tracks = tracks.begun(len(points), detector.window)
+        detector.step(NO_BACKEND, tracks, features, estimate)
+    rows = np.flatnonzero(tracks.found)
     times = np.nan_to_num(detector._stamps - features.stamp)
-    return constant_velocity(detector.tracks, rows, times, 25.0).velocity[:, 2]
+    return constant_velocity(tracks, rows, times, 25.0).velocity[:, 2]
 
 
 def test_tracks_stand_still_when_the_correction_changes():

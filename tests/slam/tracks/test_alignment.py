@@ -21,11 +21,11 @@ RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 
 def rows(ids: IdArray, T: np.ndarray | None = None, size: float = 15.0) -> LandmarkTable:
     """Landmarks, with patches taken from a pose."""
-    landmarks = LandmarkTable.empty(4).with_new(0, ids, _features(len(ids)), np.arange(len(ids)))
-    if T is None:
-        return landmarks
-    patch = Patch(np.zeros((5, 5), np.float32), np.full(2, 2.0), size, T)
-    return landmarks.with_patches(np.arange(len(ids)), len(ids) * [patch])
+    features = _features(len(ids))
+    landmarks = LandmarkTable(ids, features.descriptors, features.laplacian)
+    if T is not None:
+        landmarks.patches[:] = Patch(np.zeros((5, 5), np.float32), np.full(2, 2.0), size, T)
+    return landmarks
 
 
 def _features(count: int) -> slam.StereoFeatures:
@@ -90,7 +90,8 @@ def align(features: slam.StereoFeatures, landmarks: LandmarkTable, seen: Landmar
 @pytest.mark.parametrize("right", [True, False])
 def test_features_move_to_their_patches_also_without_a_right_image(right):
     features = frame(right)
-    aligned, landmarks = align(features, rows(IDS, np.eye(4)))
+    landmarks = rows(IDS, np.eye(4))
+    aligned = align(features, landmarks)
     np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
     np.testing.assert_allclose(aligned.uv_right, features.uv_right + SHIFT)
     assert landmarks.has_patch.all()
@@ -100,30 +101,33 @@ def test_features_move_to_their_patches_also_without_a_right_image(right):
 def test_a_patch_that_is_not_found_or_of_another_scale_is_taken_anew(nearer, size):
     then, features = np.eye(4), frame()
     then[2, 3] = nearer
-    aligned, landmarks = align(features, rows(IDS, then, size))
+    landmarks = rows(IDS, then, size)
+    aligned = align(features, landmarks)
     np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
     assert not landmarks.has_patch.any()
-    landmarks = alignment.with_new_patches(Shifting(), aligned, SEEN, landmarks, np.eye(4))
+    alignment.take_patches(Shifting(), aligned, SEEN, landmarks, np.eye(4))
     assert [(p.size, p.T_world_left.tolist()) for p in landmarks.patches] == 4 * [(15.0, np.eye(4).tolist())]
 
 
 def test_a_patch_that_is_seen_larger_is_taken_anew_where_it_is_found_before_it_is_too_large():
     then, features = np.eye(4), frame()
     then[2, 3] = -1.6  # all are seen 1.23 to 1.4 times as large
-    aligned, landmarks = align(features, rows(IDS, then))
+    landmarks = rows(IDS, then)
+    aligned = align(features, landmarks)
     np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
     assert not landmarks.has_patch.any()
 
 
 def test_without_a_pose_or_images_nothing_moves_and_what_was_not_seen_for_long_is_given_up():
     features, landmarks = frame(), rows(IDS, np.eye(4))
-    for aligned, after in (
+    for aligned in (
         align(features, landmarks, replace(SEEN, T_world_left=None)),
         align(replace(features, images=None), landmarks),
     ):
         np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
-        assert after.has_patch.all()
-    aligned, after = align(features, replace(landmarks, unseen=np.array([0, 11, 0, 10])))
-    assert after.has_patch.tolist() == [True, False, True, True]
+        assert landmarks.has_patch.all()
+    landmarks.unseen[:] = [0, 11, 0, 10]
+    aligned = align(features, landmarks)
+    assert landmarks.has_patch.tolist() == [True, False, True, True]
     moved = np.abs(aligned.uv_left - features.uv_left).max(axis=1) > 0
     assert moved[SEEN.rows].tolist() == [True, False, True, True]

@@ -25,7 +25,7 @@ def scene(frame: int = 0) -> tuple[LandmarkTable, np.ndarray, StereoFeatures]:
     kind = np.arange(150) % 10
     cloud.descriptors, cloud.laplacian = cloud.descriptors[kind], cloud.laplacian[kind]
     start, ids = cloud.features(np.eye(4), 0.0)
-    landmarks = LandmarkTable.empty(32).with_new(0, np.arange(len(ids)), start, np.arange(len(ids)))
+    landmarks = LandmarkTable(np.arange(len(ids)), start.descriptors, start.laplacian)
     return landmarks, cloud.points[ids], cloud.features(T_TRUE, 1.0 + frame, 0.2)[0]
 
 
@@ -71,7 +71,7 @@ def test_other_places_wait_for_several_frames(far):
 def test_places_are_not_asked_for_where_landmarks_are_found():
     cloud = Cloud(150)
     features, ids = cloud.features(np.eye(4), 0.0)
-    landmarks = LandmarkTable.empty(32).with_new(0, np.arange(len(ids)), features, np.arange(len(ids)))
+    landmarks = LandmarkTable(np.arange(len(ids)), features.descriptors, features.laplacian)
 
     def never() -> np.ndarray:
         raise AssertionError
