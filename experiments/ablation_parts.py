@@ -75,7 +75,7 @@ def exact_rig() -> AbstractContextManager[object]:
 
 def no_first_frames() -> AbstractContextManager[object]:
     """The detector waits until it knows its tracks."""
-    name = "slam.objects.detector.MovingObjectDetector.newly_moving"
+    name = "slam.objects.detector.MovingObjectDetector.parting"
     return mock.patch(name, lambda *_: np.zeros(0, np.int64))
 
 

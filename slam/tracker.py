@@ -110,11 +110,8 @@ class Tracker:
         ids, rows = step.matches.ids, step.matches.rows
         if step.standing.stands:
             return ids[~isin(rows, step.standing.witnesses)]
-        ages = step.index - step.landmarks.last_seen[step.landmarks.rows(ids)]
-        moving = self.objects.newly_moving(
-            step.features, ids, rows, ages, lambda ids: _positions(state, ids), step.pose
-        )
-        return np.union1d(self.objects.suspects, moving)
+        parting = self.objects.parting(step.features, ids, rows, lambda ids: _positions(state, ids), step.pose)
+        return np.union1d(self.objects.suspects, parting)
 
     def update(self, state: State, step: Step) -> Step | Elsewhere:
         """Update the back end; `Elsewhere` in an unknown place."""

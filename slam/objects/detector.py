@@ -25,11 +25,12 @@ from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.measurement import measure
 from slam.objects.merging import merge
 from slam.objects.modes import ObjectDetector, Places
+from slam.objects.parting import parting
 from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Region, follow_regions
 from slam.objects.revision import CorrectRows, revise_tracks
-from slam.objects.scene import Scene, displacements, moved_since
+from slam.objects.scene import Scene, displacements
 from slam.objects.tracks import Tracks, fit_positions, fit_velocities, make_room, record
 
 _NONE: IndexArray = np.zeros(0, np.intp)
@@ -62,7 +63,7 @@ class MovingObjectDetector(ObjectDetector):
         self._stamps = np.full(window, np.nan)
         self._poses = np.tile(np.eye(4), (window, 1, 1))  # of the left camera in the window's frames
         self._number = -1
-        self._first: dict[int, tuple[int, Array]] = {}  # landmarks by id: frame and place of the first sight
+        self._parted: dict[int, int] = {}  # landmarks by id: the last frame in which they parted from the rest
         self._path: RecentPoses | None = None
         self._regions: list[Region] = []
 
@@ -71,22 +72,16 @@ class MovingObjectDetector(ObjectDetector):
         slot = self._number % self.setup.config.window
         revise_tracks(self.tracks, self.bodies, self._poses, slot, self.setup.rig, correct)
 
-    def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
-        T_world_left: Array,
-    ) -> IdArray:  # fmt: skip
-        """See `slam.objects.modes.ObjectDetector`."""
-        s, c, now = self.setup, self.setup.config, self._number + 1
-        if not 0 < now < c.window or not len(ids):
-            return NO_IDS
-        new = np.flatnonzero([id not in self._first for id in ids.tolist()])
-        self._first.update(zip(ids[new].tolist(), zip(np.maximum(now - ages[new], 0), places(ids[new]))))
-        frames, points = map(np.array, zip(*(self._first[id] for id in ids.tolist())))
-        pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-        return ids[moved_since(
-            s.rig, T_world_left, points, now - frames.astype(float), pixels, s.sigma, c.doubtful, c.suspect,
-            c.min_support,
-        )]  # fmt: skip
+    def parting(
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
+    ) -> IdArray:
+        """See `slam.objects.modes.ObjectDetector`; a landmark stays in doubt for some frames."""
+        now = self._number + 1
+        if now > 0 and len(ids):
+            parts = parting(self.setup, self.tracks, now, features, ids, rows, places, T_world_left)
+            self._parted.update(dict.fromkeys(ids[parts].tolist(), now))
+        self._parted = {id: last for id, last in self._parted.items() if now - last <= self.setup.config.confirm}
+        return np.array(sorted(self._parted), np.int64)
 
     def step(
         self, backend: Backend, features: StereoFeatures, estimate: Estimate, landmark: IdArray,

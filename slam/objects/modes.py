@@ -20,23 +20,21 @@ Places = Callable[[IdArray], Array]
 class ObjectDetector:
     """What the system asks of a detector of moving objects in every step; by itself it takes everything for still.
 
-    `newly_moving` and `suspects` are asked before the back end's update, `step` comes after it.
+    `parting` and `suspects` are asked before the back end's update, `step` comes after it.
     """
 
     #: Ids of landmarks that may move: they do not measure the camera's next pose.
     suspects: IdArray = np.zeros(0, np.int64)
 
-    def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
-        T_world_left: Array,
-    ) -> IdArray:  # fmt: skip
-        """Ids of landmarks that move in the run's first frames, before it is known what moves: see `suspects`.
+    def parting(
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
+    ) -> IdArray:
+        """Ids of landmarks that may have begun to move in this frame or the last ones: see `suspects`.
 
         Args:
             features: of the frame, before the back end's update.
             ids: of the landmarks found in it (K,).
             rows: of their features (K,).
-            ages: frames since each was last measured, or joined the map (K,).
             places: gives the positions of landmarks (K, 3) in the world [m] by their ids.
             T_world_left: the camera's pose (4, 4), as far as it is known.
         """
