@@ -4,8 +4,7 @@ A near body that starts to move would carry the camera along. Points of a far wa
 turn, and three points before it decide. So before each update the landmarks found in a frame are compared with where
 their tracks saw them: those that lie together, and whose motion is not that of the rest, are two explanations of one
 frame, by the camera's motion and by theirs. The camera keeps with the rest, which is wider spread, and the covariance
-of its pose grows by what the withheld measurements would have told. They are withheld only where it matters: where they
-would pull the pose by a good part of its standard deviation.
+of its pose grows by what the withheld measurements would have told.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from slam.objects.scene import FARTHEST, Displacements, classify_scene, places_i
 from slam.objects.track_kernels import fit_fixed_points, inverses
 from slam.objects.tracks import Tracks
 
-_PULL = 0.5**2  # χ²(6) of the pull that matters: half a standard deviation of the pose
 _FEW = 3  # derived: landmarks that determine a pose
 _AROUND = 0.5  # of a group's extent in view, how far beyond it landmarks of unknown motion are taken for a part of it
 _LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
@@ -65,12 +63,11 @@ def parting(
     )
     view = places_in_view(local[tested])
     scene = classify_scene(moved, view, c.suspect, _FEW, (_LEAST_NOISE / setup.sigma) ** 2)
-    groups = [group.members for group in scene.groups if group.pull > _PULL]
-    if not groups:
+    if not scene.groups:
         return out
     unknown = np.setdiff1d(np.arange(len(ids)), mine[tested])
     place = places_in_view(transform(inverse(T_world_left), places(ids[unknown])))
-    for members in groups:
+    for members in (group.members for group in scene.groups):
         out[mine[tested[members]]] = True
         low, high = view[members].min(axis=0), view[members].max(axis=0)
         beyond = _AROUND * (high - low)

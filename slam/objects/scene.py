@@ -57,7 +57,6 @@ class Group:
     members: IndexArray  # their rows (K,)
     test: float  # χ²(6) of their motion against the rest's
     away: float  # how far they went against the rest, in the mean [m]
-    pull: float  # χ²(6) by which they would pull the motion of all away from that of the rest, in modelled noise
 
     def moves(self, test: float, away: float) -> bool:
         """Whether it went farther than `away` [m] and moved for certain: by a χ²(6) above `limit` of `test`."""
@@ -149,23 +148,16 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
     )  # fmt: skip
     rest = group < 0
     heavier = tail(alone[rest])  # of what is in no group: before, other groups would be part of it
-    information = _full(L[rest]) + np.diag(kernels.PRIOR)
-    groups = []
-    for k, value in enumerate((values / heavier).tolist()):
-        members = np.flatnonzero(group == k)
-        if value > limit(test, len(members)):
-            own = _full(L[members])
-            told = eta[members].sum(axis=0) - own @ common
-            pull = float(told @ np.linalg.solve(information + own, told))
-            groups.append(Group(members, value, _mean_gap(moved, members, common), pull))
+    found = [(np.flatnonzero(group == k), value / heavier) for k, value in enumerate(values.tolist())]
+    groups = [
+        Group(members, value, _mean_gap(moved, members, common))
+        for members, value in found
+        if value > limit(test, len(members))
+    ]
+    information = np.zeros((6, 6))
+    information[np.tril_indices(6)] = L[rest].sum(axis=0)
+    information += np.tril(information, -1).T + np.diag(kernels.PRIOR)
     return Scene(groups, alone, common, scale * heavier * np.linalg.inv(information))
-
-
-def _full(L: Array) -> Array:
-    """The sum (6, 6) of tracks' Λ, given as lower triangles (N, 21)."""
-    total = np.zeros((6, 6))
-    total[np.tril_indices(6)] = L.sum(axis=0)
-    return total + np.tril(total, -1).T
 
 
 def _full_windows(place: Array, support: int) -> tuple[IndexArray, IndexArray, Array, Array]:
