@@ -73,9 +73,9 @@ def exact_rig() -> AbstractContextManager[object]:
     return stack
 
 
-def no_first_frames() -> AbstractContextManager[object]:
-    """The detector waits until it knows its tracks."""
-    name = "slam.objects.detector.MovingObjectDetector.newly_moving"
+def nothing_parts() -> AbstractContextManager[object]:
+    """Landmarks measure the pose until the detector knows by their tracks that they may move."""
+    name = "slam.objects.detector.MovingObjectDetector.parting"
     return mock.patch(name, lambda *_: np.zeros(0, np.int64))
 
 
@@ -125,7 +125,7 @@ GROUPS = (
         Variant("one iteration", ("backend.iterations=1",)),
         Variant("covariance not transported", ("backend.consistent=false",)),
         Variant("no uncertainty of the rig", (), exact_rig),
-        Variant("no test of first frames", (), no_first_frames),
+        Variant("no test of a frame's landmarks", (), nothing_parts),
         Variant("no atlas", ("atlas.enabled=false",)),
         Variant("left pixels alone", ("backend.measurement=left",)),
         Variant("pixel noise of the other kind", {

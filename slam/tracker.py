@@ -118,8 +118,8 @@ class Tracker:
         if step.standing.stands:
             return ids[~isin(rows, step.standing.witnesses)]
         at = step.tracks.rows(ids)
-        moving = self.objects.newly_moving(step.tracks, step.features, at, rows, step.pose)
-        return np.union1d(self.objects.suspects, moving)
+        parting = self.objects.parting(step.tracks, step.features, at, rows, step.pose)
+        return np.union1d(self.objects.suspects, parting)
 
     def update(self, state: State, step: Step) -> Step | Elsewhere:
         """Update the back end; `Elsewhere` in an unknown place."""

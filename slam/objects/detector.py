@@ -9,7 +9,6 @@ import numpy as np
 
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
-from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform
 from slam.interfaces import Backend
@@ -33,10 +32,11 @@ from slam.objects.fits import fit_positions, fit_velocities, make_room, record, 
 from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.merging import merge
+from slam.objects.parting import parting
 from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Region, follow_regions
-from slam.objects.scene import Scene, displacements, moved_since
+from slam.objects.scene import Scene, displacements
 from slam.tracks.table import Tracks
 
 _NONE: IndexArray = np.zeros(0, np.intp)
@@ -47,7 +47,7 @@ _ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a 
 class ObjectDetector:
     """What the system asks of a detector of moving objects in every step; by itself it takes everything for still.
 
-    `newly_moving` and `suspects` are asked before the back end's update, `step` comes after it.
+    `parting` and `suspects` are asked before the back end's update, `step` comes after it.
     """
 
     #: Number of frames for which the table of tracks keeps what it measured.
@@ -55,10 +55,10 @@ class ObjectDetector:
     #: Ids of landmarks that may move: they do not measure the camera's next pose.
     suspects: IdArray = np.zeros(0, np.int64)
 
-    def newly_moving(
+    def parting(
         self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
     ) -> IdArray:
-        """Ids of landmarks that move in the run's first frames, before it is known what moves: see `suspects`.
+        """Ids of landmarks that may have begun to move in this frame or the last ones: see `suspects`.
 
         Args:
             tracks: the table of tracks, as the last frame left it.
@@ -130,21 +130,15 @@ class MovingObjectDetector(ObjectDetector):
             slot = self._number % self.window
             revise_tracks(tracks, self.bodies, self._poses, slot, self.setup.rig, correct)
 
-    def newly_moving(
+    def parting(
         self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
     ) -> IdArray:
-        """See `ObjectDetector`."""
-        s, c, now = self.setup, self.setup.config, self._number + 1
-        known = tracks.number[at] >= 0
-        at, rows = at[known], rows[known]
-        if not 0 < now < c.window or not len(at):
-            return NO_IDS
-        first = (tracks.dof[at] > 0).argmax(axis=1)  # slots are frames as long as the window is not full
-        pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-        return tracks.ids[at[moved_since(
-            s.rig, T_world_left, tracks.anchor[at], now - first.astype(float), pixels, s.sigma, c.doubtful, c.suspect,
-            c.min_support,
-        )]]  # fmt: skip
+        """See `ObjectDetector`; a landmark stays in doubt for some frames."""
+        now = self._number + 1
+        if now > 0 and len(at):
+            parted = at[parting(self.setup, tracks, now, features, at, rows, T_world_left)]
+            tracks.parted[parted] = 1 + self.setup.config.confirm
+        return np.sort(tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)])
 
     def step(
         self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
@@ -155,6 +149,7 @@ class MovingObjectDetector(ObjectDetector):
         self._advance_bodies(tracks, frame)
         follow(tracks, self.bodies, frame)
         self._measure(tracks, frame)
+        np.maximum(tracks.parted - 1, 0, out=tracks.parted)
         tracks.still[:] = tracks.found & among(max(len(features), 1), still)[tracks.row]
         self._fit(tracks, frame)
         self._change_members(tracks, frame)

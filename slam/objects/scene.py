@@ -25,21 +25,19 @@ import numpy as np
 
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray
-from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, hat, inverse, transform
+from slam.geometry.se3 import Array, hat
 from slam.objects import scene_kernels as kernels
-from slam.objects.fits import Tracks, measure, times_vectors
+from slam.objects.fits import times_vectors
 from slam.objects.track_kernels import displaced
+from slam.tracks.table import Tracks
 
 LAG = 4  #: frames between the older and the recent measurements, about
 _RECENT = 5  # frames that are recent, at most; of short tracks the later half
-_FARTHEST = 4.0  # a track's depth must be so many times its deviation
+FARTHEST = 4.0  #: a track's depth must be so many times its deviation
 _TAIL = 3.0  # tracks; see `limit`
 _UPPER_QUARTILE = chi_square_limit(3, 0.75)  # of χ²(3)
 _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
 _HALVES = 0.5 * np.array(list(product((0, 1), repeat=3)))  # of a width, by which windows of a size are apart
-_LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
-_RIDGE = 1e-6  # numerics: share of the trace
 _CELLS = 2**12  # numerics: more than there are windows along an axis
 
 
@@ -116,47 +114,13 @@ def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array, min_frames
     rows = rows[tracks.count(rows) >= min_frames]
     local = (tracks.position[rows] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
     variance = np.einsum("nii->n", tracks.covariance[rows])
-    known = local[:, 2] > _FARTHEST * np.sqrt(np.where(variance < 0, np.inf, variance))  # below 0 by rounding alone
-    return rows[known], _place(local[known])
+    known = local[:, 2] > FARTHEST * np.sqrt(np.where(variance < 0, np.inf, variance))  # below 0 by rounding alone
+    return rows[known], places_in_view(local[known])
 
 
-def _place(local: Array) -> Array:
+def places_in_view(local: Array) -> Array:
     """Where points (N, 3) in camera coordinates are seen: x/z, y/z, log z (N, 3)."""
     return np.column_stack([local[:, :2] / local[:, 2:], np.log(local[:, 2])])
-
-
-def moved_since(
-    rig: StereoRig, T_world_left: Array, first: Array, frames: Array, pixels: Array, sigma: float, doubtful: float,
-    suspect: float, support: int,
-) -> BoolArray:  # fmt: skip
-    """Which points (N,) moved otherwise than the scene since they were first seen: for frames without long tracks yet.
-
-    What moves from the beginning on would else pull the camera along until its tracks are known, and that error stays:
-    the world's axes are those of the first frame. The noise is that of these displacements themselves.
-
-    Args:
-        rig: the cameras.
-        T_world_left: the camera's pose (4, 4), which may be wrong.
-        first: where the points were first seen (N, 3), in world coordinates [m].
-        frames: since then (N,).
-        pixels: (uL, vL, uR) of each in this frame (N, 3); those without a right pixel are not tested.
-        sigma: pixel noise [px].
-        doubtful: χ²(3) from which a single point moved.
-        suspect: χ²(6) from which a group did.
-        support: least number of points of a group.
-    """
-    moves = np.zeros(len(pixels), bool)
-    points, information, dof = measure(rig, T_world_left, first, pixels, sigma)
-    local = transform(inverse(T_world_left), first)
-    known = np.flatnonzero((dof == 3) & (local[:, 2] > 0))
-    if len(known) < 3 * support:
-        return moves
-    A, was = information[known], first[known]
-    ridge = _RIDGE * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    moved = Displacements(was - T_world_left[:3, 3], points[known] - was, 0.5 * (A + ridge), frames[known])
-    scene = classify_scene(moved, _place(local[known]), suspect, support, (_LEAST_NOISE / sigma) ** 2)
-    moves[known[~scene.rest | (scene.alone > doubtful * tail(scene.alone[scene.rest]))]] = True
-    return moves
 
 
 def limit(test: float, size: IndexArray | int) -> Array:

@@ -168,12 +168,10 @@ def _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, la
     for m in range(len(clear)):
         clear[m] = -np.inf
         own_tracks = tracks[starts[m] : starts[m + 1]]
-        size, most = 0, 0.0
+        size = 0
         for n in own_tracks:
-            if rest[n]:
-                size += 1
-                most += min(1.0, _PULL / max(alone[n], 1e-9)) * alone[n]
-        if size < support or size > largest or most <= asked[size]:
+            size += rest[n]
+        if size < support or size > largest:
             continue
         inside[:], told_inside[:] = 0.0, 0.0
         for n in own_tracks:

@@ -169,6 +169,8 @@ class Tracks(LandmarkTable):
     expelled: BoolArray = _column(bool)
     # whether its feature stays at its pixel while the camera stands (N,): it belongs to no body
     still: BoolArray = _column(bool)
+    # frames for which, as a landmark, it is in doubt since it parted from the rest (N,), see `slam.objects.parting`
+    parted: IdArray = _column(np.int64)
 
     @classmethod
     def empty(cls, dimensions: int, window: int = 0, rows: int = _ROOM) -> Tracks:
@@ -263,7 +265,7 @@ class Tracks(LandmarkTable):
 
     def begin(self, rows: IndexArray, numbers: IdArray, features: StereoFeatures, points: Array) -> None:
         """Begin to follow rows (K,) that have a feature each, at `points` (K, 3) in world coordinates, in place."""
-        self.number[rows], self.unfound[rows], self.expelled[rows] = numbers, 0, False
+        self.number[rows], self.unfound[rows], self.expelled[rows], self.parted[rows] = numbers, 0, False, 0
         self.anchor[rows] = self.position[rows] = points
         self.forget_past(rows)
         self.look[rows], self.laplacian[rows] = (x[self.row[rows]] for x in (features.descriptors, features.laplacian))
