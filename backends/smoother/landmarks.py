@@ -149,12 +149,13 @@ class SmootherLandmarks(LandmarkRows):
             self, mean=mean, information=information, z=np.full_like(self.z, np.nan), pose=-1 + 0 * self.pose
         )
 
-    def folded(self, first: int) -> Self:
-        """With what they are known by, in place of all measurements, where one was made before pose number `first`.
+    def folded(self, first: int, oldest: int) -> Self:
+        """With what they are known by in place of all measurements, where one was made before pose number `first`.
 
         Poses before it are kept no more. The numbers of the poses stay: they say when a landmark was measured last.
+        Landmarks that pose `oldest` or a later one measured go on with the measurements that are left.
         """
-        old = ((self.pose >= 0) & (self.pose < first)).any(axis=1) & ~self.world
+        old = ((self.pose >= 0) & (self.pose < first)).any(axis=1) & (self.pose.max(axis=1) < oldest) & ~self.world
         return replace(
             self, mean=np.where(old[:, None], self.position, self.mean),
             information=np.where(old[:, None, None], inverses(self.own), self.information),

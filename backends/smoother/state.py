@@ -124,13 +124,13 @@ class SmootherState:
         """Row of a pose of the graph."""
         return number - self.first
 
-    def without_old(self, past: int) -> SmootherState:
-        """Without what is kept of all but the last `past` poses."""
+    def without_old(self, past: int, lag: int) -> SmootherState:
+        """Without what is kept of all but the last `past` poses, of which `lag` are smoothed."""
         gone = len(self.poses) - past
         if gone <= 0:
             return self
         return replace(
             self, first=self.first + gone, poses=self.poses[gone:], sights=self.sights[gone:], ties=self.ties[gone:],
-            spread=self.spread[gone:], landmarks=self.landmarks.folded(self.first + gone),
+            spread=self.spread[gone:], landmarks=self.landmarks.folded(self.first + gone, self.number - lag),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip

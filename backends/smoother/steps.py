@@ -166,7 +166,9 @@ class Steps(RectifiedMeasurement):
             solved.serials, solved.points
         )
         s = replace(s, poses=poses, last=last, pair=pair, spread=spread, landmarks=marks)
-        return s if self.past is None or len(s.poses) < 1.5 * self.past else s.without_old(self.past)
+        if self.past is None or self.config.lag is None or len(s.poses) < 1.5 * self.past:
+            return s
+        return s.without_old(self.past, self.config.lag)
 
     # --- landmarks ---
 
