@@ -86,9 +86,9 @@ def test_few_landmarks_of_long_ago_count_when_several_frames_show_them(shown, fr
     """A few out of many agree by chance with the pose that all others give, as if the path had no drift."""
     cloud = Cloud(150)
     start, ids = cloud.features(np.eye(4), 0.0)
-    landmarks = LandmarkTable.empty(32).with_new(0, np.arange(len(ids)), start, np.arange(len(ids)))
     old = np.arange(len(ids)) < 60
-    landmarks = replace(landmarks, out_of_view=np.where(old, AssociationConfig.rematch_after, 0))
+    away = np.where(old, AssociationConfig.rematch_after, 0)
+    landmarks = LandmarkTable(np.arange(len(ids)), start.descriptors, start.laplacian, out_of_view=away)
     features = start.select(np.flatnonzero(~old | (np.arange(len(ids)) < shown)))
     expected = prediction(cloud.points[ids], 0.01, 5.0)
     for frame in range(frames):
@@ -96,5 +96,5 @@ def test_few_landmarks_of_long_ago_count_when_several_frames_show_them(shown, fr
         counts = shown * (frame == frames - 1)
         assert len(matches) == (~old).sum() + counts
         assert old[matches.ids].sum() == counts
-        landmarks = landmarks.with_returning(matches.returning)
+        landmarks.count_returning(matches.returning)
     assert not landmarks.returning.any()
