@@ -63,7 +63,8 @@ def parting(
     if not scene.groups:
         return out
     young = np.setdiff1d(np.flatnonzero(followed), mine[tested])
-    place = places_in_view(transform(inverse(T_world_left), t.position[at[young]]))
+    local = transform(inverse(T_world_left), t.position[at[young]])
+    young, place = young[local[:, 2] > 0], places_in_view(local[local[:, 2] > 0])
     for members in (group.members for group in scene.groups):
         out[mine[tested[members]]] = True
         low, high = view[members].min(axis=0), view[members].max(axis=0)
