@@ -72,7 +72,7 @@ class Run:
     """One system on one sequence."""
 
     def __init__(self, sequence: Sequence, case: Case, frontend: object, backend: str, in_view: int) -> None:
-        config = SystemConfig.for_kind(sequence.kind, "surf", backend).with_settings(case.settings)
+        config = SystemConfig.for_kind(sequence.kind).with_settings(case.settings)
         largest = round(ROOM * in_view) if sequence.kind == "driving" else max(config.map.max_landmarks, in_view)
         wanted = {"map.target_in_view": in_view, "map.max_landmarks": largest}
         self.system = StereoSlam(sequence.rig, frontend, backend, config=config.with_settings(wanted))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -134,6 +134,7 @@ def options_of(made: Any, rig: Any) -> dict[str, tuple[Any, Any]] | None:
     class takes any and does not say which.
     """
     found: dict[str, tuple[Any, Any]] = {}
+    closed = True
     try:
         bases = [base for base in made.__mro__[:-1] if "__init__" in vars(base)] if isinstance(made, type) else [made]
         for one in bases:
@@ -141,10 +142,15 @@ def options_of(made: Any, rig: Any) -> dict[str, tuple[Any, Any]] | None:
             named = (p for p in parameters if p.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY))
             values = {p.name: None if p.default is Parameter.empty else p.default for p in named if p.name != "models"}
             found = {name: (value, one) for name, value in values.items() if not callable(value)} | found
-            if all(p.kind is not Parameter.VAR_KEYWORD for p in parameters):
+            closed = all(p.kind is not Parameter.VAR_KEYWORD for p in parameters)
+            if closed and one is bases[0]:
                 return found
-        config = made(rig).config
-        return found | {f.name: (getattr(config, f.name), type(config)) for f in fields(config)}
+            if closed:
+                break
+        config = getattr(made(rig), "config", None)
+        if is_dataclass(config):
+            return found | {f.name: (getattr(config, f.name), type(config)) for f in fields(config)}
+        return found if closed else None
     except (Exception, SystemExit):  # noqa: BLE001 (whatever a foreign class does)
         return None
 
@@ -154,9 +160,10 @@ def _unknown_option(made: Any, rig: Any, options: Mapping[str, Any]) -> str:
     known = options_of(made, rig)
     if known is None:
         return ""
-    if wrong := next((option for option in options if option not in known and option != "models"), None):
+    taken = signature(made).parameters
+    if wrong := next((name for name in options if name not in (*known, *taken, "models")), None):
         return f": {unknown('option', wrong, known)}" if known else f" has no options, got {wrong!r}"
-    if "models" in options and "models" not in signature(made).parameters:
+    if "models" in options and "models" not in taken and all(p.kind is not p.VAR_KEYWORD for p in taken.values()):
         return " cannot be created: it does not take the argument models"
     return ""
 

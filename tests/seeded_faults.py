@@ -1,4 +1,4 @@
-"""Thirty faults of one line each, put into a copy of the package one after another: do the tests find them?
+"""Faults of one line each, put into a copy of the package one after another: do the tests find them?
 
     python tests/seeded_faults.py            # all of them: an hour or two, so by hand or at night
     python tests/seeded_faults.py window     # those whose name, file or tests hold this word

@@ -46,8 +46,9 @@ class PairGeometry:
 
     @property
     def swapped(self) -> bool:
-        """The matches fit the rig far better with the images exchanged."""
-        return self.conclusive and most(self.as_swapped, self.as_given)
+        """Most matches fit the rig with the images exchanged, and far fewer as they are."""
+        others = max(self.as_given, self.matches - self.as_swapped)
+        return self.conclusive and most(self.as_swapped, others)
 
     @property
     def same(self) -> bool:

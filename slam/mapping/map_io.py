@@ -170,6 +170,9 @@ class SavedMap:
             poses = np.array([k.T_odom_left for k in self.keyframes]).reshape(-1, 4, 4)
             object.__setattr__(self, "keyframe_poses", poses)
         _require(vars(self), _LANDMARKS, self.source)
+        rig = self.rig if isinstance(self.rig, np.ndarray) else np.zeros(1)
+        if rig.shape not in ((0,), (len(_RIG),)) or not (np.isfinite(rig) & (rig > 0)).all():
+            raise SlamError(f"{self.source}: the rig must be {len(_RIG)} positive numbers, or none")
         if (np.diff(self.ids) <= 0).any():
             raise SlamError(f"{self.source}: landmark ids must ascend")
         if self.dimensions > _MOST_DIMENSIONS:
@@ -238,10 +241,10 @@ class SavedMap:
         Raises:
             SlamError: they cannot, or are not.
         """
-        if rig is not None and (
-            other := rig_difference(dict(zip(_RIG, self.rig.tolist())), rig_numbers(rig), _REFINED)
-        ):
-            raise SlamError(f"{self.source}: the map is of another rig: {other}")
+        if rig is not None:
+            here, numbers = rig_numbers(rig), list(zip(_RIG, self.rig.tolist()))  # first the size of the images
+            if other := rig_difference(dict(numbers[:2]), here) or rig_difference(dict(numbers[2:]), here, _REFINED):
+                raise SlamError(f"{self.source}: the map is of another rig: {other}")
         if self.frontend and frontend and self.frontend != frontend:
             raise SlamError(f"{self.source}: its descriptors are of front end {self.frontend!r}, not {frontend!r}")
         if dimensions is not None and dimensions != self.dimensions and len(self):

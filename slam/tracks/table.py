@@ -260,7 +260,7 @@ class Tracks(LandmarkTable):
 
     def erase_landmarks(self, rows: IndexArray) -> None:
         """Landmarks (K,) leave the map, in place; their tracks go on."""
-        self.ids[rows], self.patches[rows] = -1, None
+        self.ids[rows], self.patches[rows], self.parted[rows] = -1, None, 0
         vars(self).pop("mapped", None)
 
     def begin(self, rows: IndexArray, numbers: IdArray, features: StereoFeatures, points: Array) -> None:

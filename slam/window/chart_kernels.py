@@ -111,12 +111,13 @@ def relative_charts(T, points):
 def displace(p, E, d, out):
     """The point after a step d of its chart: its inverse distance is changed, not its distance.
 
-    With ``E = [e₁ r, e₂ r, −u r²]`` and u the point's direction: ``p + (E₀ d₀ + E₁ d₁ + E₂ d₂) / (1 + r d₂)``.
+    With ``E = [e₁ r, e₂ r, −u r²]`` and u the point's direction: ``p + (E₀ d₀ + E₁ d₁ + E₂ d₂) / (1 + r d₂)``. The
+    distance grows tenfold at most.
     """
     r = np.sqrt(E[0, 0] * E[0, 0] + E[1, 0] * E[1, 0] + E[2, 0] * E[2, 0])
     scale = max(1.0 + r * d[2], 0.1)
     for i in range(3):
-        out[i] = p[i] + (E[i, 0] * d[0] + E[i, 1] * d[1] + E[i, 2] * d[2]) / scale
+        out[i] = p[i] + (E[i, 0] * d[0] + E[i, 1] * d[1] + E[i, 2] * (scale - 1.0) / r) / scale
 
 
 @kernel

@@ -35,8 +35,10 @@ class Conditional:
         y = s / np.maximum(1.0 - _distance(self.stayed) * s[:, 2:], _LEAST)  # the inverse of `chart_kernels.displace`
         x = self.mean - self.gain @ np.concatenate([y.ravel(), poses.ravel()])
         d, poses = x[: 3 * len(self.left)].reshape(-1, 3), x[3 * len(self.left) :].reshape(-1, 6)
-        moved = (self.left @ d[:, :, None])[:, :, 0] / np.maximum(1.0 + _distance(self.left) * d[:, 2:], _LEAST)
-        return moved, poses
+        r = _distance(self.left)
+        scale = np.maximum(1.0 + r * d[:, 2:], _LEAST)
+        d = np.concatenate([d[:, :2], (scale - 1.0) / r], axis=1)
+        return (self.left @ d[:, :, None])[:, :, 0] / scale, poses
 
 
 def _distance(E: Array) -> Array:
