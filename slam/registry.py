@@ -170,6 +170,9 @@ def _unknown_option(made: Any, rig: Any, options: Mapping[str, Any]) -> str:
 
 def require_methods(role: str, part: Any, name: str = "") -> Any:
     """A back end or front end, or None for no front end; raises ConfigurationError where it lacks a method."""
+    if isinstance(part, type):
+        made = f"{part.__name__}(rig.rectified.rig)" if role == "backends" else f"{part.__name__}(rig)"
+        raise ConfigurationError(f"{_spoken(role)} {part.__name__} is a class: give an instance, such as {made}")
     missing = [method for method in METHODS[role] if not callable(getattr(part, method, None))]
     if missing and (part is not None or role == "backends"):
         what = f"{_spoken(role)} {name or type(part).__name__}"

@@ -9,6 +9,7 @@ import numpy as np
 
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform
 from slam.interfaces import Backend
@@ -32,7 +33,7 @@ from slam.objects.fits import fit_positions, fit_velocities, make_room, record, 
 from slam.objects.following import follow
 from slam.objects.frame import NO_IDS, Frame, Setup
 from slam.objects.merging import merge
-from slam.objects.parting import parting
+from slam.objects.parting import moved_since, parting
 from slam.objects.proof import PROOF, Way, by_left_image, with_frame
 from slam.objects.recovery import located, observed
 from slam.objects.regions import Region, follow_regions
@@ -134,11 +135,22 @@ class MovingObjectDetector(ObjectDetector):
         self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
     ) -> IdArray:
         """See `ObjectDetector`; a landmark stays in doubt for some frames."""
-        now = self._number + 1
-        if now > 0 and len(at):
-            parted = at[parting(self.setup, tracks, now, features, at, rows, T_world_left)]
-            tracks.parted[parted] = 1 + self.setup.config.confirm
-        return np.sort(tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)])
+        s, c, now = self.setup, self.setup.config, self._number + 1
+        followed = tracks.number[at] >= 0
+        at, rows = at[followed], rows[followed]
+        if now >= self.window:
+            parted = at[parting(s, tracks, now, features, at, rows, T_world_left)]
+            tracks.parted[parted] = 1 + c.confirm
+            return np.sort(tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)])
+        if not now:
+            return NO_IDS
+        first = (tracks.dof[at] > 0).argmax(axis=1)  # slots are frames as long as the window is not full
+        pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
+        ages = now - first.astype(float)
+        moved = moved_since(
+            s.rig, T_world_left, tracks.anchor[at], ages, pixels, s.sigma, c.doubtful, c.suspect, c.min_support
+        )
+        return np.sort(tracks.ids[at[moved]])
 
     def step(
         self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate,

@@ -13,10 +13,11 @@ import numpy as np
 
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.pnp import measurement_rows
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.fits import measure
 from slam.objects.frame import Setup
-from slam.objects.scene import FARTHEST, Displacements, classify_scene, places_in_view
+from slam.objects.scene import FARTHEST, Displacements, classify_scene, places_in_view, tail
 from slam.objects.track_kernels import fit_fixed_points, inverses
 from slam.tracks.table import Tracks
 
@@ -37,13 +38,12 @@ def parting(
         tracks: as they were after the last frame.
         now: number of this frame.
         features: of the frame.
-        at: rows in the table of the landmarks found in it (K,).
+        at: rows in the table of the landmarks found in it that are followed (K,).
         rows: of their features (K,).
         T_world_left: the camera's pose (4, 4) as far as it is known: an error of it moves all landmarks alike.
     """
     c, t, out = setup.config, tracks, np.zeros(len(at), bool)
-    followed = t.number[at] >= 0
-    mine = np.flatnonzero(followed & (t.body[at] < 0) & (t.count(at) >= min(c.min_frames, now)))
+    mine = np.flatnonzero((t.body[at] < 0) & (t.count(at) >= c.min_frames))
     known = at[mine]
     position, covariance = np.empty_like(t.position), np.empty_like(t.covariance)
     fit_fixed_points(t.A, t.p, t.anchor, known, position, covariance)
@@ -62,7 +62,7 @@ def parting(
     scene = classify_scene(moved, view, c.suspect, _FEW, (_LEAST_NOISE / setup.sigma) ** 2)
     if not scene.groups:
         return out
-    young = np.setdiff1d(np.flatnonzero(followed), mine[tested])
+    young = np.setdiff1d(np.arange(len(at)), mine[tested])
     local = transform(inverse(T_world_left), t.position[at[young]])
     young, place = young[local[:, 2] > 0], places_in_view(local[local[:, 2] > 0])
     for members in (group.members for group in scene.groups):
@@ -71,3 +71,38 @@ def parting(
         beyond = _AROUND * (high - low)
         out[young] |= ((place > low - beyond) & (place < high + beyond)).all(axis=1)
     return out
+
+
+def moved_since(
+    rig: StereoRig, T_world_left: Array, first: Array, frames: Array, pixels: Array, sigma: float, doubtful: float,
+    suspect: float, support: int,
+) -> BoolArray:  # fmt: skip
+    """Which points (N,) moved otherwise than the scene since they were first seen: for a run's first frames.
+
+    What moves from the beginning on would else pull the camera along until its tracks are known, and that error stays:
+    the world's axes are those of the first frame. The noise is that of these displacements themselves. Tracks are then
+    too short for their means, of which `parting` asks, to be any better than their first points.
+
+    Args:
+        rig: the cameras.
+        T_world_left: the camera's pose (4, 4), which may be wrong.
+        first: where the points were first seen (N, 3), in world coordinates [m].
+        frames: since then (N,).
+        pixels: (uL, vL, uR) of each in this frame (N, 3); those without a right pixel are not tested.
+        sigma: pixel noise [px].
+        doubtful: χ²(3) from which a single point moved.
+        suspect: χ²(6) from which a group did.
+        support: least number of points of a group.
+    """
+    moves = np.zeros(len(pixels), bool)
+    points, information, dof = measure(rig, T_world_left, first, pixels, sigma)
+    local = transform(inverse(T_world_left), first)
+    known = np.flatnonzero((dof == 3) & (local[:, 2] > 0))
+    if len(known) < 3 * support:
+        return moves
+    A, was = information[known], first[known]
+    ridge = _RIDGE * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    moved = Displacements(was - T_world_left[:3, 3], points[known] - was, 0.5 * (A + ridge), frames[known])
+    scene = classify_scene(moved, places_in_view(local[known]), suspect, support, (_LEAST_NOISE / sigma) ** 2)
+    moves[known[~scene.rest | (scene.alone > doubtful * tail(scene.alone[scene.rest]))]] = True
+    return moves

@@ -18,7 +18,7 @@ from slam.tracks.table import Tracks
 from tests.slam.scene import RIG
 
 SIGMA = 0.3  # pixel noise [px]; the detector is told one pixel
-FRAMES = 8
+FRAMES = ObjectsConfig().window
 IDENTITY = np.eye(4)
 
 
