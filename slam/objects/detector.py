@@ -138,19 +138,20 @@ class MovingObjectDetector(ObjectDetector):
         s, c, now = self.setup, self.setup.config, self._number + 1
         followed = tracks.number[at] >= 0
         at, rows = at[followed], rows[followed]
-        if now >= self.window:
-            parted = at[parting(s, tracks, now, features, at, rows, T_world_left)]
-            tracks.parted[parted] = 1 + c.confirm
-            return np.sort(tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)])
         if not now:
             return NO_IDS
+        parted = at[parting(s, tracks, now, features, at, rows, T_world_left)]
+        tracks.parted[parted] = 1 + c.confirm
+        doubted = tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)]
+        if now >= self.window:
+            return np.sort(doubted)
         first = (tracks.dof[at] > 0).argmax(axis=1)  # slots are frames as long as the window is not full
         pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
         ages = now - first.astype(float)
         moved = moved_since(
             s.rig, T_world_left, tracks.anchor[at], ages, pixels, s.sigma, c.doubtful, c.suspect, c.min_support
         )
-        return np.sort(tracks.ids[at[moved]])
+        return np.union1d(doubted, tracks.ids[at[moved]])
 
     def step(
         self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
