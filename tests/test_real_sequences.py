@@ -27,12 +27,13 @@ def run_defaults(slam_data, case, backend, out, frames=None):
     return sequence, run(sequence, RunOptions(backend, "surf", config, out, 0, frames or case.frames))
 
 
-SCATTERED = CASES[-1]  # the library, without what recognises a place: single runs differ by a factor of four
+#: Single runs differ by a factor of two on raw 0001, and of four in the library, without what recognises a place.
+SCATTERED = [case for case in CASES if case is CASES[-1] or case.name == "raw 0001"]
 
 
 @pytest.mark.parametrize(
     ("case", "backend"),
-    [pytest.param(c, b, id=f"{c.name}-{b}") for c in RECORDED if c is not SCATTERED for b in bars(c.name)],
+    [pytest.param(c, b, id=f"{c.name}-{b}") for c in RECORDED if c not in SCATTERED for b in bars(c.name)],
 )
 def test_errors_are_those_measured(slam_data, tmp_path, case, backend):
     """Plain stereo odometry on OpenCV's ORB or SIFT has 0.36 and 0.20 m on KITTI 06.
@@ -48,9 +49,10 @@ def test_errors_are_those_measured(slam_data, tmp_path, case, backend):
         assert error_of(Trajectory.read_tum(tmp_path / PATHS[path]), sequence) < allowed, path
 
 
-def test_the_median_is_that_measured_where_single_runs_scatter(slam_data):
-    sequence, allowed = open_sequence(slam_data / SCATTERED.path), bars(SCATTERED.name)
-    trials = [errors(SCATTERED, sequence, tuple(allowed), trial) for trial in range(SCATTERED.trials)]
+@pytest.mark.parametrize("case", SCATTERED, ids=lambda case: case.name)
+def test_the_median_is_that_measured_where_single_runs_scatter(slam_data, case):
+    sequence, allowed = open_sequence(slam_data / case.path), bars(case.name)
+    trials = [errors(case, sequence, tuple(allowed), trial) for trial in range(5)]  # as the bars
     for backend, figures in allowed.items():
         for path, most in figures.items():
             assert np.median([trial[backend][path] for trial in trials]) < most, (backend, path)
