@@ -75,7 +75,7 @@ def exact_rig() -> AbstractContextManager[object]:
 
 def nothing_parts() -> AbstractContextManager[object]:
     """Landmarks measure the pose until the detector knows by their tracks that they may move."""
-    name = "slam.objects.detector.MovingObjectDetector.parting"
+    name = "slam.bodies.detector.MovingObjectDetector.parting"
     return mock.patch(name, lambda *_: np.zeros(0, np.int64))
 
 

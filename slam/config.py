@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from slam.bodies.config import ObjectsConfig
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.config import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for, require_not_negative
-from slam.objects.config import ObjectsConfig
 from slam.settings import apply_settings
 from slam.tracks.config import AssociationConfig
 

@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from slam import registry
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.detector import MovingObjectDetector, ObjectDetector
 from slam.calibration import SavedCalibration, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
@@ -25,8 +27,6 @@ from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.naming import count
-from slam.objects.config import ObjectsConfig
-from slam.objects.detector import MovingObjectDetector, ObjectDetector
 from slam.papers.procedure1 import Procedure1Detector
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.stages import Stages
@@ -247,7 +247,7 @@ class StereoSlam:
                 return step
         with stage("estimate"):  # the pose; the calibration learns from it
             step = t.estimate(state, step)
-        with stage("objects"):  # still, moving or undecided; moving bodies (paper B, 3): `slam.objects.detector`
+        with stage("objects"):  # still, moving or undecided; moving bodies (paper B, 3): `slam.bodies.detector`
             step = t.sort(state, step)
         with stage("manage"):  # count, erase and add landmarks (paper A, IV): `slam.mapping.mapper`
             step = t.manage(state, step)

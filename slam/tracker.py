@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam.bodies.detector import ObjectDetector
 from slam.data import (
     Estimate,
     FrameResult,
@@ -23,7 +24,6 @@ from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Frontend, RestingBackend
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
-from slam.objects.detector import ObjectDetector
 from slam.rig_error import CommonError, Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
 from slam.third_party import checked

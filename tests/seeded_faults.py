@@ -149,15 +149,15 @@ FAULTS = (
     ),
     # moving bodies
     Fault(
-        "noise of depth counts as a body's own extent", "slam/objects/points.py",
+        "noise of depth counts as a body's own extent", "slam/bodies/points.py",
         "values, axes = np.linalg.eigh(total - noise)", "values, axes = np.linalg.eigh(total)",
-        "tests/slam/objects/test_first_sight.py tests/slam/objects",
+        "tests/slam/bodies/test_first_sight.py tests/slam/bodies",
     ),
     Fault(
-        "a body's point counts twice as its frame leaves", "slam/objects/belief.py",
+        "a body's point counts twice as its frame leaves", "slam/bodies/belief.py",
         "rows, places = rows.select(~taken & (rows.pose > 0)), places.select(~there & (places.pose > 0))",
         "rows, places = rows.select(rows.pose > 0), places.select(~there & (places.pose > 0))",
-        "tests/slam/objects/test_first_sight.py tests/slam/objects",
+        "tests/slam/bodies/test_first_sight.py tests/slam/bodies",
     ),
     # the front end
     Fault(

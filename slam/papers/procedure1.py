@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.archives import array, unpack
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.detector import ObjectDetector
 from slam.data import Estimate, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.files import read_bytes, whole_file
@@ -24,8 +26,6 @@ from slam.geometry.se3 import Array, angles, inverse, log, pose, transform
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
-from slam.objects.config import ObjectsConfig
-from slam.objects.detector import ObjectDetector
 from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
 

@@ -79,7 +79,7 @@ def compile_kernels(backend: str, frontend: str = "surf") -> None:
     This one takes the front end's kernels, which `surf` alone has, another one those of the back end and of moving
     objects, about twice as long, which are then loaded from Numba's cache. No kernel is compiled by both.
     """
-    from slam.objects.scene_kernels import groups_apart
+    from slam.bodies.scene_kernels import groups_apart
 
     folder = groups_apart.stats.cache_path if hasattr(groups_apart, "stats") else None  # without Numba's compiler
     cold = folder is not None and not any(Path(folder).glob("scene_kernels.groups_apart-*.nbi"))

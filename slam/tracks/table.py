@@ -139,7 +139,7 @@ class Tracks(LandmarkTable):
     """All rows: `ids` are −1 for what is no landmark, `number` for what is not followed; a row with neither is unused.
 
     Every measurement of what is followed is kept as a point in world coordinates with its information: the point ``p``
-    that the pixels say, relative to the track's own anchor, and ``A = Jᵀ J / σ²``; `slam.objects.fits` fits them.
+    that the pixels say, relative to the track's own anchor, and ``A = Jᵀ J / σ²``; `slam.bodies.fits` fits them.
     """
 
     number: IdArray = _column(np.int64, fill=-1)  # of the track (N,), never used twice; −1 for what is not followed
@@ -169,7 +169,7 @@ class Tracks(LandmarkTable):
     expelled: BoolArray = _column(bool)
     # whether its feature stays at its pixel while the camera stands (N,): it belongs to no body
     still: BoolArray = _column(bool)
-    # frames for which, as a landmark, it is in doubt since it parted from the rest (N,), see `slam.objects.parting`
+    # frames for which, as a landmark, it is in doubt since it parted from the rest (N,), see `slam.bodies.parting`
     parted: IdArray = _column(np.int64)
 
     @classmethod

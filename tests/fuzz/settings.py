@@ -13,13 +13,13 @@ import slam
 from backends.ekf.filter import EkfConfig
 from backends.smoother.config import SmootherConfig
 from frontends.surf.config import SurfConfig
+from slam.bodies.config import ObjectsConfig
 from slam.calibration.config import SelfCalibrationConfig
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels, MotionModel, ObjectModels
-from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam
 from slam.tracks.config import AssociationConfig
 from tests.fuzz.harness import Subject

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import slam
+from slam.bodies.detector import ObjectDetector
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
-from slam.objects.detector import ObjectDetector
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slam.bodies.config import ObjectsConfig
 from slam.config import SystemConfig
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
-from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 

@@ -1,0 +1,220 @@
+"""What is believed of one moving body: the camera's last poses in it, and its points. See `slam.bodies.estimator`.
+
+How sure it is that a body exists follows from the frames in which it was measured and those in which it was not: the
+recursion of integrated probabilistic data association (Mušicki, Evans and Stanković, IEEE Transactions on Automatic
+Control 39, 1994). A measurement counts the more, the better the body's motion explains its points compared with a still
+world.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam.data import BoolArray, IdArray, RecentPoses
+from slam.geometry.se3 import Array
+from slam.models import ObjectModels
+from slam.object_data import ObjectEstimate
+from slam.window.marginal import marginalised
+from slam.window.problem import Carried, Places, RelativePrior, Rows, Window
+from slam.window.stereo import RectifiedStereo
+
+EVEN = 0.5  #: fixed: a body rather exists than not above this probability, which it has before its first evidence
+_LEAST = 2.0  # ratio of the likelihoods of a measured body, at least: a body at rest shows no motion, but is there
+_LARGEST = 20.0  # χ² that counts of the typical member: many members share one error of the camera's pose
+_CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
+
+
+def when_measured(probability: float, gain: float) -> float:
+    """The probability after a frame in which the body was measured.
+
+    Args:
+        probability: before.
+        gain: by how much χ² the body's motion explains its typical member better than a fixed point does.
+    """
+    ratio = max(_LEAST, math.exp(0.5 * min(gain, _LARGEST)))
+    return min(_CERTAIN, probability * ratio / (1.0 - probability + probability * ratio))
+
+
+def when_missed(probability: float, seen: int, age: int) -> float:
+    """The probability after a frame in which the body was not measured.
+
+    Args:
+        probability: before.
+        seen: number of frames in which it was measured, and
+        age: number of frames since it was found: their ratio says how surely it is measured where it exists.
+    """
+    detection = (seen + 1.0) / (age + 2.0)
+    return probability * (1.0 - detection) / (1.0 - probability * detection)
+
+
+_EXACT = 1e-12 * np.eye(6)  # numerics: [rad², m²]
+_TURN = 0.01  # cost: a point is seen from elsewhere by no less [rad]; what is less adds up
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of a body, a row each."""
+
+    ids: IdArray  # (N,), −1 of those that were given up but still take part
+    position: Array  # in body coordinates (N, 3) [m]
+    local: Array  # covariance (N, 3, 3) [m²] in the coordinates of the newest camera, by which they are known
+    failures: IdArray  # how often running each was rejected (N,)
+    unseen: IdArray  # frames since each was seen (N,)
+    sights: IdArray  # frames in which each was used (N,)
+    first: Array  # direction (N, 3) from which each was seen first, in body coordinates
+    turned: Array  # largest angle between that and later ones (N,) [rad], as far as it is allowed for
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @classmethod
+    def new(cls, ids: IdArray, position: Array, local: Array, eye: Array) -> Points:
+        """Points at their first sight, from `eye` (3,)."""
+        none = np.zeros(len(ids), np.int64)
+        return cls(ids, position, local, none, none, none + 1, _directions(position, eye), np.zeros(len(ids)))
+
+    def joined(self, other: Points) -> Points:
+        """These and others."""
+        return Points(*(np.concatenate([mine, its]) for mine, its in zip(vars(self).values(), vars(other).values())))
+
+    def select(self, keep: BoolArray) -> Points:
+        """Some of them."""
+        return Points(*(column[keep] for column in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class BodyBelief:
+    """One body in the last K frames."""
+
+    since: float  # when the estimate began [s]
+    T_begun: Array  # pose T_world_object (4, 4) then
+    moved: bool  # whether it has moved for certain since
+    # what was known of the velocity [ω, v] (6,) in the first interval: mean, in world axes, and standard deviations
+    velocity: Array
+    sigmas: Array
+    stamps: Array  # times of the frames (K,) [s]
+    poses: Array  # T_body_left (K, 4, 4)
+    scales: Array  # factors (K,) on the impulse before each frame
+    points: Points  # of the body
+    rows: Rows  # what was measured of them in these frames
+    places: Places  # what is known of points besides, from a frame
+    prior: RelativePrior  # what earlier frames say of the poses and points
+    covariance: Array  # of the poses together (6 K, 6 K), perturbed on the right
+    estimate: ObjectEstimate  # of the newest frame, as it is reported
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def alive(self) -> BoolArray:
+        """Which of the points belong to it still (N,)."""
+        return np.asarray(self.points.ids >= 0)
+
+
+def _directions(points: Array, eye: Array) -> Array:
+    """Unit vectors (N, 3) from points (N, 3) towards the camera's place (3,)."""
+    d = eye - points
+    return np.asarray(d / np.linalg.norm(d, axis=1)[:, None])
+
+
+def begun(stamp: float, T_body_left: Array, velocity: Array, sigmas: Array, estimate: ObjectEstimate) -> BodyBelief:
+    """A belief without points: the body's frame is put at T_body_left (4, 4) from the camera, by definition."""
+    none = np.zeros((0, 3))
+    points = Points.new(np.zeros(0, np.int64), none, np.zeros((0, 3, 3)), np.zeros(3))
+    return BodyBelief(
+        stamp, estimate.T_world_object, False, velocity, sigmas, np.array([stamp]), T_body_left[None], np.ones(1),
+        points, Rows.none(), Places.none(), RelativePrior.of_pose(T_body_left, _EXACT), _EXACT, estimate,
+    )  # fmt: skip
+
+
+def carried(b: BodyBelief, cameras: RecentPoses, models: ObjectModels) -> Carried:
+    """The motion between the frames, for the camera's poses in them (K)."""
+    triples, intervals, means, variances = [], [], [], []
+    for i in range(1, len(b)):
+        first = i == 1
+        if first and b.stamps[0] != b.since:
+            continue  # what is known of this interval is in the prior
+        dt = b.stamps[i] - b.stamps[i - 1]
+        linear, angular = models.velocity_variance(dt)
+        variance = b.scales[i] ** 2 * np.repeat([angular, linear], 3)
+        mean: Array = np.zeros(6)
+        if first:
+            variance, mean = variance + b.sigmas**2, b.velocity.copy()
+            mean[:3] = b.poses[0][:3, :3] @ cameras.poses[0][:3, :3].T @ b.velocity[:3]
+        triples.append((i - 2, i - 1, i))
+        intervals.append((1.0 if first else b.stamps[i - 1] - b.stamps[i - 2], dt))
+        means.append(mean)
+        variances.append(variance)
+    if not triples:
+        return Carried.none()
+    return Carried(
+        cameras.poses, cameras.covariance, np.array(triples), np.array(intervals), np.array(means), np.array(variances)
+    )
+
+
+def window(b: BodyBelief, stereo: RectifiedStereo, motion: Carried) -> Window:
+    """The belief as a problem for the solver."""
+    return Window(stereo, b.poses, b.points.position, b.rows, places=b.places, carried=motion, prior=b.prior)
+
+
+def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Carried, drift: float) -> BodyBelief:
+    """The belief without its oldest frame, which becomes part of the prior, and without points that were given up.
+
+    Points that the frame has measured join the prior. `drift` is the density of the random walk of a point's direction
+    with the angle from which it is seen [rad / √rad].
+
+    Raises:
+        numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
+    """
+    rows, places = b.rows, b.places
+    member, here, alive = np.zeros(len(b.points), bool), np.zeros(len(b.points), bool), b.alive
+    member[b.prior.points], here[rows.point[rows.pose == 0]] = True, True
+    here[places.point[places.pose == 0]] = True
+    joins, ends = here & ~member & alive, member & ~alive
+    taken = (rows.pose == 0) & (member | joins)[rows.point] | ends[rows.point]
+    there = (places.pose == 0) & (member | joins)[places.point] | ends[places.point]
+    w = window(b, stereo, motion.select(np.flatnonzero((motion.poses <= 0).any(axis=1))))
+    w = Window(
+        stereo, w.poses, w.points, rows.select(taken), places=places.select(there), carried=w.carried, prior=b.prior,
+        joining=np.flatnonzero(joins),
+    )  # fmt: skip
+    prior, _, _ = marginalised(w, [0], ends[b.prior.points])
+    prior, turned = _drifted(prior, b, drift)
+    rows, places = rows.select(~taken & (rows.pose > 0)), places.select(~there & (places.pose > 0))
+    keep = member & alive | joins
+    keep[rows.point] = keep[places.point] = True
+    index = np.cumsum(keep) - 1
+    return replace(
+        b, stamps=b.stamps[1:], poses=b.poses[1:], scales=b.scales[1:],
+        points=replace(b.points, turned=turned).select(keep),
+        rows=replace(rows, pose=rows.pose - 1, point=index[rows.point]),
+        places=replace(places, pose=places.pose - 1, point=index[places.point]),
+        prior=replace(prior, points=index[prior.points]), covariance=b.covariance[6:, 6:],
+    )  # fmt: skip
+
+
+def _drifted(prior: RelativePrior, b: BodyBelief, density: float) -> tuple[RelativePrior, Array]:
+    """The prior with its points less certain across the line of sight, and the angles (N,) allowed for now.
+
+    A feature is found where the image looks like it; seen from farther round than ever before, that is elsewhere on the
+    body. The first two coordinates of a point in its chart are its direction.
+    """
+    p = b.points
+    cosine = np.einsum("ni,ni->n", p.first, _directions(p.position, b.poses[-1][:3, 3]))
+    turned = np.maximum(p.turned, np.arccos(np.clip(cosine, -1, 1)))
+    more = (turned - p.turned)[prior.points]
+    far = np.flatnonzero(more > _TURN)
+    if not len(far) or not density:
+        return prior, p.turned
+    out = p.turned.copy()
+    out[prior.points[far]] = turned[prior.points[far]]
+    at = (3 * far[:, None] + np.arange(2)).reshape(-1)
+    S = np.diag(1.0 / np.repeat(density**2 * more[far], 2)) + prior.information[np.ix_(at, at)]
+    gain = np.linalg.solve(S, prior.information[at]).T
+    information = prior.information - gain @ prior.information[at]
+    return replace(
+        prior, information=0.5 * (information + information.T), vector=prior.vector - gain @ prior.vector[at]
+    ), out

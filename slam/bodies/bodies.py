@@ -1,0 +1,254 @@
+"""A moving rigid body as the detector keeps it: its pose over the window, its extent, and what is reported of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.bodies.belief import EVEN, BodyBelief, when_measured, when_missed
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.track_kernels import windows_in_body
+from slam.data import BoolArray
+from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, transform
+from slam.models import ObjectModels
+from slam.object_data import MovingObject, ObjectEstimate
+from slam.tracks.table import Tracks
+
+_YOUNG = 4  # frames in which a body moves as it did when it was found
+CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
+_REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
+_SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A body."""
+
+    id: int
+    T: Array  # pose T_world_object (4, 4) at the present frame
+    velocity: Array  # [ω, v] (6,) in world axes
+    covariance: Array  # of the pose (6, 6), body axes
+    history: Array  # poses at the window's slots (W, 4, 4)
+    known: BoolArray  # at which slots there is a measured one (W,)
+    T_before: Array  # pose at the previous frame
+    lower: Array  # corner (3,) of the extent of its points, body coordinates
+    upper: Array  # the opposite corner
+    size: float  # what it measures across at least [m]
+    reach: float  # its points lie no farther from its origin [m]
+    seen_at: float  # when its points were last found together [s]
+    velocity_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of the velocity (6, 6)
+    seen: int = 1  # number of frames in which it was measured
+    missed: int = 0  # number of frames since it was measured
+    measured: bool = True  # whether it was in this frame
+    moving: bool = True  # whether it moves now
+    evidence: float = 0.0  # evidence that it has moved, given all that is uncertain; see `slam.bodies.proof`
+    far: bool = False  # whether it was followed for farther than it is wide before it became a body
+    certain: int = 0  # what frames so far count for the proof that it moves, see `slam.bodies.proof`
+    proven: bool = False  # whether it has moved for certain by its tracks
+    moved: bool = False  # whether it has by its estimate, too, see `slam.bodies.estimator`: only then it is reported
+    alike: int = 0  # number of frames in which it moved as an older body did, as a part of that would
+    age: int = 0  # number of frames since it was found
+    existence: float = EVEN  # probability that it exists, see `slam.bodies.belief`
+    measured_at: float = float("nan")  # when the estimate last used them [s]
+    reported: int = 0  # number of frames in which it was reported as measured
+    reported_unmeasured: int = 0  # number of frames in which it was reported though it was not measured
+    apart_from: int | None = None  # id of the body of which it is a part with a motion of its own; None for none
+    distinct: frozenset[int] = frozenset()  # ids of bodies that it is known not to be a part of
+    belief: BodyBelief | None = field(default=None, repr=False)  # its estimate; None where there is none yet
+
+    @property
+    def across(self) -> float:
+        """Diagonal of its extent, but no less than its least size [m]."""
+        return max(math.dist(self.upper, self.lower), self.size)
+
+    @property
+    def middle(self) -> Array:
+        """Middle of its extent (3,) in world coordinates."""
+        return np.asarray(self.T[:3, :3] @ (0.5 * (self.lower + self.upper)) + self.T[:3, 3])
+
+    def placed(self, T: Array, slot: int, measured: bool, **changes: Any) -> Body:
+        """The body with its pose at the present frame, whose slot is `slot`, and other changes."""
+        history, known = self.history.copy(), self.known.copy()
+        history[slot], known[slot] = T, measured
+        return replace(self, T=T, history=history, known=known, measured=measured, **changes)
+
+
+def new_body(
+    id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float, uncertainty: Array | None = None
+) -> Body:  # fmt: skip
+    """A body found with a twist at its centre; its poses over the window follow from a constant velocity.
+
+    Args:
+        id: for it.
+        centre: origin (3,) of its frame in world coordinates, now.
+        twist: [ω, v] (6,).
+        times: of the window's slots less the present (W,) [s].
+        stamp: the present [s].
+        size: what it measures across at least [m].
+        uncertainty: covariance of the twist (6, 6); None where it is known.
+    """
+    history = np.tile(np.eye(4), (len(times), 1, 1))
+    history[:, :3, :3] = so3_exp(times[:, None] * twist[:3])
+    history[:, :3, 3] = centre + times[:, None] * twist[3:]
+    T = np.eye(4)
+    T[:3, 3] = centre
+    none = np.zeros(3)
+    return Body(
+        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, none, none,
+        size, np.inf, stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
+    )  # fmt: skip
+
+
+def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
+    """The body predicted over `dt` [s] with constant velocity, not measured yet.
+
+    Impulses on its velocities, of the variances that the motion model gives, add `dt` times themselves to the pose.
+    """
+    T = body.T.copy()
+    T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
+    T[:3, 3] += dt * body.velocity[3:]
+    linear, angular = models.velocity_variance(dt)
+    R = np.zeros((6, 6))
+    R[:3, :3] = R[3:, 3:] = T[:3, :3].T
+    velocity = body.velocity_covariance + np.diag([angular] * 3 + [linear] * 3)
+    return body.placed(
+        T, slot, False, T_before=body.T, covariance=body.covariance + dt**2 * R @ velocity @ R.T,
+        velocity_covariance=velocity, missed=body.missed + 1, age=body.age + 1,
+    )  # fmt: skip
+
+
+def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_speed: float) -> Body:
+    """The body as it is estimated in the present frame."""
+    estimate = belief.estimate
+    size = 0.5 * float(np.linalg.norm(body.upper - body.lower))
+    v, P = estimate.velocity, estimate.velocity_covariance
+    speed = float(np.linalg.norm(v[3:]) + size * np.linalg.norm(v[:3]))
+    certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
+    changes: dict[str, Any] = {}
+    if estimate.measured:
+        changes = {"seen_at": stamp, "measured_at": stamp, "seen": body.seen + 1, "missed": 0}
+    if estimate.measured and belief.since == stamp and body.belief is None:
+        body = replace(body, known=np.zeros_like(body.known))  # the estimate began anew: it knows of no earlier pose
+    return body.placed(
+        estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
+        velocity_covariance=P, belief=belief, moved=body.moved or belief.moved,
+        moving=body.seen <= _YOUNG or (certain and speed > min_speed), **changes,
+    )  # fmt: skip
+
+
+def continued(body: Body, known: Body) -> Body:
+    """A new body that turns out to be a known one: it takes over that one's id, frame and probability of existence.
+
+    The estimate of it begins anew, and so does the evidence that it moves. Its frame stays as predicted, but for a
+    shift from the part seen before to the part seen now.
+    """
+    frame = known.T.copy()
+    frame[:3, 3] += body.middle - known.middle
+    change = inverse(body.T) @ frame
+    turn = adjoint(inverse(change))
+    corners = transform(inverse(change), np.stack([body.lower, body.upper]))
+    return replace(
+        body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
+        covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
+        proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
+        reported=known.reported, reported_unmeasured=known.reported_unmeasured,
+        measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
+    )  # fmt: skip
+
+
+def hidden(bodies: Iterable[Body], eye: Array, points: Array) -> BoolArray:
+    """Which points (N, 3) lie behind one of the bodies, seen from `eye` (3,): beyond the far side of its extent."""
+    behind = np.zeros(len(points), bool)
+    for body in bodies:
+        start = transform(inverse(body.T), eye[None])
+        rays = transform(inverse(body.T), points) - start
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sides = (np.stack([body.lower, body.upper])[:, None] - start) / rays  # of the way to the point
+        enters, leaves = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+        behind |= (enters > 0) & (enters < leaves) & (leaves < 1)
+    return behind
+
+
+def with_evidence(body: Body, gain: float) -> Body:
+    """The body after what this frame says of its existence; see `slam.bodies.belief`."""
+    if body.measured:
+        return replace(body, existence=when_measured(body.existence, gain))
+    return replace(body, existence=when_missed(body.existence, body.seen, body.age))
+
+
+def with_extent(body: Body, local: Array) -> Body:
+    """The body with the extent of its points (K, 3)."""
+    if len(local) < 3:
+        return body
+    lower, upper = outermost(local)
+    body = replace(body, lower=lower, upper=upper)
+    return body if math.isfinite(body.reach) else replace(body, reach=_REACH * body.across)
+
+
+def outermost(points: Array) -> tuple[Array, Array]:
+    """The 5th and 95th percentiles (3,) of points (K, 3), at least two: as NumPy's, without their cost for a few."""
+    ordered = np.sort(points, axis=0)
+    place = CUT * (len(points) - 1)
+    k = int(place)
+    share = place - k
+    return (1 - share) * ordered[k] + share * ordered[k + 1], (1 - share) * ordered[-1 - k] + share * ordered[-2 - k]
+
+
+def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Array, Array, BoolArray]:
+    """What tracks measured in each slot of the window, in the body's coordinates.
+
+    Returns:
+        points (N, W, 3) in body coordinates, information (N, W, 3, 3), and whether there is any (N, W).
+    """
+    t = tracks
+    points, A, known = windows_in_body(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
+    return points, A, known
+
+
+def reported(bodies: dict[int, Body], tracks: Tracks, config: ObjectsConfig) -> tuple[MovingObject, ...]:
+    """The bodies that are worth reporting, by ascending id; that they are is counted in place."""
+    out = []
+    for id, body in sorted(bodies.items()):
+        if body.belief is None or not (body.proven and body.moved):
+            continue
+        if _worth_reporting(body, body.belief.estimate, config):
+            count = "reported" if body.belief.estimate.measured else "reported_unmeasured"
+            bodies[id] = replace(body, **{count: getattr(body, count) + 1})
+            out.append(_report(body, body.belief, tracks))
+    return tuple(out)
+
+
+def _worth_reporting(body: Body, estimate: ObjectEstimate, config: ObjectsConfig) -> bool:
+    """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
+    short = estimate.stamp - body.measured_at <= config.report_unmeasured
+    seldom = body.reported_unmeasured + 1 <= config.unmeasured_share * body.reported
+    return estimate.measured or (short and seldom and body.existence > EVEN)
+
+
+def _enclosing(points: Array) -> Array:
+    """Lower and upper corner (2, 3) of a box about points (K, 3), false ones among them left out.
+
+    The percentiles are widened by what they cut off evenly spread points, at most to the outermost point.
+    """
+    lower, upper = outermost(points)
+    more = CUT / (1.0 - 2.0 * CUT) * (upper - lower)
+    return np.stack([np.maximum(lower - more, points.min(axis=0)), np.minimum(upper + more, points.max(axis=0))])
+
+
+def _report(body: Body, belief: BodyBelief, tracks: Tracks) -> MovingObject:
+    estimate = belief.estimate
+    mine = tracks.body == body.id
+    rows = tracks.row[mine & tracks.found]
+    points = tracks.local[mine & tracks.sure]
+    T, new = estimate.T_world_object, belief.since == estimate.stamp
+    motion = np.eye(4) if new else T @ inverse(body.T_before)
+    extent = _enclosing(points) if len(points) > 1 else np.zeros((2, 3))
+    return MovingObject(
+        body.id, np.sort(rows), estimate, motion, T @ inverse(belief.T_begun), extent, body.moving, belief.since,
+        body.measured_at, body.existence,
+    )  # fmt: skip

@@ -1,0 +1,352 @@
+"""The detector of moving objects: tracks all features, says which move, and estimates the bodies that they form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from slam.bodies import finder, membership
+from slam.bodies.bodies import (
+    Body,
+    advanced,
+    continued,
+    hidden,
+    reported,
+    with_belief,
+    with_evidence,
+    with_extent,
+)
+from slam.bodies.camera import recent_poses, with_estimate
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.estimator import FRAMES, BodyEstimator
+from slam.bodies.fits import fit_positions, fit_velocities, make_room, record, revise_tracks
+from slam.bodies.following import follow
+from slam.bodies.frame import NO_IDS, Frame, Setup
+from slam.bodies.merging import merge
+from slam.bodies.parting import moved_since, parting
+from slam.bodies.proof import PROOF, Way, by_left_image, with_frame
+from slam.bodies.recovery import located, observed
+from slam.bodies.regions import Region, follow_regions
+from slam.bodies.scene import Scene, displacements
+from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
+from slam.geometry.arrays import among, median
+from slam.geometry.pnp import measurement_rows
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, transform
+from slam.interfaces import Backend
+from slam.models import EstimatorModels
+from slam.object_data import MotionLabels, MovingObject
+from slam.tracks.table import Tracks
+
+_NONE: IndexArray = np.zeros(0, np.intp)
+_PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
+_ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
+
+
+class ObjectDetector:
+    """What the system asks of a detector of moving objects in every step; by itself it takes everything for still.
+
+    `parting` and `suspects` are asked before the back end's update, `step` comes after it.
+    """
+
+    #: Number of frames for which the table of tracks keeps what it measured.
+    window: int = 0
+    #: Ids of landmarks that may move: they do not measure the camera's next pose.
+    suspects: IdArray = np.zeros(0, np.int64)
+
+    def parting(
+        self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
+    ) -> IdArray:
+        """Ids of landmarks that may have begun to move in this frame or the last ones: see `suspects`.
+
+        Args:
+            tracks: the table of tracks, as the last frame left it.
+            features: of the frame, before the back end's update.
+            at: rows in the table of the landmarks found in it (K,).
+            rows: of their features (K,).
+            T_world_left: the camera's pose (4, 4), as far as it is known.
+        """
+        return np.zeros(0, np.int64)
+
+    def restart(self) -> None:
+        """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
+
+    def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
+        """Take note that the rig's correction changes before the next frame.
+
+        Args:
+            tracks: the table of tracks.
+            correct: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
+        """
+
+    def step(
+        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, still: IndexArray
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
+        """Say which features move, before any of them becomes a landmark, and report the bodies.
+
+        Args:
+            backend: gives the camera's last poses with their joint covariance.
+            tracks: the table of tracks; landmarks that were found have their feature already. Changed in place.
+            features: of the frame.
+            estimate: the camera's pose after the update.
+            still: rows of features that stay at their pixels while the camera stands.
+        """
+        none = np.zeros(0, np.intp)
+        return MotionLabels(none, none, np.zeros(0, np.int64)), ()
+
+
+class MovingObjectDetector(ObjectDetector):
+    """Finds moving bodies without being told.
+
+    Args:
+        rig: the cameras.
+        config: settings.
+        models: pixel noise of the estimators, and how they assume that bodies move.
+    """
+
+    def __init__(self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> None:
+        self.setup = Setup(rig, config, models)
+        self.window = config.window
+        self._estimator = BodyEstimator(rig, models)
+        self._next_track = 0
+        self._next_body = 1
+        self.restart()
+
+    def restart(self) -> None:
+        """See `ObjectDetector`."""
+        window = self.window
+        self.bodies: dict[int, Body] = {}
+        self.suspects = NO_IDS
+        self._stamps = np.full(window, np.nan)
+        self._poses = np.tile(np.eye(4), (window, 1, 1))  # of the left camera in the window's frames
+        self._number = -1
+        self._path: RecentPoses | None = None
+        self._regions: list[Region] = []
+
+    def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
+        """See `ObjectDetector`."""
+        if self._number >= 0:
+            slot = self._number % self.window
+            revise_tracks(tracks, self.bodies, self._poses, slot, self.setup.rig, correct)
+
+    def parting(
+        self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
+    ) -> IdArray:
+        """See `ObjectDetector`; a landmark stays in doubt for some frames."""
+        s, c, now = self.setup, self.setup.config, self._number + 1
+        followed = tracks.number[at] >= 0
+        at, rows = at[followed], rows[followed]
+        if not now:
+            return NO_IDS
+        parted = at[parting(s, tracks, now, features, at, rows, T_world_left)]
+        tracks.parted[parted] = 1 + c.confirm
+        doubted = tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)]
+        if now >= self.window:
+            return np.sort(doubted)
+        first = (tracks.dof[at] > 0).argmax(axis=1)  # slots are frames as long as the window is not full
+        pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
+        ages = now - first.astype(float)
+        moved = moved_since(
+            s.rig, T_world_left, tracks.anchor[at], ages, pixels, s.sigma, c.doubtful, c.suspect, c.min_support
+        )
+        return np.union1d(doubted, tracks.ids[at[moved]])
+
+    def step(
+        self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
+        still: IndexArray = _NONE,
+    ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
+        """Follow all tracks into this frame, test them, and find bodies; see `ObjectDetector`."""
+        frame = self._begin(backend, tracks, features, estimate)
+        self._advance_bodies(tracks, frame)
+        follow(tracks, self.bodies, frame)
+        self._measure(tracks, frame)
+        np.maximum(tracks.parted - 1, 0, out=tracks.parted)
+        tracks.still[:] = tracks.found & among(max(len(features), 1), still)[tracks.row]
+        self._fit(tracks, frame)
+        self._change_members(tracks, frame)
+        scene, suspects, groups = finder.find_groups(frame, tracks, self.bodies)
+        for group in groups:
+            moving = finder.lasting(group, tracks, frame)
+            new = finder.moving_group(frame, tracks, moving) if len(moving) else None
+            if new is not None:
+                self._found(new, tracks, frame, group[0])
+        if self.setup.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.bodies.regions`
+            self._follow_regions(tracks, frame)
+        self._prove(tracks, frame, scene)
+        unproven = (tracks.body >= 0) & ~self._of_proven(tracks)
+        c, expelled = self.setup.config, np.flatnonzero(tracks.expelled & tracks.found)
+        # of a body that was dropped: nothing is known of these until a group could be found
+        unproven[expelled[tracks.count(expelled) < c.min_frames + c.confirm]] = True
+        suspected = np.concatenate([tracks.ids[suspects], tracks.ids[unproven]])
+        self.suspects = np.unique(suspected[suspected >= 0])
+        self._begin_estimates(tracks, frame)
+        self._begin_tracks(tracks, frame)
+        return self._motion_labels(tracks, frame), reported(self.bodies, tracks, self.setup.config)
+
+    def _begin(self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate) -> Frame:
+        """Move on by a frame; nothing is followed into the first one."""
+        s = self.setup
+        self._number += 1
+        measured = among(len(features), tracks.row[tracks.row >= 0])
+        if self._number == 0:
+            tracks.number[:], tracks.body[:], tracks.dof[:] = -1, -1, 0
+        slot = self._number % s.config.window
+        self._stamps[slot], self._poses[slot] = features.stamp, estimate.T_world_left
+        local = s.rig.triangulate(features.uv_left, features.uv_right)
+        measuring = local[measured & np.isfinite(local[:, 0])]
+        self._path = with_estimate(self._path, estimate, s.rig, s.sigma, measuring, FRAMES + 1)
+        cameras = recent_poses(backend, FRAMES + 1, self._path, estimate.covariance)
+        return Frame(s, self._number, features, local, self._stamps.copy(), self._poses.copy(), cameras)
+
+    def _advance_bodies(self, tracks: Tracks, frame: Frame) -> None:
+        """Predict all bodies; forget those that were not seen for long."""
+        now, dt = frame.features.stamp, frame.dt
+        for body in list(self.bodies.values()):
+            fresh = (body.seen + 0.5) * dt < _ESTABLISHED  # to the nearest frame
+            too_long = now - body.seen_at > self.setup.config.forget_after
+            if too_long or (fresh and body.missed >= _PATIENCE + body.seen):
+                del self.bodies[body.id]
+                tracks.give_up(np.flatnonzero(tracks.body == body.id))
+            else:
+                self.bodies[body.id] = advanced(body, dt, frame.slot, self.setup.models)
+
+    def _measure(self, tracks: Tracks, frame: Frame) -> None:
+        """Estimate the bodies, and add this frame's measurements to the tracks, in world coordinates."""
+        f = frame.features
+        for body in list(self.bodies.values()):
+            mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
+            front = (other for other in self.bodies.values() if other.proven and other.id != body.id)
+            tracks.row[mine[hidden(front, frame.eye, tracks.position[mine])]] = -1
+            belief = located(body, tracks, frame, self._estimator)
+            if belief is None or not self.setup.models.known(belief.estimate):  # it begins anew once measured again
+                body = replace(body, belief=None)
+            else:
+                body = with_belief(body, belief, frame.slot, f.stamp, self.setup.config.min_speed)
+            self.bodies[body.id] = body
+            mine = np.flatnonzero(tracks.body == body.id)
+            tracks.position[mine] = transform(body.T, tracks.local[mine])
+        make_room(tracks, frame.slot)
+        self._record(tracks, np.flatnonzero(tracks.found), frame)
+
+    def _record(self, tracks: Tracks, rows: IndexArray, frame: Frame) -> None:
+        """Add what tracks (K,) measured in this frame."""
+        record(tracks, rows, frame.slot, self.setup.rig, frame.T_world_left, frame.features, self.setup.sigma)
+
+    def _fit(self, tracks: Tracks, frame: Frame) -> None:
+        """Positions of free tracks, and velocities of those that may move."""
+        c = self.setup.config
+        free = np.flatnonzero((tracks.body < 0) & tracks.found)
+        count = tracks.count(free)
+        unsure = (count < c.min_frames) | tracks.doubtful[free] | tracks.velocity[free].any(axis=1)
+        fit_positions(tracks, free)
+        fit_velocities(tracks, free[unsure & (count > 1)], frame.times, c.max_speed)
+
+    def _change_members(self, tracks: Tracks, frame: Frame) -> None:
+        """Update the bodies' members; bodies that do not move are dropped."""
+        gains = membership.update_members(self.bodies, frame, tracks)
+        for id, body in list(self.bodies.items()):
+            typical = median(gains[id]) if len(gains.get(id, ())) else 0.0
+            body = self.bodies[id] = with_evidence(body, typical)
+            if id in gains and typical <= 0 and not body.proven:
+                self._drop(tracks, body)
+            elif id in gains:
+                mine = np.flatnonzero((tracks.body == id) & tracks.sure)
+                self.bodies[id] = with_extent(body, tracks.local[mine])
+        merge(self.bodies, tracks)
+
+    def _follow_regions(self, tracks: Tracks, frame: Frame) -> None:
+        """Follow the regions that may move; one that has moved for certain becomes a body."""
+        self._regions = follow_regions(self._regions, frame, tracks)
+        for region in [r for r in self._regions if r.has_moved(frame)]:
+            self._regions.remove(region)
+            self._found(finder.region_group(frame, tracks, region), tracks, frame, far=True)
+
+    def _found(
+        self, group: finder.MovingGroup, tracks: Tracks, frame: Frame, whole: int | None = None, far: bool = False
+    ) -> None:
+        """Make a body of tracks with a common twist, or continue with them one that was out of view.
+
+        That keeps its id, but not its points. Where the tracks belong to another body, both are merged later.
+
+        Args:
+            group: the tracks that move.
+            tracks: all tracks.
+            frame: the present one.
+            whole: id of the body that they are a part of, with a motion of their own; None for none.
+            far: whether they were followed for farther than they are wide already.
+        """
+        members = group.members
+        body = replace(group.body(self._next_body, frame, tracks), far=far)
+        parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
+        known = membership.reappeared(parts, body)
+        if known is not None:
+            tracks.give_up(np.flatnonzero(tracks.body == known.id))
+            body = continued(body, known)
+        self._next_body = max(self._next_body, body.id + 1)
+        membership.add_members(body, tracks, members, sure=True)
+        self.bodies[body.id] = with_extent(replace(body, apart_from=whole), tracks.local[members])
+
+    def _prove(self, tracks: Tracks, frame: Frame, scene: Scene) -> None:
+        """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
+        s = self.setup
+        for body in list(self.bodies.values()):
+            if not body.measured:
+                continue
+            members = np.flatnonzero((tracks.body == body.id) & tracks.found)
+            members = members[tracks.count(members) >= s.config.min_frames - 1]
+            moved = displacements(tracks, members, frame.ages, frame.poses[:, :3, 3], s.slide)
+            way = Way.of(body, frame)
+            left = 0.0 if body.proven else by_left_image(tracks, members, frame, scene)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, left, body.far)
+            certain = body.certain + counts
+            body = replace(body, evidence=evidence, certain=certain, proven=body.proven or certain >= PROOF)
+            self.bodies[body.id] = body
+            if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
+                self._drop(tracks, body)
+
+    def _drop(self, tracks: Tracks, body: Body) -> None:
+        """Let a body's tracks go; they stay suspected for a while, and need proof to become members of another one."""
+        mine = np.flatnonzero(tracks.body == body.id)
+        membership.remove_members(tracks, mine, body)
+        tracks.expelled[mine] = True
+        del self.bodies[body.id]
+
+    def _begin_estimates(self, tracks: Tracks, frame: Frame) -> None:
+        """Begin the estimates of bodies that have none."""
+        for id, body in list(self.bodies.items()):
+            if body.belief is None and body.measured:
+                mine = np.flatnonzero((tracks.body == id) & tracks.found)
+                seen = observed(body, tracks, mine, tracks.row[mine], frame.features, body.T)
+                belief = self._estimator.updated(None, id, seen, frame.cameras)
+                self.bodies[id] = replace(body, belief=belief, measured_at=frame.features.stamp)
+
+    def _begin_tracks(self, tracks: Tracks, frame: Frame) -> None:
+        """Follow landmarks and stereo features that are not followed yet; give up what was not found for long."""
+        f, deep = frame.features, np.isfinite(frame.local[:, 0])
+        lost = (tracks.number >= 0) & (tracks.body < 0) & (tracks.unfound > self.setup.config.patience)
+        tracks.give_up(np.flatnonzero(lost))
+        found = np.flatnonzero(tracks.row >= 0)
+        anew = found[(tracks.number[found] < 0) & deep[tracks.row[found]]]
+        rows = np.flatnonzero(~among(len(f), tracks.row[found]) & deep)
+        unused = np.flatnonzero(~tracks.used)[: len(rows)]
+        tracks.row[unused] = rows
+        new = np.concatenate([anew, unused])
+        numbers = np.arange(self._next_track, self._next_track + len(new))
+        self._next_track += len(new)
+        tracks.begin(new, numbers, f, transform(frame.T_world_left, frame.local[tracks.row[new]]))
+        self._record(tracks, new, frame)
+        fit_positions(tracks, new)
+
+    def _of_proven(self, tracks: Tracks) -> BoolArray:
+        """Which tracks (N,) belong to a body that has moved for certain."""
+        return np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
+
+    def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
+        n = len(frame.features)
+        on, near = membership.tracks_on_bodies(self.bodies, tracks, self.setup.config.margin)
+        moving = among(n, tracks.row[on])
+        undecided = among(n, tracks.row[near]) | among(n, tracks.row[tracks.found & tracks.doubtful])
+        landmarks = np.sort(tracks.ids[self._of_proven(tracks) & (tracks.ids >= 0)])
+        return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks)

@@ -1,0 +1,377 @@
+"""The estimate of a moving body: the camera in its last frames, moving among the body's points.
+
+Seen from the body it is the camera that moves: so a body is a window of camera poses in the body and of points, solved
+by `slam.window` as the camera's own window is. What ties the frames together besides the points is the body's motion,
+constant velocity in the world but for random impulses; there the camera's own motion comes in, with its uncertainty.
+Frames that leave are marginalised, so that a body that is seen for long does not drift. The camera's estimate is read
+and never changed.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam.bodies.belief import BodyBelief, Points, begun, carried, slid, window
+from slam.bodies.points import (
+    MAX_REJECTIONS,
+    MIN_POINTS,
+    Shape,
+    first_frame,
+    points_to_replace,
+    shape_of,
+    with_shape,
+)
+from slam.chi_square import chi_square_limit, chi_square_limits
+from slam.data import BoolArray, IdArray, IndexArray, Observations, RecentPoses
+from slam.geometry.arrays import isin
+from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform
+from slam.models import EstimatorModels
+from slam.object_data import ObjectEstimate, ObjectObservations
+from slam.window import chart_kernels, pose_only
+from slam.window.gating import INFLATION
+from slam.window.problem import Places, Rows
+from slam.window.solver import Solution, linearised, solve
+from slam.window.stereo import RectifiedStereo
+
+FRAMES = 4  #: cost: frames of a window; older ones are marginalised
+_SOLVED_AGAIN = 4  # numerics: how often it is solved again without observations that disagree with the others
+_CHANCE = 1e-6  # that a body at rest seems to have moved; from 1e-4 to 1e-12 next to nothing changes
+_LEAST = 2  # points that must agree with a body that has more: one agrees with some pose always
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Observations of a body in the rectified rig: `z` (M, 3), and where they triangulate to, `local` (M, 3)."""
+
+    given: ObjectObservations
+    z: Array
+    local: Array
+
+    @property
+    def deep(self) -> BoolArray:
+        """Which have a depth (M,)."""
+        return np.asarray(np.isfinite(self.local).all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Expected:
+    """A belief with a new frame that is not measured yet."""
+
+    belief: BodyBelief  # with the predicted pose; it has no covariance yet
+    # of the new pose given the last one (6, 6): by the velocity, its impulse, and the camera's motion
+    covariance: Array
+    impulse: Array  # what the impulse adds to it (6, 6)
+    local: Array  # covariances of the points in the new camera, for a known motion since the last frame (N, 3, 3)
+
+
+class BodyEstimator:
+    """Estimates bodies one by one; all that is known of one is its `BodyBelief`.
+
+    Args:
+        rig: the cameras, rectified.
+        models: pixel noise, gate, and how bodies move.
+    """
+
+    def __init__(self, rig: StereoRig, models: EstimatorModels) -> None:
+        self.stereo = RectifiedStereo.of(rig)
+        self.sigma = models.pixel_sigma
+        self.models = models.objects
+        self.gate = models.gate_probability
+        self.drift = self.models.drift / self.stereo.f
+
+    def updated(
+        self, belief: BodyBelief | None, id: int, seen: ObjectObservations | None, cameras: RecentPoses
+    ) -> BodyBelief | None:
+        """The belief after one more frame, the newest of the camera's poses.
+
+        A body of which nothing is known, or of which nothing agrees with what is known though it was located
+        (`ObjectObservations.T_world_object`), begins anew, if at least three points have a depth.
+
+        Args:
+            belief: before; None for none.
+            id: of the body.
+            seen: its points in this frame; None where it was not seen.
+            cameras: its last `FRAMES` + 1 poses, or as many as there are.
+
+        Returns:
+            None where there is no belief before and it cannot begin.
+        """
+        measured = None if seen is None else self._measured(seen)
+        after = None
+        if belief is not None and len(cameras) > 1:
+            with suppress(np.linalg.LinAlgError):
+                after = self._followed(belief, id, measured, cameras)
+        lost = after is None or not after.estimate.measured
+        if measured is not None and lost and (belief is None or measured.given.T_world_object is not None):
+            with suppress(np.linalg.LinAlgError):
+                return self._begun(id, measured, cameras) or after
+        return after
+
+    # --- parts ---
+
+    def _measured(self, seen: ObjectObservations) -> _Seen:
+        z = self.stereo.measure(Observations(seen.points, seen.uv_left, seen.uv_right))
+        return _Seen(seen, z, self.stereo.triangulate(z))
+
+    def _begun(self, id: int, seen: _Seen, cameras: RecentPoses) -> BodyBelief | None:
+        """A new belief: the body's frame is put where it is said to be, or at the mean of its points."""
+        X, stamp = cameras.poses[-1], float(cameras.stamps[-1])
+        own, near = first_frame(X, seen.local) if seen.deep.any() else (np.eye(4), seen.deep)
+        if near.sum() < MINIMAL_POINTS:
+            return None
+        T = own if seen.given.T_world_object is None else seen.given.T_world_object
+        velocity, sigmas = self.models.first_velocity(seen.given)
+        none = np.zeros(0, np.int64)
+        estimate = ObjectEstimate(
+            id, stamp, T, np.zeros((6, 6)), velocity, np.diag(sigmas**2), True, none, none
+        )  # fmt: skip
+        b = begun(stamp, inverse(T) @ X, velocity, sigmas, estimate)
+        b, joined = self._joined(b, seen, near)
+        return self._reported(b, id, cameras, True, seen.given.points[joined], none)
+
+    def _followed(self, b: BodyBelief, id: int, seen: _Seen | None, cameras: RecentPoses) -> BodyBelief:
+        """The belief with a further frame.
+
+        Raises:
+            numpy.linalg.LinAlgError: it cannot be solved.
+        """
+        cameras = _of(cameras, np.append(b.stamps, cameras.stamps[-1]))
+        earlier = _of(cameras, b.stamps)
+        if len(b) >= FRAMES:
+            b = slid(b, self.stereo, carried(b, earlier, self.models), self.drift)
+            cameras, earlier = _of(cameras, cameras.stamps[1:]), _of(cameras, b.stamps)
+        expected = self._expected(b, cameras)
+        after = None if seen is None else self._corrected(b, expected, id, seen, cameras)
+        if after is not None:
+            return after
+        none = np.zeros(0, np.int64)
+        rejected = none if seen is None else np.sort(seen.given.points[isin(seen.given.points, b.points.ids)])
+        return self._reported(self._predicted(expected.belief, cameras), id, cameras, False, none, rejected)
+
+    def _corrected(
+        self, before: BodyBelief, expected: _Expected, id: int, seen: _Seen, cameras: RecentPoses
+    ) -> BodyBelief | None:
+        """The belief by what was seen; None where too little agrees, or the motion would be no body's."""
+        b, used, rejected = self._solved(expected, seen, cameras)
+        if b is None:
+            return None
+        b, joined = self._joined(b, seen, ~isin(seen.given.points, np.concatenate([used, rejected])))
+        good = np.sort(np.concatenate([used, seen.given.points[joined]]))
+        after = self._reported(b, id, cameras, True, good, np.sort(rejected))
+        if len(used) >= MINIMAL_POINTS and not after.moved:
+            after = replace(after, moved=_has_moved(after))
+        e, last, dt = after.estimate, before.estimate, float(b.stamps[-1] - b.stamps[-2])
+        possible = self.models.possible(
+            e.velocity, e.velocity_covariance, last.velocity, last.velocity_covariance, dt
+        )  # fmt: skip
+        return after if possible else None
+
+    def _expected(self, b: BodyBelief, cameras: RecentPoses) -> _Expected:
+        """With the new frame's pose as the motion model predicts it."""
+        dt = float(cameras.stamps[-1] - cameras.stamps[-2])
+        T, velocity = cameras.poses[-2] @ inverse(b.poses[-1]), b.estimate.velocity
+        T = pose(so3_exp(dt * velocity[:3]) @ T[:3, :3], T[:3, 3] + dt * velocity[3:])
+        Y = inverse(T) @ cameras.poses[-1]
+        b = replace(
+            b, stamps=cameras.stamps, poses=np.concatenate([b.poses, Y[None]]), scales=np.append(b.scales, 1.0),
+            points=replace(b.points, unseen=b.points.unseen + 1),
+        )  # fmt: skip
+        by_step = adjoint(inverse(Y)) * dt
+        back = np.kron(np.eye(2), T[:3, :3].T)
+        impulses = by_step * np.sqrt(np.repeat(self.models.velocity_variance(dt)[::-1], 3))
+        covariance = by_step @ back @ b.estimate.velocity_covariance @ back.T @ by_step.T
+        turn = Y[:3, :3].T @ b.poses[-2][:3, :3]
+        return _Expected(
+            b, covariance + impulses @ impulses.T + _between(cameras), impulses @ impulses.T,
+            turn @ b.points.local @ turn.T,
+        )  # fmt: skip
+
+    def _predicted(self, b: BodyBelief, cameras: RecentPoses) -> BodyBelief:
+        """With the covariances of a frame in which nothing was measured."""
+        e = linearised(window(b, self.stereo, carried(b, cameras, self.models)))
+        solution = Solution(e.window, e, e.cost)
+        local, _ = solution.point_covariances(len(b) - 1)
+        return replace(b, covariance=solution.pose_covariance, points=replace(b.points, local=local))
+
+    def _solved(
+        self, expected: _Expected, seen: _Seen, cameras: RecentPoses
+    ) -> tuple[BodyBelief | None, IdArray, IdArray]:
+        """The belief by what was seen of its points, and the ids used and rejected; None where too little agrees."""
+        b = expected.belief
+        place = {i: row for row, i in enumerate(b.points.ids.tolist()) if i >= 0}
+        rows = np.array([place.get(i, -1) for i in seen.given.points.tolist()], np.intp)
+        known = np.flatnonzero(rows >= 0)
+        rows, z, ids = rows[known], seen.z[known], seen.given.points[known]
+        if not len(rows):
+            return None, ids, ids
+        Y, used, scale = self._agreement(expected, rows, z, seen.given.T_world_object, cameras.poses[-1])
+        b = replace(
+            b, poses=np.concatenate([b.poses[:-1], Y[None]]), scales=np.append(b.scales[:-1], scale)
+        )  # fmt: skip
+        motion = carried(b, cameras, self.models)
+        limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.gate)
+        enough = min(_LEAST, (int(b.alive.sum()) + 1) // 2)
+        for again in range(_SOLVED_AGAIN + 1):
+            if used.sum() < enough:
+                return None, ids[:0], ids
+            tried = replace(b, rows=b.rows.joined(self._rows(len(b) - 1, rows[used], z[used])))
+            solution = solve(window(tried, self.stereo, motion))
+            local, _ = solution.point_covariances(len(b) - 1)
+            distances = solution.left_out_distances(-1, rows[used], z[used], local[rows[used]], self.sigma)
+            excess = distances / limits[used]
+            bad = excess > max(1.0, 0.5 * float(excess.max()))  # the worst draw the pose, and others seem bad
+            if not bad.any() or again == _SOLVED_AGAIN:
+                break
+            used[np.flatnonzero(used)[bad]] = False
+        return self._after(tried, solution, local, rows, used), ids[used], ids[~used]
+
+    def _agreement(
+        self, expected: _Expected, rows: IndexArray, z: Array, guess: Array | None, X: Array
+    ) -> tuple[Array, BoolArray, float]:
+        """The pose on which most observations agree, which ones, and by what factor the impulse must be larger."""
+        b = expected.belief
+        predicted, points = b.poses[-1], b.points.position[rows]
+        local = transform(inverse(predicted), points)
+        noise = pose_only.residual_noise(self.stereo, self.sigma, local, expected.local[rows], z)
+        starts = [predicted] + ([] if guess is None else [inverse(guess) @ X])
+        most, limit = max(MIN_POINTS, (len(rows) + 1) // 2), chi_square_limit(6, self.gate)
+        first = None
+        for factor in (0.0, *INFLATION):
+            information = np.linalg.inv(expected.covariance + factor**2 * expected.impulse)
+            problem = pose_only.PoseProblem(self.stereo, points, z, noise, predicted, information, self.gate)
+            for start in starts:
+                Y, used = pose_only.solve(problem, start)
+                off = log(inverse(predicted) @ Y)
+                tried = Y, used, float(np.hypot(1.0, factor))
+                first = first or tried
+                if len(rows) < most or (used.sum() >= most and off @ information @ off < limit):
+                    return tried
+        assert first is not None
+        return first
+
+    def _after(self, b: BodyBelief, solution: Solution, local: Array, rows: IndexArray, used: BoolArray) -> BodyBelief:
+        """The belief at a solution; points that failed too often are given up."""
+        p = b.points
+        failures, unseen, sights, ids = p.failures.copy(), p.unseen.copy(), p.sights.copy(), p.ids.copy()
+        failures[rows] = np.where(used, 0, failures[rows] + 1)
+        unseen[rows], sights[rows] = 0, sights[rows] + used
+        ids[failures >= MAX_REJECTIONS] = -1
+        w = solution.window
+        return replace(
+            b, poses=w.poses, covariance=solution.pose_covariance,
+            points=replace(p, ids=ids, position=w.points, local=local, failures=failures, unseen=unseen, sights=sights),
+        )  # fmt: skip
+
+    def _joined(self, b: BodyBelief, seen: _Seen, new: BoolArray) -> tuple[BodyBelief, IndexArray]:
+        """With those of the new observations that have a depth, as far as there is room; and which they are."""
+        which = np.flatnonzero(new & seen.deep)
+        alive = np.flatnonzero(b.alive)
+        gone = points_to_replace(b.points.unseen[alive], b.points.sights[alive], len(which), self.models.points)
+        which = which[: self.models.points - len(alive) + int(gone.sum())]
+        if not len(which):
+            return b, which
+        ids = b.points.ids.copy()
+        ids[alive[gone]] = -1
+        Y = b.poses[-1]
+        shape = self._shape(b, seen.local[which]).seen_from(inverse(Y))
+        h, own = with_shape(self.stereo.project, seen.z[which], seen.local[which], self.sigma, shape)
+        new_points = Points.new(seen.given.points[which], transform(Y, h), own, Y[:3, 3])
+        at = len(ids) + np.arange(len(which))
+        points = replace(b.points, ids=ids).joined(new_points)
+        return replace(
+            b, points=points, rows=b.rows.joined(self._rows(len(b) - 1, at, seen.z[which])),
+            places=b.places.joined(_places(len(b) - 1, at, h, shape)),
+        ), which  # fmt: skip
+
+    def _shape(self, b: BodyBelief, h: Array) -> Shape:
+        """The body's shape in body coordinates, by the points it has, or else by the new ones at h (M, 3)."""
+        Y, alive = b.poses[-1], b.alive
+        if alive.sum() >= MIN_POINTS:
+            R = Y[:3, :3]
+            return shape_of(b.points.position[alive], R @ b.points.local[alive] @ R.T)
+        _, J = self.stereo.project(h)
+        back = np.linalg.inv(J) * self.sigma
+        return shape_of(h, back @ np.swapaxes(back, 1, 2)).seen_from(Y)
+
+    def _rows(self, frame: int, points: IndexArray, z: Array) -> Rows:
+        return Rows(np.full(len(points), frame), points, z, np.full(len(points), 1 / self.sigma))
+
+    def _reported(
+        self, b: BodyBelief, id: int, cameras: RecentPoses, measured: bool, used: IdArray, rejected: IdArray
+    ) -> BodyBelief:
+        """With the estimate of its newest frame, where the camera's uncertainty is part of all that is in the world."""
+        X, Y = cameras.poses[-2:], b.poses[-2:]
+        k = 6 * len(Y)
+        by_pose = np.zeros((k, k))
+        for i, A in enumerate(adjoint(Y)):
+            by_pose[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = A
+        P = by_pose @ (b.covariance[-k:, -k:] + cameras.covariance[-k:, -k:]) @ by_pose.T  # of the body's poses
+        T = X[-len(Y) :] @ inverse(Y)
+        velocity, spread = b.velocity, np.diag(b.sigmas**2)
+        if len(b) > 1:
+            velocity, J = _velocity(T[0], T[1], float(b.stamps[-1] - b.stamps[-2]))
+            spread = J @ P @ J.T
+        estimate = ObjectEstimate(
+            id, float(b.stamps[-1]), T[-1], P[-6:, -6:], velocity, spread, measured, used, rejected
+        )  # fmt: skip
+        if not all(np.isfinite(a).all() for a in (estimate.T_world_object, estimate.covariance, velocity, spread)):
+            raise np.linalg.LinAlgError("a body's estimate is not finite")
+        return replace(b, estimate=estimate)
+
+
+def _has_moved(b: BodyBelief) -> bool:
+    """Whether the motion since the estimate began is more than the uncertainty of body and camera makes it seem."""
+    change = log(inverse(b.T_begun) @ b.estimate.T_world_object)
+    return bool(change @ np.linalg.solve(b.estimate.covariance, change) > chi_square_limit(6, 1 - _CHANCE))
+
+
+def _of(cameras: RecentPoses, stamps: Array) -> RecentPoses:
+    """The camera's poses at some of their stamps (K,), ascending.
+
+    Raises:
+        numpy.linalg.LinAlgError: one of them is not there.
+    """
+    at = np.searchsorted(cameras.stamps, stamps).clip(0, len(cameras) - 1)
+    if len(cameras) < len(stamps) or (cameras.stamps[at] != stamps).any():
+        raise np.linalg.LinAlgError("the camera's poses in a body's frames are not known")
+    rows = (6 * at[:, None] + np.arange(6)).reshape(-1)
+    return RecentPoses(cameras.stamps[at], cameras.poses[at], cameras.covariance[rows[:, None], rows])
+
+
+def _between(cameras: RecentPoses) -> Array:
+    """Covariance (6, 6) of the camera's newest pose given the last but one."""
+    A = adjoint(inverse(cameras.poses[-1]) @ cameras.poses[-2])
+    P = cameras.covariance[-12:, -12:]
+    cross = A @ P[:6, 6:]
+    return np.asarray(P[6:, 6:] + A @ P[:6, :6] @ A.T - cross - cross.T)
+
+
+def _places(frame: int, points: IndexArray, h: Array, shape: Shape) -> Places:
+    """That points at h (M, 3) in a frame's camera belong to a body of a shape, given there.
+
+    A Gaussian about the shape's middle: its information, and the point in each point's chart that it is centred on, are
+    those of the chart at h.
+    """
+    eye = np.eye(4)
+    basis, origin = chart_kernels.relative_charts(eye, h)
+    _, D, _ = chart_kernels.chart_changes(eye, h, basis, np.tile(np.eye(3), (len(h), 1, 1)))
+    back = np.linalg.inv(D)
+    information = np.swapaxes(back, 1, 2) @ np.linalg.inv(shape.covariance) @ back
+    root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
+    middle = origin + (D @ (shape.mean - h)[:, :, None])[:, :, 0]
+    return Places(np.full(len(points), frame), points, basis, middle, np.ascontiguousarray(root))
+
+
+def _velocity(before: Array, after: Array, dt: float) -> tuple[Array, Array]:
+    """Velocity [ω, v] (6,) in world axes between two poses, and derivatives (6, 12) by both, perturbed on the right."""
+    turn = so3_log(after[:3, :3] @ before[:3, :3].T)
+    J = np.zeros((6, 12))
+    by_turn = np.linalg.inv(so3_left_jacobian(turn)) @ after[:3, :3] / dt
+    J[:3, :3], J[:3, 6:9] = -by_turn, by_turn
+    J[3:, 3:6], J[3:, 9:] = -before[:3, :3] / dt, after[:3, :3] / dt
+    return np.concatenate([turn, after[:3, 3] - before[:3, 3]]) / dt, J

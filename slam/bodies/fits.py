@@ -1,0 +1,148 @@
+"""What tracks measured, as points in world coordinates, and how that fits a fixed point or a constant velocity.
+
+Sums over the window of `slam.tracks.table.Tracks` give the least-squares fixed point, the least-squares point with an
+even velocity, and the χ² of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.bodies.bodies import Body
+from slam.bodies.track_kernels import constant_velocities, fit_fixed_points, leave_window, points_on_rays
+from slam.data import IndexArray, StereoFeatures
+from slam.geometry.pnp import measurement_rows
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.tracks.table import Tracks
+
+_MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
+_TOO_FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
+_STEPS = 4  # numerics: of Gauss-Newton at most
+MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
+AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
+EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain, may leave of what moves with it
+
+
+def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array, sigma: float) -> tuple:
+    """Points (N, 3) measured by pixels, their information (N, 3, 3), and the number of measured values of each (N,).
+
+    Each is linearised on the measured ray, at the depth of the expected point: so the left pixel is met exactly, and
+    the depth is linear in the disparity and therefore free of bias; only where the expected point is far off, at the
+    measured depth. Rows whose uR is NaN have no information along the ray; unusable rows have none at all.
+
+    Args:
+        rig: the cameras, rectified.
+        T_world_left: pose (4, 4) of the left camera.
+        points: expected points (N, 3) in world coordinates.
+        measured: (N, 3) = (uL, vL, uR).
+        sigma: pixel noise [px].
+    """
+    found: tuple = points_on_rays(rig.rectified_parameters, T_world_left, points, measured, sigma, _TOO_FAR, _STEPS)
+    return found
+
+
+def make_room(tracks: Tracks, slot: int) -> None:
+    """Let what `slot` held leave the window for the fading sums, in place."""
+    t = tracks
+    leave_window(t.number, t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, slot, _MEMORY)
+
+
+def record(
+    tracks: Tracks, rows: IndexArray, slot: int, rig: StereoRig, T_world_left: Array, features: StereoFeatures,
+    sigma: float,
+) -> None:  # fmt: skip
+    """Enter what the features of tracks (K,) measure in this frame, in place; see `make_room`."""
+    z = measurement_rows(features.uv_left[tracks.row[rows]], features.uv_right[tracks.row[rows]])
+    points, tracks.A[rows, slot], tracks.dof[rows, slot] = measure(rig, T_world_left, tracks.position[rows], z, sigma)
+    tracks.p[rows, slot] = points - tracks.anchor[rows]
+
+
+def fit_positions(tracks: Tracks, rows: IndexArray) -> None:
+    """Fit fixed points to the windows of tracks, in place."""
+    t = tracks
+    fit_fixed_points(t.A, t.p, t.anchor, rows, t.position, t.covariance)
+    t.velocity[rows] = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantVelocity:
+    """Points with an even velocity, a row each."""
+
+    position: Array  # now (N, 3)
+    covariance: Array  # of the position (N, 3, 3)
+    velocity: Array  # (N, 3) [m/s]
+    velocity_covariance: Array  # (N, 3, 3)
+    test: Array  # χ²(3) of the velocity (N,)
+
+
+def constant_velocity(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> ConstantVelocity:
+    """Points with an even velocity, fitted to the windows of tracks.
+
+    Args:
+        tracks: all tracks.
+        rows: which of them.
+        times: of the window's slots less the present (W,) [s].
+        max_speed: deviation of velocities before anything is known [m/s].
+    """
+    points, *rest = constant_velocities(tracks.A, tracks.p, rows, times, max_speed**-2)
+    return ConstantVelocity(tracks.anchor[rows] + points, *rest)
+
+
+def fit_velocities(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> None:
+    """Give tracks a velocity, in place, where a fixed point does not explain them; see `constant_velocity`."""
+    m = constant_velocity(tracks, rows, times, max_speed)
+    moves = m.test > MOVES
+    moving = rows[moves]
+    tracks.velocity[moving], tracks.velocity_covariance[moving] = m.velocity[moves], m.velocity_covariance[moves]
+    tracks.position[moving], tracks.covariance[moving] = m.position[moves], m.covariance[moves]
+
+
+def times_vectors(M: Array, v: Array) -> Array:
+    """Products (..., 3) of matrices (..., 3, 3) and vectors (..., 3)."""
+    return np.asarray((M @ v[..., None])[..., 0])
+
+
+def revise_tracks(
+    tracks: Tracks, bodies: Mapping[int, Body], poses: Array, slot: int, rig: StereoRig,
+    correct: Callable[[Array], Array],
+) -> None:  # fmt: skip
+    """Move the points of all tracks to where their pixels say that they are, corrected again; in place.
+
+    Without it a change of all disparities looks as if all that is far away had moved along the line of sight.
+
+    Args:
+        tracks: the tracks.
+        bodies: the bodies by id; their members' points move in them.
+        poses: T_world_left (W, 4, 4) in the frames of the window's slots.
+        slot: of the newest frame.
+        rig: the cameras.
+        correct: corrects rectified rows (uL, vL, uR) (N, 3) [px] again, as of `slam.calibration.model.Revision`.
+    """
+    rows, slots = np.nonzero(tracks.dof)
+    points = tracks.anchor[rows] + tracks.p[rows, slots]
+    tracks.p[rows, slots] += _shifts(points, poses[slots], rig, correct)
+    alive = np.flatnonzero(tracks.number >= 0)
+    shift = _shifts(tracks.position[alive], np.broadcast_to(poses[slot], (len(alive), 4, 4)), rig, correct)
+    tracks.position[alive] += shift
+    tracks.older_b[alive] += times_vectors(tracks.older_A[alive], shift)
+    for body in bodies.values():
+        mine = tracks.body[alive] == body.id
+        tracks.local[alive[mine]] += shift[mine] @ body.T[:3, :3]
+
+
+def _shifts(points: Array, T_world_left: Array, rig: StereoRig, correct: Callable[[Array], Array]) -> Array:
+    """By what points (N, 3) seen from poses (N, 4, 4) move, in world coordinates (N, 3); not at all out of view."""
+    R = T_world_left[:, :3, :3]
+    z, J = rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T_world_left[:, :3, 3]))
+    shifts = np.zeros_like(points)
+    seen = np.isfinite(z).all(axis=1) & rig.left.in_image(z[:, :2])
+    good = np.flatnonzero(seen & (np.abs(z[:, 0] - z[:, 2]) < rig.width))
+    change = correct(z[good]) - z[good]
+    finite = np.isfinite(change).all(axis=1)
+    good, change = good[finite], change[finite]
+    shifts[good] = times_vectors(R[good], np.linalg.solve(J[good], change[..., None])[..., 0])
+    return shifts

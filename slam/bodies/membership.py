@@ -1,0 +1,365 @@
+"""Which tracks belong to a body, and which features lie on it.
+
+A track's measurements are compared with a fixed point in the world and with a fixed point in the body. The difference
+of the two χ² over the window, a log-likelihood ratio, decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.bodies.bodies import Body, in_body_axes, with_extent
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
+from slam.bodies.frame import Frame
+from slam.bodies.points import MAX_REJECTIONS
+from slam.bodies.track_kernels import inverses, squares, weighted_means
+from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
+from slam.data import BoolArray
+from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
+from slam.tracks.table import Tracks
+
+_ROUNDS = 3  # of fitting poses and points in turn
+_TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
+_MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
+_PART_EXPLAINED = 0.05  # share of χ² that the motion of a body leaves of what was found of it before
+_FREEDOM = 6.0  # fixed: of a body's pose in every frame
+PROBATION = 12  #: frames in which a body must have moved for certain, and is not told from another one
+_NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join, and
+_INSIDE = 4.0  # up to which it counts as inside, the extent being widened by
+_EDGE = 0.1  # as a share of its diagonal: the outermost points lie beyond the percentiles
+_LOOSE = 4.0  # by how much it may exceed the 99 % limit then
+_BETTER = 6.0  # by how much χ² the body must explain a track better than the still world does, for it to join, and
+_BETTER_INSIDE = -4.0  # where it lies inside
+_WORSE = -9.0  # a member for which the still world is better by more leaves
+_MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
+_ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
+_RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
+_RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
+_LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
+_WEAK = 1e-8  # numerics: variance that is added to a known pose's [m²]
+_UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
+_APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
+
+
+@dataclass(frozen=True, eq=False)
+class MembershipTest:
+    """How well tracks fit a body, a row each."""
+
+    gain: Array  # by how much χ² the body explains them better than the still world (N,)
+    fits: BoolArray  # whether the body explains them (N,)
+    count: NDArray[np.int64]  # number of frames that say so (N,)
+
+
+def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> MembershipTest:
+    """Compare the fit of tracks to a body with that to the still world, over the window."""
+    points, A, known = in_body_axes(body, tracks, rows)
+    dof = np.where(known, tracks.dof[rows], 0)
+    fixed, still, count = squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
+    limit = _limits(3 * dof.shape[1])[np.maximum(dof.sum(axis=1) - 3, 1)]
+    fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
+    return MembershipTest(still - fixed, fits, count)
+
+
+@cache
+def _limits(most: int) -> Array:
+    """99 % limits of χ² for 0 to `most` degrees of freedom."""
+    return chi_square_limits(np.arange(most + 1), 0.99)
+
+
+def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Body:
+    """A new body with its poses over the window and its extent fitted to what tracks measured.
+
+    A constant velocity is only the first guess for a body that starts to move: poses and points are improved in turn.
+    """
+    body = _with_poses_fitted(replace(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
+    points, A, _ = in_body_axes(body, tracks, rows)
+    return with_extent(replace(body, T=body.history[slot]), weighted_means(points, A))
+
+
+def _with_poses_fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
+    """A body with its poses over the window fitted to what tracks measured."""
+    for _ in range(_ROUNDS):
+        points, A, _ = in_body_axes(body, tracks, rows)
+        y = weighted_means(points, A)
+        J = -points_by_pose(y)
+        JA = np.swapaxes(J, 1, 2)[:, None] @ A
+        normal = (JA @ J[:, None]).sum(axis=0) + np.diag([_TURN**-2] * 3 + [_SHIFT**-2] * 3)
+        right = times_vectors(JA, points - y[:, None]).sum(axis=0)
+        body = replace(body, history=body.history @ exp(np.linalg.solve(normal, right[..., None])[..., 0]))
+    return body
+
+
+def add_members(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False) -> None:
+    """Make tracks members of a body, in place; their points in it are what they measured over the window."""
+    if not len(rows):
+        return
+    points, A, _ = in_body_axes(body, tracks, rows)
+    tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.doubtful[rows] = body.id, 0, 0, False
+    tracks.local[rows], tracks.local_information[rows] = weighted_means(points, A), A.sum(axis=1)
+    tracks.sure[rows] = sure
+
+
+def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
+    """Make members free tracks without measurements, in place."""
+    if not len(rows):
+        return
+    tracks.position[rows] = transform(body.T, tracks.local[rows])
+    tracks.forget_past(rows)
+    tracks.unfound[rows] = 1
+
+
+def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
+    """Make seen members free tracks that keep their measurements, in place."""
+    tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
+    fit_positions(tracks, rows)
+
+
+def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, Array]:
+    """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
+
+    Inside a body that stereo resolves no proof of motion is needed. For bodies farther away depth noise is larger than
+    the body, so that all around it seems to lie inside.
+
+    Returns:
+        by body, by how much χ² it explains its seen members better than the still world (K,).
+    """
+    gains, config = {}, frame.setup.config
+    bodies = {id: body for id, body in every.items() if body.measured}
+    for body in bodies.values():
+        _improve(body, tracks, frame.slot)
+        gains[body.id] = _expel(body, tracks, config)
+    if not bodies:
+        return gains
+    free = np.flatnonzero((tracks.body < 0) & tracks.found & ~tracks.still)
+    free = free[tracks.count(free) >= 2]
+    best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
+    for body in bodies.values():
+        near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
+        if not len(near):
+            continue
+        gain = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
+        better = gain > best[near]
+        best[near[better]], whose[near[better]] = gain[better], body.id
+    for body in bodies.values():
+        mine = free[whose == body.id]
+        streak = tracks.streak[mine]
+        add_members(body, tracks, mine)
+        tracks.streak[mine] = streak  # they may be of a part that is about to be found
+    return gains
+
+
+def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[np.intp]) -> Array:
+    """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it."""
+    inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
+    proof = tracks.expelled[rows] | (not resolved)
+    v = membership_test(body, tracks, rows)
+    may = (
+        v.fits
+        & (v.count >= np.where(proof, _ENOUGH, 2))
+        & (v.gain > np.where(inside & ~proof, _BETTER_INSIDE, _BETTER))
+    )
+    return np.where(may, v.gain, -np.inf)
+
+
+def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
+    """Remove members that do not fit the body, in place; returns the gain of the seen ones that stay (K,).
+
+    That is the `MembershipTest.gain` less what the body's poses, fitted to its members, gain by chance.
+    """
+    mine = np.flatnonzero(tracks.body == body.id)
+    v, seen = membership_test(body, tracks, mine), tracks.found[mine]
+    most_fit = v.fits[seen].sum() > _MOST * seen.sum()
+    unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
+    stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
+    wrong = stays | (tracks.misfit[mine] >= MAX_REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
+    tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
+    if wrong.any():
+        remove_members(tracks, mine[wrong & ~seen], body)
+        tracks.expelled[mine[wrong]] = True
+        _release(tracks, mine[wrong & seen])
+        mine = mine[~wrong]
+    if len(mine) > config.max_points:
+        worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
+        order = np.lexsort((worth, -tracks.unfound[mine]))
+        remove_members(tracks, mine[order[: len(mine) - config.max_points]], body)
+    stay = seen & ~wrong
+    return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
+
+
+def take_to(tracks: Tracks, rows: NDArray[np.intp], change: Array) -> None:
+    """Take the points of members to another frame of their body, by `change` (4, 4), in place."""
+    R = change[:3, :3]
+    tracks.local[rows] = transform(change, tracks.local[rows])
+    tracks.local_information[rows] = R @ tracks.local_information[rows] @ R.T
+
+
+def tracks_on_bodies(
+    bodies: Mapping[int, Body], tracks: Tracks, margin: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of seen tracks that lie on a body, members or not, and of those near one that may lie on it.
+
+    A track inside a body's extent lies on it, unless it is known to stand still. Tracks on a body that is not proven
+    yet belong to the second group.
+    """
+    seen, known = tracks.found, tracks.body >= 0
+    on = np.zeros(len(tracks), bool)
+    for body in bodies.values():
+        if body.proven:
+            on |= seen & (tracks.body == body.id)
+    near, free = seen & known & ~on, np.flatnonzero(seen & ~known & ~tracks.still)
+    for body in bodies.values():
+        if not body.measured:
+            continue
+        close = free[_distances(body, tracks, free, margin) < _NEAR]
+        near[close] = True
+        inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
+        if len(inside) and body.proven:
+            asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
+            on[inside[membership_test(body, tracks, inside).gain > asked]] = True
+    return np.flatnonzero(on), np.flatnonzero(near & ~on)
+
+
+def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
+    """Rows of the seen tracks that belong to a body, or lie on or near it and belong to none."""
+    free = np.flatnonzero(tracks.found & (tracks.body < 0))
+    near = free[_distances(body, tracks, free, margin) < _NEAR]
+    return np.concatenate([np.flatnonzero(tracks.found & (tracks.body == body.id)), near])
+
+
+def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
+    """The body in whose extent most of these tracks lie, if their past fits its motion, too; else None.
+
+    Args:
+        bodies: all bodies.
+        tracks: all tracks.
+        rows: which of them.
+        own: a body made of them alone.
+    """
+    for body in bodies.values():
+        near = _distances(replace(body, reach=np.inf), tracks, rows, _MERGED) < _NEAR
+        if not body.measured or 2 * near.sum() <= len(rows):
+            continue
+        alone = float(squares(*in_body_axes(own, tracks, rows)[:2]).sum())
+        points, A, known = in_body_axes(body, tracks, rows)
+        fixed = float(squares(points, A).sum())
+        still = float(_still(tracks, rows, known).sum())
+        by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
+        certain = _squares_with_pose_error(points, A, body)
+        apart = body.seen > PROBATION and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
+        if fixed < 2 * EXPLAINED * still and not apart:
+            return body
+    return None
+
+
+def _squares_with_pose_error(points: Array, A: Array, body: Body) -> float:
+    """χ² of fixed points, in body coordinates by slot (N, W, 3) with information (N, W, 3, 3), if the pose may be off.
+
+    In every frame the points share the displacement by the error of the body's pose, of known covariance.
+    """
+    y = weighted_means(points, A)
+    shared = np.linalg.inv(_spread_of_place(body, y.mean(axis=0)))
+    pull = times_vectors(A, points - y[:, None]).sum(axis=0)
+    explained = (pull * np.linalg.solve(A.sum(axis=0) + shared, pull[..., None])[..., 0]).sum()
+    return float(squares(points, A).sum() - explained)
+
+
+def _spread_of_place(body: Body, y: Array) -> Array:
+    """Covariance (3, 3), in body axes, of where the body's point y (3,) is, given that of its pose."""
+    J = -points_by_pose(y[None])[0]
+    return np.asarray(J @ body.covariance @ J.T + _WEAK * np.eye(3))
+
+
+def with_reach(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
+    """The body with a reach that includes tracks that have moved with it."""
+    away = np.linalg.norm(tracks.position[rows] - body.T[:3, 3], axis=1)
+    return replace(body, reach=max(body.reach, float(away.max(initial=0.0))))
+
+
+def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
+    """The body out of view that a new one is, by position and velocity, perhaps seen from another side; else None.
+
+    The middle of the part that is seen may be off the body's middle by half its size.
+    """
+    best, least = None, _RETURNED
+    for body in bodies.values():
+        if body.measured or not body.proven:
+            continue
+        y, R = 0.5 * (body.lower + body.upper), body.T[:3, :3]
+        place = R @ _spread_of_place(body, y) @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
+        gap = new.middle - body.middle
+        change = new.velocity[3:] - body.velocity[3:]
+        velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
+        off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))
+        if off < least:
+            best, least = body, off
+    return best
+
+
+def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
+    """Whether the members `rows` of another body have moved with this one all the time.
+
+    The test is much stricter than that of `body_around`: nearly all that the still world leaves unexplained must be
+    explained.
+    """
+    if not len(rows):
+        return False
+    points, A, known = in_body_axes(whole, tracks, rows)
+    still = float(_still(tracks, rows, known).sum())
+    return float(squares(points, A).sum()) < _PART_EXPLAINED * still
+
+
+def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
+    """How far tracks of two bodies are from having moved like one rigid body; from 1 on they have not.
+
+    It is the increase of χ² if all tracks share the poses of one body, in the frames in which both bodies are known,
+    relative to the larger of two limits: the increase by chance (99 %), and that by motions that differ by the share
+    `_UNLIKE`. The second is needed for fast bodies, because errors of stereo are correlated over successive frames.
+    """
+    both = one.known & other.known
+    one, other = replace(one, known=both), replace(other, known=both)
+
+    def left(body: Body, rows: NDArray[np.intp]) -> float:
+        return float(squares(*in_body_axes(_with_poses_fitted(body, tracks, rows), tracks, rows)[:2]).sum())
+
+    every = np.concatenate([ones, others])
+    more = left(one, every) - left(one, ones) - left(other, others)
+    _, _, known = in_body_axes(one, tracks, every)
+    still = float(_still(tracks, every, known).sum())
+    return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
+
+
+def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float) -> Array:
+    """Squared distances (N,) of free tracks from a body's extent, in units of their own noise.
+
+    The extent is widened by `margin`, a share of what it measures across.
+    """
+    wider = margin * body.across
+    local = transform(inverse(body.T), tracks.position[rows])
+    away = (local - np.clip(local, body.lower - wider, body.upper + wider)) @ body.T[:3, :3].T
+    near = (local**2).sum(axis=1) < body.reach**2
+    out = np.full(len(rows), np.inf)
+    P = tracks.covariance[rows[near]]
+    out[near] = (away[near] * times_vectors(inverses(P, _RIDGE, _LEAST), away[near])).sum(axis=1)
+    return out
+
+
+def _improve(body: Body, tracks: Tracks, slot: int) -> None:
+    """Take this frame's measurements into the members' points."""
+    t, R = tracks, body.T[:3, :3]
+    mine = np.flatnonzero((t.body == body.id) & (t.misfit == 0) & (t.dof[:, slot] > 0))
+    gap = (t.p[mine, slot] + t.anchor[mine] - body.T[:3, 3]) @ R - t.local[mine]
+    turned = R.T @ t.A[mine, slot] @ R
+    total = t.local_information[mine] + turned
+    t.local_information[mine] = total
+    t.local[mine] += times_vectors(inverses(total, _RIDGE, 0.0), times_vectors(turned, gap))
+
+
+def _still(tracks: Tracks, rows: NDArray[np.intp], known: BoolArray) -> Array:
+    """χ² (N,) of "one fixed point in the world" in the slots of tracks that are `known` (N, W)."""
+    return squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))

@@ -1,0 +1,356 @@
+"""Compiled loops over tracks: 3x3 matrices are worked through in place of many small batches of arrays.
+
+Windows are those of `slam.tracks.table.Tracks`: information ``A`` (N, W, 3, 3) and points ``p`` (N, W, 3) by slot;
+`rows` (M,) names the tracks. A fixed point fitted to a window is ``(Σ A)⁻¹ Σ A p``; a small share of the trace on the
+diagonal makes information invertible that knows nothing along the ray.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.kernels.linear import column_times, invert_symmetric, multiply, row_times, square, trace, turn, turn_back
+from slam.kernels.se3 import transform, transform_back
+from slam.kernels.stereo import by_point, residual
+from slam.runtime.compilation import helper, kernel
+
+_RIDGE = 1e-9  # numerics: share of the trace, for information over a whole window, and
+_PART = 1e-6  # numerics: for a part of it
+_LEAST = 1e-12  # numerics: and this for windows that are empty
+
+
+@helper
+def _add(total, M, factor):
+    for i in range(3):
+        for j in range(3):
+            total[i, j] += factor * M[i, j]
+
+
+@helper
+def _add_times(total, M, v, factor):
+    for i in range(3):
+        total[i] += factor * row_times(M, i, v)
+
+
+@kernel
+def inverses(M, share, least):
+    """Inverses of symmetric matrices (N, 3, 3) with a `share` of the trace and `least` added to the diagonal."""
+    out = np.empty_like(M)
+    for n in range(len(M)):
+        invert_symmetric(M[n], share * trace(M[n]) + least, out[n])
+    return out
+
+
+@kernel
+def predicted_pixels(camera, T_world_left, points, P, sigma):
+    """Pixels (uL, vL, uR) (N, 3) at which a camera sees points (N, 3) that have covariances P (N, 3, 3), in the world.
+
+    And the covariances (N, 3, 3) of the innovations of pixels with noise `sigma`. Behind the camera, pixels are NaN.
+    """
+    z, S = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+    local, J, G = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for n in range(len(points)):
+        transform_back(T_world_left, points[n], local)
+        residual(camera, local, np.zeros(3), z[n], J)
+        for k in range(3):
+            z[n, k] = -z[n, k]
+            by_point(J[k], T_world_left, G[k])
+        turn(G, P[n], S[n])
+        for k in range(3):
+            S[n, k, k] += sigma * sigma
+    return z, S
+
+
+# ---------------------------------------------------------------------------------------------- windows of tracks
+
+
+@kernel
+def leave_window(ids, A, p, dof, older_A, older_b, older_age, slot, memory):
+    """Move what `slot` holds from the windows of all tracks to their fading sums, in place."""
+    for n in range(len(ids)):
+        if ids[n] < 0:
+            continue
+        leaving = A[n, slot]
+        older_age[n] = memory * (older_age[n] + trace(older_A[n])) + A.shape[1] * trace(leaving)
+        for i in range(3):
+            older_b[n, i] = memory * older_b[n, i] + row_times(leaving, i, p[n, slot])
+            for j in range(3):
+                older_A[n, i, j] = memory * older_A[n, i, j] + leaving[i, j]
+        leaving[:], p[n, slot], dof[n, slot] = 0.0, 0.0, 0
+
+
+@kernel
+def fit_fixed_points(A, p, anchor, rows, position, covariance):
+    """Fixed points that fit the windows best, and their covariances, into `position` (N, 3), `covariance` (N, 3, 3)."""
+    total, told = np.empty((3, 3)), np.empty(3)
+    for m in range(len(rows)):
+        n = rows[m]
+        total[:], told[:] = 0.0, 0.0
+        for w in range(A.shape[1]):
+            _add(total, A[n, w], 1.0)
+            _add_times(told, A[n, w], p[n, w], 1.0)
+        invert_symmetric(total, _RIDGE * trace(total) + _LEAST, covariance[n])
+        for i in range(3):
+            position[n, i] = anchor[n, i] + row_times(covariance[n], i, told)
+
+
+@kernel
+def constant_velocities(A, p, rows, times, prior):
+    """Points with an even velocity that fit the windows best.
+
+    Args:
+        A: information by slot.
+        p: points by slot.
+        rows: of the tracks.
+        times: of the slots (W,) [s]; the point is where it is at 0.
+        prior: information on each axis of the velocity before anything is known [s²/m²].
+
+    Returns:
+        points (M, 3) and their covariances (M, 3, 3), velocities (M, 3) [m/s] and theirs (M, 3, 3), and χ²(3) of the
+        velocities (M,).
+    """
+    n = len(rows)
+    points, P, velocity, PV = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
+    test = np.zeros(n)
+    M0, M1, M2 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    P0, G, S = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    b0, b1, told = np.empty(3), np.empty(3), np.empty(3)
+    for m in range(n):
+        M0[:], M1[:], M2[:], b0[:], b1[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        for w in range(A.shape[1]):
+            t, Aw, pw = times[w], A[rows[m], w], p[rows[m], w]
+            _add(M0, Aw, 1.0)
+            _add(M1, Aw, t)
+            _add(M2, Aw, t * t)
+            _add_times(b0, Aw, pw, 1.0)
+            _add_times(b1, Aw, pw, t)
+        invert_symmetric(M0, _RIDGE * trace(M0) + _LEAST, P0)
+        multiply(P0, M1, G)
+        for i in range(3):
+            told[i] = b1[i] - column_times(G, i, b0)
+            for j in range(3):
+                S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
+            S[i, i] += prior
+        invert_symmetric(S, _RIDGE * trace(S) + _LEAST, PV[m])
+        for i in range(3):
+            velocity[m, i] = row_times(PV[m], i, told)
+            test[m] += velocity[m, i] * told[i]
+        turn(G, PV[m], P[m])
+        _add(P[m], P0, 1.0)
+        for i in range(3):
+            points[m, i] = row_times(P0, i, b0) - row_times(G, i, velocity[m])
+    return points, P, velocity, PV, test
+
+
+@kernel
+def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, rays, centres, slide):
+    """How far tracks went from the older to the recent frames of their windows: see `slam.bodies.scene`.
+
+    Args:
+        A: information by slot, and so on: see `slam.tracks.table.Tracks`.
+        p: points by slot.
+        dof: numbers measured by slot.
+        older_A: information of what has left the window.
+        older_b: the same times the points.
+        older_age: its ages, weighted.
+        rows: of the tracks.
+        ages: of the slots (W,) in frames.
+        most_recent: so many frames are recent, at most.
+        rays: from the camera to the tracks (M, 3).
+        centres: of the camera by slot (W, 3), in the same axes.
+        slide: variance of a feature's direction that comes with each angle by which it is seen otherwise [rad].
+
+    Returns:
+        displacements (M, 3), their information (M, 3, 3), and the lag (M,) in frames.
+    """
+    d, W, lag = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3)), np.empty(len(rows))
+    now, before, P_now, P_before = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    b_now, b_before = np.empty(3), np.empty(3)
+    for m in range(len(rows)):
+        n = rows[m]
+        count = 0
+        for w in range(A.shape[1]):
+            count += dof[n, w] > 0
+        recent = min(max(count // 2, 2), most_recent)
+        now[:], b_now[:], before[:] = 0.0, 0.0, 0.0
+        _add(before, older_A[n], 1.0)
+        for i in range(3):
+            b_before[i] = older_b[n, i]
+        late, early = 0.0, older_age[n]
+        late_slot, early_slot = -1, -1
+        for w in range(A.shape[1]):
+            if dof[n, w] == 0:
+                continue
+            if ages[w] < recent:
+                _add(now, A[n, w], 1.0)
+                _add_times(b_now, A[n, w], p[n, w], 1.0)
+                late += ages[w] * trace(A[n, w])
+                if late_slot < 0 or ages[w] < ages[late_slot]:
+                    late_slot = w
+            else:
+                _add(before, A[n, w], 1.0)
+                _add_times(b_before, A[n, w], p[n, w], 1.0)
+                early += ages[w] * trace(A[n, w])
+                if early_slot < 0 or ages[w] > ages[early_slot]:
+                    early_slot = w
+        lag[m] = max(early / max(trace(before), _LEAST) - late / max(trace(now), _LEAST), 1.0)
+        invert_symmetric(now, _PART * trace(now) + 1e3 * _LEAST, P_now)
+        invert_symmetric(before, _PART * trace(before) + 1e3 * _LEAST, P_before)
+        for i in range(3):
+            d[m, i] = row_times(P_now, i, b_now) - row_times(P_before, i, b_before)
+        _add(P_now, P_before, 1.0)
+        if late_slot >= 0 and early_slot >= 0:
+            _add_slide(P_now, rays[m], centres[late_slot], centres[early_slot], slide)
+        invert_symmetric(P_now, 0.0, W[m])
+    return d, W, lag
+
+
+@helper
+def _add_slide(P, ray, late, early, slide):
+    """Add to P (3, 3) the slide of a feature that was seen along `ray` (3,) from two places of the camera."""
+    far, along, way = 0.0, 0.0, 0.0
+    for i in range(3):
+        far += ray[i] * ray[i]
+        along += ray[i] * (late[i] - early[i])
+        way += (late[i] - early[i]) ** 2
+    across = np.sqrt(max(way - along * along / far, 0.0))
+    variance = slide * np.sqrt(far) * across  # of the angle across / depth, at the depth
+    for i in range(3):
+        P[i, i] += variance
+        for j in range(3):
+            P[i, j] -= variance * ray[i] * ray[j] / far
+
+
+# ---------------------------------------------------------------------------------------------- windows and bodies
+
+
+@helper
+def _into_body(A, p, dof, anchor, history, known, points, turned, there):
+    """One track's window in a body's coordinates, into `points` (W, 3), `turned` (W, 3, 3), and `there` (W,)."""
+    for w in range(len(dof)):
+        T = history[w]
+        away = p[w, 0] + anchor[0] - T[0, 3], p[w, 1] + anchor[1] - T[1, 3], p[w, 2] + anchor[2] - T[2, 3]
+        for i in range(3):
+            points[w, i] = column_times(T, i, away)
+        there[w] = known[w] and dof[w] > 0
+        if there[w]:
+            turn_back(T, A[w], turned[w])
+        else:
+            turned[w] = 0.0
+
+
+@helper
+def _mean(points, A, mean):
+    """Mean of a window's points (W, 3), weighted by their information (W, 3, 3)."""
+    total, P, told = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
+    for w in range(len(points)):
+        _add(total, A[w], 1.0)
+        _add_times(told, A[w], points[w], 1.0)
+    invert_symmetric(total, _PART * trace(total) + _LEAST, P)
+    for i in range(3):
+        mean[i] = row_times(P, i, told)
+
+
+@helper
+def _square(points, A, mean):
+    """χ² of "one fixed point" for a window's points (W, 3) with information (W, 3, 3); `mean` is overwritten."""
+    _mean(points, A, mean)
+    total = 0.0
+    for w in range(len(points)):
+        total += square(A[w], (points[w, 0] - mean[0], points[w, 1] - mean[1], points[w, 2] - mean[2]))
+    return total
+
+
+@kernel
+def windows_in_body(A, p, dof, anchor, rows, history, known):
+    """What tracks measured, in the coordinates of a body.
+
+    Args:
+        A: information by slot.
+        p: points by slot, relative to the anchors.
+        dof: numbers measured by slot.
+        anchor: of the tracks, in world coordinates.
+        rows: of the tracks.
+        history: poses of the body by slot (W, 4, 4).
+        known: at which slots there is one (W,).
+
+    Returns:
+        points (M, W, 3), their information (M, W, 3, 3), and whether there is any (M, W).
+    """
+    size = A.shape[1]
+    points, turned = np.empty((len(rows), size, 3)), np.empty((len(rows), size, 3, 3))
+    there = np.empty((len(rows), size), np.bool_)
+    for m in range(len(rows)):
+        n = rows[m]
+        _into_body(A[n], p[n], dof[n], anchor[n], history, known, points[m], turned[m], there[m])
+    return points, turned, there
+
+
+@kernel
+def weighted_means(points, A):
+    """Means (M, 3) of points by slot (M, W, 3), weighted by their information (M, W, 3, 3)."""
+    means = np.empty((len(points), 3))
+    for m in range(len(points)):
+        _mean(points[m], A[m], means[m])
+    return means
+
+
+@kernel
+def squares(points, A):
+    """χ² (M,) of "one fixed point" for points by slot (M, W, 3) with information (M, W, 3, 3)."""
+    out, mean = np.empty(len(points)), np.empty(3)
+    for m in range(len(points)):
+        out[m] = _square(points[m], A[m], mean)
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- pixels
+
+
+@kernel
+def points_on_rays(camera, T_world_left, points, measured, sigma, far, steps):
+    """Points (N, 3) on the measured rays, their information (N, 3, 3), and numbers measured (N,).
+
+    See `slam.bodies.fits.measure`; `camera` (7,) is `slam.geometry.rig.StereoRig.rectified_parameters`, `far`
+    [px] how far off an expected point may be, and `steps` how often it is linearised at most.
+    """
+    fu, fv, u0, v0, right_fu, _, shift = camera
+    out, A, dof = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3)), np.zeros(len(points), np.int8)
+    place, r, J, g = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
+    for n in range(len(points)):
+        x, y = (measured[n, 0] - u0) / fu, (measured[n, 1] - v0) / fv
+        transform_back(T_world_left, points[n], place)
+        met, stereo, front = place[2], not np.isnan(measured[n, 2]), False
+        for _ in range(steps):
+            depth = met
+            place[0], place[1], place[2] = x * depth, y * depth, depth
+            front = residual(camera, place, measured[n], r, J) and r[0] + r[1] == r[0] + r[1]
+            if not (front and stereo):
+                break
+            met = depth - r[2] * depth * depth / (right_fu * shift)  # on the ray uR changes by f' b / z
+            if abs(r[2]) <= far:
+                break
+        if not front:
+            transform(T_world_left, np.zeros(3), out[n])
+            continue
+        place[0], place[1], place[2] = x * met, y * met, met
+        transform(T_world_left, place, out[n])
+        dof[n] = 3 if stereo else 2
+        for k in range(dof[n]):
+            by_point(J[k], T_world_left, g)
+            for i in range(3):
+                for j in range(3):
+                    A[n, i, j] += g[i] * g[j] / (sigma * sigma)
+    return out, A, dof
+
+
+@kernel
+def within_reach(start, found, start_variance, found_variance, way, sigmas):
+    """Which places (M, 3) are no farther than `way` [m] from the starts (N, 3), given the variances [m²]: (N, M)."""
+    out = np.empty((len(start), len(found)), np.bool_)
+    for n in range(len(start)):
+        x, y, z = start[n]
+        for m in range(len(found)):
+            square = (found[m, 0] - x) ** 2 + (found[m, 1] - y) ** 2 + (found[m, 2] - z) ** 2
+            out[n, m] = square < (way + sigmas * np.sqrt(start_variance[n] + found_variance[m])) ** 2
+    return out

@@ -1,0 +1,228 @@
+"""Simulated rigid bodies before a moving camera, for the tests of their estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+import backends
+from slam.bodies.belief import BodyBelief
+from slam.bodies.camera import recent_poses, with_estimate
+from slam.bodies.estimator import FRAMES, BodyEstimator
+from slam.data import Observations
+from slam.evaluation.metrics import nees
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.models import EstimatorModels, MotionModel, models_for
+from slam.object_data import ObjectEstimate, ObjectObservations
+
+SIGMA = 0.7
+HANDHELD = StereoRig.rectified_pair(260.0, 159.5, 119.5, 0.12, 320, 240)
+KITTI = StereoRig.rectified_pair(718.856, 607.19, 185.22, 0.54, 1241, 376)
+
+
+@dataclass(frozen=True)
+class BodyScene:
+    """Truth of a drive past one body.
+
+    Attributes:
+        rig: the cameras.
+        models: assumed by the estimators.
+        dt: time between frames [s].
+        camera: poses T_world_left (F, 4, 4), the first the identity.
+        body: motion of the body (F, 4, 4) since frame 0, in world coordinates, the first the identity.
+        velocity: angular velocity and velocity of the origin (F, 6) in world axes in the interval before each frame.
+        points: of the body at frame 0, in world coordinates (P, 3).
+        landmarks: of the still world (N, 3).
+        stamps: times (F,) [s].
+    """
+
+    rig: StereoRig
+    models: EstimatorModels
+    dt: float
+    camera: Array
+    body: Array
+    points: Array
+    landmarks: Array
+    stamps: Array = field(default_factory=lambda: np.zeros(0))
+
+    def background(self, k: int, rng: np.random.Generator, limit: int = 60) -> Observations:
+        """Landmarks in frame k."""
+        uv, seen = self._seen(k, self.landmarks, rng)
+        rows = np.flatnonzero(seen)[:limit]
+        return Observations(rows.astype(np.int64), uv[rows, :2], uv[rows, 2:])
+
+    def observations(self, k: int, rng: np.random.Generator, outliers: float = 0.0) -> ObjectObservations:
+        """The body in frame k; a share of its points is measured elsewhere on it, or with a wrong right pixel."""
+        uv, seen = self._seen(k, se3.transform(self.body[k], self.points), rng)
+        bad = rng.random(len(uv)) < outliers
+        offsets = rng.uniform(5, 30, (len(uv), 3)) * rng.choice([-1, 1], (len(uv), 3))
+        uv[bad] += offsets[bad][:, [0, 1, 2, 1]]
+        rows = np.flatnonzero(seen)
+        return ObjectObservations(7, rows + 1000, uv[rows, :2], uv[rows, 2:])
+
+    def _seen(self, k: int, points: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Noisy (uL, vL, uR, vR) of points in frame k; on the right the row has the noise of the left one."""
+        local = se3.transform(se3.inverse(self.camera[k]), points)
+        left, right = self.rig.project(local)
+        noise = SIGMA * rng.standard_normal((len(local), 3))
+        seen = (local[:, 2] > 0.3) & self.rig.left.in_image(left) & self.rig.right.in_image(right)
+        return np.concatenate([left, right], axis=1) + noise[:, [0, 1, 2, 1]], seen
+
+
+def random_motion(
+    frames: int, dt: float, start: Array, densities: tuple[float, float], rng: np.random.Generator, origin: Array
+) -> Array:
+    """Motion (F, 4, 4) in world coordinates of a body about its `origin`, whose velocities [ω, v] walk randomly."""
+    T, velocity = se3.pose(np.eye(3), origin), np.array(start, float)
+    back, out = se3.inverse(T), [np.eye(4)]
+    sigma = np.sqrt(dt) * np.repeat([densities[1], densities[0]], 3)
+    for _ in range(frames - 1):
+        velocity = velocity + sigma * rng.standard_normal(6)
+        T = se3.pose(se3.so3_exp(dt * velocity[:3]) @ T[:3, :3], T[:3, 3] + dt * velocity[3:])
+        out.append(T @ back)
+    return np.array(out)
+
+
+def box_points(count: int, size: Array, centre: Array, rng: np.random.Generator) -> Array:
+    """Points (P, 3) on the faces of a box."""
+    unit = rng.uniform(-0.5, 0.5, (count, 3))
+    face = rng.integers(3, size=count)
+    unit[np.arange(count), face] = np.where(rng.random(count) < 0.5, -0.5, 0.5)
+    return centre + unit * size
+
+
+def camera_path(frames: int, dt: float, velocity: Array, motion: MotionModel, rng: np.random.Generator) -> Array:
+    """Poses (F, 4, 4) from the identity; velocities walk randomly but little, as `motion` says."""
+    T, v, w = np.eye(4), np.array(velocity, float), np.zeros(3)
+    sigma_v, sigma_w = np.sqrt(motion.velocity_variance(dt))
+    out = [T]
+    for _ in range(frames - 1):
+        v, w = v + sigma_v * rng.standard_normal(3), 0.9 * w + sigma_w * rng.standard_normal(3)
+        T = se3.pose(T[:3, :3] @ se3.so3_exp(w * dt), T[:3, 3] + v * dt)
+        out.append(T)
+    return np.array(out)
+
+
+def cloud(rig: StereoRig, poses: Array, count: int, near: float, far: float, rng: np.random.Generator) -> Array:
+    """Still points (N, 3), each in view of a pose drawn from `poses`, between two depths [m]."""
+    depth = rng.uniform(near, far, count)
+    uv = rng.uniform((0, 0), (rig.width - 1, rig.height - 1), (count, 2))
+    rays = np.concatenate([rig.left.normalise(uv), np.ones((count, 1))], axis=1) * depth[:, None]
+    chosen = poses[rng.integers(len(poses), size=count)]
+    return np.einsum("nij,nj->ni", chosen[:, :3, :3], rays) + chosen[:, :3, 3]
+
+
+def box_scene(
+    seed: int = 0, frames: int = 30, moving: bool = True, distance: float = 1.0, points: int = 25,
+    body: Array | None = None, still: bool = False,
+) -> BodyScene:  # fmt: skip
+    """A box of 0.3 m before a hand-held camera at 30 Hz."""
+    rng = np.random.default_rng([seed, 5])
+    models, dt, centre = replace(models_for("handheld"), pixel_sigma=SIGMA), 1 / 30, np.array([0.0, 0.0, distance])
+    motion = MotionModel(0.1, 0.1)
+    camera = (
+        camera_path(frames, dt, np.array([0.1, 0.02, 0.0]), motion, rng)
+        if moving
+        else np.tile(np.eye(4), (frames, 1, 1))
+    )
+    o = models.objects
+    start = np.concatenate([0.3 * rng.standard_normal(3), 0.1 * rng.standard_normal(3)])
+    if body is None:
+        body = random_motion(frames, dt, start, (0.3 * o.acceleration, 0.3 * o.angular_acceleration), rng, centre)
+    if still:
+        body = np.tile(np.eye(4), (frames, 1, 1))
+    shape = box_points(points, np.full(3, 0.3), centre, rng)
+    return BodyScene(
+        HANDHELD, models, dt, camera, body, shape, cloud(HANDHELD, camera, 120, 1.0, 4.0, rng), dt * np.arange(frames)
+    )
+
+
+def car_scene(seed: int = 0, frames: int = 30, distance: float = 15.0, points: int = 30) -> BodyScene:
+    """A car ahead of a driving one at 10 Hz, both at 8 m/s or so."""
+    rng = np.random.default_rng([seed, 6])
+    models, dt, centre = replace(models_for("driving"), pixel_sigma=SIGMA), 0.1, np.array([1.0, 0.5, distance])
+    camera = camera_path(frames, dt, np.array([0, 0, 8.0]), MotionModel(0.5, 0.05), rng)
+    o = models.objects
+    start = np.array([0, 0, 0, 0, 0, 8.0])
+    body = random_motion(frames, dt, start, (o.acceleration, o.angular_acceleration), rng, centre)
+    shape = box_points(points, np.array([1.7, 1.4, 4.0]), centre, rng)
+    return BodyScene(
+        KITTI, models, dt, camera, body, shape, cloud(KITTI, camera, 250, 5.0, 50.0, rng), dt * np.arange(frames)
+    )
+
+
+Rule = Callable[[int, ObjectObservations], "ObjectObservations | None"]
+
+
+def follow(
+    name: str, scene: BodyScene, seed: int = 0, rule: Rule | None = None, outliers: float = 0.0
+) -> Iterator[tuple[int, BodyBelief, Array]]:
+    """Run a scene through a back end, and the body's estimator beside it; frame, belief and camera's estimated pose.
+
+    `rule` may change what is observed of the body in a frame, or take it away (None).
+    """
+    backend, estimator = backends.create(name, scene.rig, models=scene.models), BodyEstimator(scene.rig, scene.models)
+    rng, known, belief, path = np.random.default_rng([seed, 7]), set(), None, None
+    for k, stamp in enumerate(scene.stamps):
+        backend.predict(float(stamp))
+        seen = scene.background(k, rng)
+        old = np.array([i in known for i in seen.ids.tolist()], bool)
+        backend.update(seen.select(old))
+        local = scene.rig.triangulate(seen.uv_left, seen.uv_right)
+        deep, e = np.isfinite(local).all(axis=1), backend.estimate(landmarks=False)
+        path = with_estimate(path, e, scene.rig, SIGMA, local[old & deep], FRAMES + 1)
+        given = scene.observations(k, rng, outliers if k else 0.0)
+        given = given if rule is None else rule(k, given)
+        belief = estimator.updated(belief, 7, given, recent_poses(backend, FRAMES + 1, path, e.covariance))
+        if belief is not None:
+            yield k, belief, e.T_world_left
+        backend.add(seen.select(~old & deep))
+        known.update(seen.ids[~old & deep].tolist())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A body's estimates against the truth, a row a frame after the first.
+
+    Attributes:
+        rotation, translation: error of the pose [deg], [m]; its frame was put before the true camera at first sight.
+        pose_nees, velocity_nees: (F,).
+        motion_rotation, motion_translation: error of the motion since the frame before (ME) [deg], [m].
+        estimates: all of them.
+    """
+
+    rotation: Array
+    translation: Array
+    pose_nees: Array
+    velocity_nees: Array
+    motion_rotation: Array
+    motion_translation: Array
+    estimates: list[ObjectEstimate]
+
+
+def score(scene: BodyScene, found: list[tuple[int, BodyBelief, Array]]) -> Outcome:
+    """Judge the estimates of one body, the first of which is that of its first sight."""
+    first, belief, T_world_left = found[0]
+    before = belief.estimate.T_world_object
+    origin = scene.camera[first] @ se3.inverse(T_world_left) @ before  # where the frame truly is
+    true = scene.body @ se3.inverse(scene.body[first]) @ origin
+    errors, off, steps = [], [], []
+    for k, belief, _ in found[1:]:
+        e, dt = belief.estimate, scene.stamps[k] - scene.stamps[k - 1]
+        errors.append(se3.log(se3.inverse(e.T_world_object) @ true[k]))
+        w = se3.so3_log(true[k, :3, :3] @ true[k - 1, :3, :3].T) / dt
+        off.append(np.concatenate([w, (true[k, :3, 3] - true[k - 1, :3, 3]) / dt]) - e.velocity)
+        step = se3.inverse(before) @ e.T_world_object
+        steps.append(se3.log(se3.inverse(step) @ se3.inverse(true[k - 1]) @ true[k]))
+        before = e.T_world_object
+    x, s, estimates = np.array(errors), np.array(steps), [b.estimate for _, b, _ in found]
+    return Outcome(
+        np.degrees(np.linalg.norm(x[:, :3], axis=1)), np.linalg.norm(x[:, 3:], axis=1),
+        nees(x, np.array([e.covariance for e in estimates[1:]])),
+        nees(np.array(off), np.array([e.velocity_covariance for e in estimates[1:]])),
+        np.degrees(np.linalg.norm(s[:, :3], axis=1)), np.linalg.norm(s[:, 3:], axis=1), estimates,
+    )  # fmt: skip

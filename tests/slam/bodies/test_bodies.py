@@ -1,0 +1,46 @@
+"""How the detector predicts a body: by the bodies' own motion model, not by the camera's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from slam.bodies.bodies import hidden, new_body
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.detector import MovingObjectDetector
+from slam.data import Estimate, StereoFeatures
+from slam.models import EstimatorModels, MotionModel, ObjectModels
+from slam.tracks.table import Tracks
+from tests.slam.scene import RIG
+
+HERE = Estimate(0.0, np.eye(4), np.eye(6), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+NO_BACKEND: Any = SimpleNamespace()  # the camera's last poses are then the online ones
+
+
+def test_a_body_is_predicted_by_its_own_motion_model() -> None:
+    models = EstimatorModels(
+        motion=MotionModel(acceleration=50.0, angular_acceleration=70.0),
+        objects=ObjectModels(acceleration=2.0, angular_acceleration=0.5),
+    )
+    detector, dt = MovingObjectDetector(RIG, ObjectsConfig(), models), 0.1
+    tracks = Tracks.empty(64, detector.window)
+    detector.step(NO_BACKEND, tracks, StereoFeatures.empty(0.0), HERE)
+    times = np.zeros(detector.setup.config.window)
+    body = new_body(1, np.array([0, 0, 3.0]), np.array([0, 0.2, 0, 1.0, 0, 0]), times, 0.0, 0.1)
+    detector.bodies[1] = body
+    detector.step(NO_BACKEND, tracks, StereoFeatures.empty(dt), replace(HERE, stamp=dt))
+    grown = np.diag(detector.bodies[1].covariance - body.covariance)
+    np.testing.assert_allclose(grown, dt**3 * np.array([0.5] * 3 + [2.0] * 3) ** 2, rtol=1e-9)
+    np.testing.assert_allclose(detector.bodies[1].T[:3, 3], [dt, 0, 3.0])
+
+
+def test_points_behind_a_body_are_hidden_and_no_others():
+    body = new_body(1, np.array([0.0, 0.0, 2.0]), np.zeros(6), np.zeros(3), 0.0, 0.0)
+    body = replace(body, lower=np.full(3, -0.1), upper=np.full(3, 0.1))
+    behind, inside, before, beside = [0.05, 0, 3.0], [0, 0, 2.05], [0, 0, 1.0], [0.5, 0, 3.0]
+    points = np.array([behind, inside, before, beside])
+    assert hidden([body], np.zeros(3), points).tolist() == [True, False, False, False]
+    assert not hidden([], np.zeros(3), points).any()

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slam
+from slam.bodies.config import ObjectsConfig
+from slam.config import SystemConfig
+from slam.data import StereoFeatures
+from slam.errors import ConfigurationError
+from slam.evaluation.objects import score_for
+from slam.geometry.se3 import inverse, transform
+
+
+def system_for(sequence, mode="detect", **settings):
+    config = SystemConfig.for_kind(sequence.kind, None)
+    config = replace(config, objects=replace(config.objects, mode=mode, **settings))
+    return slam.StereoSlam(sequence.rig, None, "ekf", config=config)
+
+
+@pytest.fixture(scope="module")
+def box_run():
+    """The box of paper B's section 4.4, from its last twenty frames at rest to its second place."""
+    sequence = slam.open_sequence("synthetic:box?density=300")
+    system, score, results = system_for(sequence), score_for(sequence), []
+    for k in range(40, 115):
+        seen = sequence.simulate(k)
+        results.append((system.process_features(seen.features), seen.objects))
+        score.add(k, results[-1][0], seen.objects)
+    return results, score
+
+
+def test_the_box_is_found_once_and_followed(box_run):
+    _, score = box_run
+    body = score.body(1)
+    assert body["ids"], "the box was not found"
+    # It starts to move at frame 60, and is a pixel away at 66.
+    assert body["delay [frames]"] <= 15
+    longest = max(score.lives.values(), key=lambda life: len(life.frames))
+    assert longest.truth == 1 and longest.frames[-1] >= 110  # in single frames too few of its features are found
+
+
+def test_nearly_no_still_feature_is_said_to_move(box_run):
+    """Of four seeds the precision is 0.94 to 0.99: in a single run the false ones of some frames are a few percent."""
+    _, score = box_run
+    assert score.summary()["features"]["precision"] > 0.92
+
+
+def test_moving_features_never_become_landmarks(box_run):
+    results, _ = box_run
+    for result, _ in results:
+        assert not np.isin(result.added_features, result.moving_features).any()
+
+
+def test_landmarks_on_what_may_be_a_body_do_not_measure_the_camera():
+    """From the group's first suspicion until the body is proven, and its landmarks leave the map."""
+    sequence = slam.open_sequence("synthetic:box?density=300")
+    system, frames = system_for(sequence), 0
+    for k in range(50, 90):
+        system.process_features(sequence.simulate(k).features)
+        tracks, bodies = system._state.tracks, system.objects.bodies
+        unproven = np.isin(tracks.body, [id for id, body in bodies.items() if not body.proven])
+        landmarks = tracks.ids[unproven & (tracks.ids >= 0)]
+        assert np.isin(landmarks, system.objects.suspects).all()
+        frames += len(landmarks) > 0
+    assert frames
+
+
+def test_nothing_moves_in_a_still_world():
+    sequence = slam.open_sequence("synthetic:desk?density=150")
+    system = system_for(sequence)
+    flagged = count = 0
+    for k in range(50):
+        result = system.process_features(sequence.observations(k))
+        flagged, count = flagged + len(result.moving_features), count + len(result.features)
+        assert not result.objects
+    assert flagged <= 0.002 * count
+
+
+def test_members_are_predicted_where_they_are_seen():
+    """The estimate's frame of a body is its own; the detector's points are in the detector's."""
+    sequence = slam.open_sequence("synthetic:box?density=300")
+    system = system_for(sequence)
+    off = []
+    for k in range(58, 110):
+        result = system.process_features(sequence.observations(k))
+        tracks, features = system._state.tracks, result.features
+        for body in system.objects.bodies.values():
+            if body.measured:
+                mine = np.flatnonzero((tracks.body == body.id) & tracks.found)
+                local = transform(inverse(result.estimate.T_world_left) @ body.T, tracks.local[mine])
+                z, _ = sequence.rig.project_stereo(local)
+                off += list(np.linalg.norm(z[:, :2] - features.uv_left[tracks.row[mine]], axis=1))
+    assert len(off) > 100
+    assert np.median(off) < 2.0  # noise of 0.7 px in both coordinates: 0.8 px
+
+
+def test_frames_with_nothing_to_see_are_no_error():
+    sequence = slam.open_sequence("synthetic:desk?frames=8")
+    system = system_for(sequence)
+    for k in range(8):
+        features = sequence.observations(k)
+        if k in (0, 3, 4):
+            features = StereoFeatures.empty(features.stamp, features.descriptors.shape[1])
+        assert not len(system.process_features(features).moving_features)
+
+
+def test_off_detects_nothing():
+    sequence = slam.open_sequence("synthetic:box?density=300")
+    system = system_for(sequence, mode="off")
+    assert not any(len(system.process_features(sequence.observations(k)).moving_features) for k in range(58, 90))
+
+
+def test_settings_are_checked():
+    with pytest.raises(ConfigurationError, match="mode"):
+        ObjectsConfig(mode="neural")
+    with pytest.raises(ConfigurationError, match="database"):
+        ObjectsConfig(mode="procedure1")
+    for name, value in (("min_support", 2), ("max_speed", 0.0), ("confirm", 0), ("window", 10**6), ("d_match", 0.0)):
+        with pytest.raises(ConfigurationError, match=name):
+            ObjectsConfig(**{name: value})
+
+
+def test_landmarks_that_were_lost_from_view_are_followed_again_once_they_are_found():
+    """Also those that have joined the map beside the track of another landmark."""
+    sequence = slam.open_sequence("synthetic:desk?density=150")
+    system, again, lost = system_for(sequence), 0, set()
+    for k in (*range(20), *range(30, 40)):
+        result = system.process_features(sequence.simulate(k).features)
+        tracks = system._state.tracks
+        deep = result.features.has_stereo[result.matched_features]
+        at = tracks.rows(np.setdiff1d(result.matched[deep], result.erased))
+        assert (tracks.number[at] >= 0).all()
+        again += len(lost & set(tracks.ids[at].tolist()))
+        lost = set(tracks.ids[(tracks.ids >= 0) & (tracks.number < 0)].tolist())
+    assert again
+
+
+def test_what_leaves_the_window_is_remembered_and_nothing_else():
+    """Longer than the window, without a body: the slot of the present frame holds only what this frame measured."""
+    sequence = slam.open_sequence("synthetic:desk?density=150")
+    system = system_for(sequence)
+    for k in range(system.config.objects.window + 3):
+        system.process_features(sequence.simulate(k).features)
+    tracks = system._state.tracks
+    alive = tracks.number >= 0
+    assert not tracks.dof[alive & ~tracks.found, system.objects._number % 12].any()
+    full = tracks.count(np.arange(len(tracks))) == system.config.objects.window
+    first = alive & (tracks.number < len(sequence.simulate(0).features) // 2)  # begun in the first frame
+    assert (full & first).any() and (np.trace(tracks.older_A[full & first], axis1=1, axis2=2) > 0).all()

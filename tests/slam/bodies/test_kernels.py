@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+
+from slam.bodies import track_kernels
+
+RNG = np.random.default_rng(5)
+TRACKS, SLOTS = 7, 6
+
+
+def windows():
+    """Information and points by slot, as of stereo measurements; the last slot of the first track is empty."""
+    J = 100 * RNG.standard_normal((TRACKS, SLOTS, 3, 3))
+    A = np.swapaxes(J, 2, 3) @ J
+    A[0, -1] = 0.0
+    return A, 0.1 * RNG.standard_normal((TRACKS, SLOTS, 3)), np.where(A[..., 0, 0] > 0, 3, 0).astype(np.int8)
+
+
+def test_fixed_points_solve_the_normal_equations():
+    A, p, _ = windows()
+    anchor, position, covariance = RNG.standard_normal((TRACKS, 3)), np.zeros((TRACKS, 3)), np.zeros((TRACKS, 3, 3))
+    track_kernels.fit_fixed_points(A, p, anchor, np.array([0, 3]), position, covariance)
+    for n in (0, 3):
+        P = np.linalg.inv(A[n].sum(axis=0))
+        np.testing.assert_allclose(covariance[n], P, rtol=1e-6)  # 1e-9 of the trace on the diagonal, condition < 1e3
+        np.testing.assert_allclose(position[n] - anchor[n], P @ np.einsum("wij,wj->i", A[n], p[n]), atol=1e-7)
+    assert not position[1].any()
+
+
+def test_constant_velocities_are_least_squares_in_point_and_velocity():
+    A, p, _ = windows()
+    times = np.linspace(-0.5, 0.0, SLOTS)
+    points, P, velocity, PV, test = track_kernels.constant_velocities(A, p, np.arange(TRACKS), times, 0.25)
+    for n in range(TRACKS):
+        H = np.stack([np.hstack([np.eye(3), t * np.eye(3)]) for t in times])
+        normal = np.einsum("wki,wkl,wlj->ij", H, A[n], H) + np.diag([0.0] * 3 + [0.25] * 3)
+        x = np.linalg.solve(normal, np.einsum("wki,wkl,wl->i", H, A[n], p[n]))
+        covariance = np.linalg.inv(normal)
+        np.testing.assert_allclose(np.concatenate([points[n], velocity[n]]), x, atol=1e-6)
+        np.testing.assert_allclose(P[n], covariance[:3, :3], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(PV[n], covariance[3:, 3:], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(test[n], x[3:] @ np.linalg.solve(covariance[3:, 3:], x[3:]), rtol=1e-5)
+
+
+def test_a_displacement_is_less_certain_by_the_slide_of_a_feature_seen_from_elsewhere():
+    """The camera goes by 0.2 m across a line of sight of 2 m: 0.1 rad, so much variance of the direction, at 2 m."""
+    A, p, dof = np.tile(1e6 * np.eye(3), (1, SLOTS, 1, 1)), np.zeros((1, SLOTS, 3)), np.full((1, SLOTS), 3, np.int8)
+    ages, ray = np.arange(SLOTS)[::-1].copy(), np.array([[0.0, 0.0, 2.0]])
+    none = np.zeros((1, 3, 3)), np.zeros((1, 3)), np.zeros(1)
+    centres, P = 0.04 * np.arange(SLOTS)[:, None] * np.array([1.0, 0, 0]), {}
+    for slide in (0.0, 1e-4):
+        _, W, _ = track_kernels.displaced(A, p, dof, *none, np.array([0]), ages, 3, ray, centres, slide)
+        P[slide] = np.linalg.inv(W[0])
+    np.testing.assert_allclose(P[1e-4] - P[0.0], 1e-4 * 0.1 * 2.0**2 * np.diag([1.0, 1.0, 0.0]), atol=1e-12)

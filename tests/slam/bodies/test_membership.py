@@ -1,0 +1,230 @@
+"""Who belongs to a body: on tables of tracks whose points and motions are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam.bodies import membership
+from slam.bodies.bodies import Body, continued, new_body, with_extent
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.fits import fit_positions
+from slam.bodies.merging import merge
+from slam.data import StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, exp, inverse, transform
+from slam.tracks.table import Tracks
+
+WINDOW = 12
+SLOT = WINDOW - 1
+SIGMA = 0.002  # [m]
+RIG = StereoRig.rectified_pair(260.0, 160, 120, 0.12, 320, 240)
+FRAME: Any = SimpleNamespace(setup=SimpleNamespace(config=ObjectsConfig()), slot=SLOT, resolves=lambda _: True)
+TIMES = (np.arange(WINDOW) - SLOT) / 30.0
+
+
+def table(seen: Array) -> Tracks:
+    """Tracks that measured the points (N, W, 3) in world coordinates, one slot a frame."""
+    n = len(seen)
+    features = StereoFeatures(
+        0.0, np.zeros((n, 2)), np.zeros((n, 2)), np.ones(n), np.zeros(n), np.ones(n), np.ones(n, np.int8),
+        np.zeros((n, 16), np.float32), (320, 240),
+    )  # fmt: skip
+    tracks, rows = Tracks.empty(16, WINDOW), np.arange(n)
+    tracks.row[rows] = rows
+    tracks.begin(rows, rows, features, seen[:, 0])
+    for slot in range(WINDOW):
+        enter(tracks, rows, slot, seen[:, slot])
+    fit_positions(tracks, rows)
+    return tracks
+
+
+def enter(tracks: Tracks, rows: Array, slot: int, points: Array) -> None:
+    """Tracks measured points in a slot."""
+    tracks.p[rows, slot], tracks.A[rows, slot], tracks.dof[rows, slot] = (
+        points - tracks.anchor[rows],
+        np.eye(3) / SIGMA**2,
+        3,
+    )
+
+
+def path(velocity: Array) -> Array:
+    """Poses (W, 4, 4) of a body with an even twist [ω, v] (6,), the last one 1 m before the camera."""
+    poses = exp(TIMES[:, None] * velocity)
+    poses[:, 2, 3] += 1.0
+    return poses
+
+
+def seen_from(poses: Array, local: Array, seed: int) -> Array:
+    """Measured points (N, W, 3) of points (N, 3) that go with poses (W, 4, 4)."""
+    points = np.stack([transform(T, local) for T in poses], axis=1)
+    return points + SIGMA * np.random.default_rng(seed).standard_normal(points.shape)
+
+
+def body_along(poses: Array, members: Array, tracks: Tracks, id: int = 1) -> Body:
+    """A settled body with these poses whose members are these rows."""
+    body = new_body(id, poses[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
+    body = replace(body, T=poses[SLOT], history=poses, seen=50, proven=True)
+    membership.add_members(body, tracks, members, sure=True)
+    return with_extent(body, tracks.local[members])
+
+
+def corners(n: int, seed: int, lid: int = 0) -> Array:
+    """Points (n, 3) of a body; the last `lid` of them lie well off its x axis."""
+    points = np.random.default_rng(seed).uniform(-0.1, 0.1, (n, 3))
+    points[n - lid :, 1] = 0.15
+    return points
+
+
+STILL = np.tile(np.eye(4), (WINDOW, 1, 1))
+AHEAD = np.array([0.0, 0.0, 1.0])
+
+
+MOVING = np.array([0.0, 0.4, 0.0, 0.3, 0.0, 0.0])
+LID = np.array([1.2, 0.4, 0.0, 0.3, 0.0, 0.0])  # turns about the body's x axis besides
+
+
+def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> None:
+    local = corners(16, 1, lid=4)
+    poses = path(MOVING)
+    seen = np.concatenate([seen_from(poses, local[:12], 2), seen_from(path(LID), local[12:], 3)])
+    tracks = table(seen)
+    body = body_along(poses, np.arange(16), tracks)
+    gains = membership.update_members({1: body}, FRAME, tracks)
+    lid = np.arange(12, 16)
+    assert (tracks.body[:12] == 1).all()
+    assert (tracks.body[lid] == -1).all() and tracks.expelled[lid].all()
+    assert len(gains[1]) == 12
+    enter(tracks, lid, SLOT, seen[lid, SLOT])
+    membership.update_members({1: body}, FRAME, tracks)
+    assert (tracks.body[lid] == -1).all()
+
+
+@pytest.mark.parametrize(("velocity", "same"), [(MOVING, True), (LID, False)])
+def test_a_group_is_part_of_a_body_only_where_it_has_no_motion_of_its_own(velocity: Array, same: bool) -> None:
+    local = corners(16, 4, lid=6)
+    poses = path(MOVING)
+    tracks = table(np.concatenate([seen_from(poses, local[:10], 5), seen_from(path(velocity), local[10:], 6)]))
+    whole = body_along(poses, np.arange(10), tracks)
+    group = np.arange(10, 16)
+    own = new_body(2, path(velocity)[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
+    own = membership.fitted(replace(own, history=path(velocity)), tracks, group, SLOT)
+    assert (membership.body_around({1: whole}, tracks, group, own) is whole) == same
+
+
+def test_parts_of_a_body_whose_pose_is_poorly_known_have_no_motion_of_their_own() -> None:
+    """An error of the pose that all frames share is taken for the part's motion only where the pose is certain."""
+    local = corners(16, 9)
+    true = path(MOVING)
+    off = true.copy()
+    off[:, :3, 3] += 0.01 * np.random.default_rng(10).standard_normal((WINDOW, 3))
+    tracks = table(seen_from(true, local, 11))
+    group = np.arange(10, 16)
+    own = new_body(2, true[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
+    own = membership.fitted(replace(own, history=true), tracks, group, SLOT)
+    whole = body_along(off, np.arange(10), tracks)
+    for sigma, same in ((1e-4, False), (0.01, True)):
+        known = replace(whole, covariance=sigma**2 * np.eye(6))
+        assert (membership.body_around({1: known}, tracks, group, own) is known) == same
+
+
+def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() -> None:
+    local, off = corners(12, 12), MOVING + np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    tracks = table(seen_from(path(MOVING), local, 13))
+    few, more = (
+        body_along(path(off), np.arange(3), tracks, id=1),
+        body_along(path(MOVING), np.arange(3, 12), tracks, id=2),
+    )
+    few = replace(few, alike=1, T=few.T @ exp(np.array([0, 0, 0, 0.1, 0, 0])))
+    more = replace(more, seen=5)
+    bodies = {1: few, 2: more}
+    merge(bodies, tracks)
+    assert list(bodies) == [1]
+    assert (tracks.body == np.where(tracks.number >= 0, 1, -1)).all()
+    grown = bodies[1]
+    np.testing.assert_allclose(grown.T[:3, :3], few.T[:3, :3])  # the older one's axes, at its own place
+    np.testing.assert_allclose(grown.history @ inverse(grown.T), more.history @ inverse(more.T), atol=1e-12)
+    assert grown.belief is None  # its estimate begins anew
+    np.testing.assert_allclose(transform(grown.T, tracks.local[:12]), transform(more.T, local), atol=0.01)
+
+
+@pytest.mark.parametrize(("share", "one"), [(0.0, True), (0.01, True), (0.15, False)])
+def test_bodies_side_by_side_are_one_only_where_they_move_alike(share: float, one: bool) -> None:
+    """The older one goes about as the young one does: only what one rigid body would leave tells them apart."""
+    other = (1 + share) * MOVING
+    local = corners(12, 14)
+    tracks = table(np.concatenate([seen_from(path(other), local[:4], 15), seen_from(path(MOVING), local[4:], 16)]))
+    few = body_along(path(other), np.arange(4), tracks, id=1)
+    more = body_along(path(MOVING), np.arange(4, 12), tracks, id=2)
+    theirs, mine = np.arange(4), np.arange(4, 12)
+    assert membership.moves_with(more, tracks, theirs)
+    alike = membership.moves_with(more, tracks, theirs)
+    assert (alike and membership.distinctness(more, mine, few, theirs, tracks) < 1.0) == one
+    bodies = {1: replace(few, T=few.T @ exp(np.array([0, 0, 0, 0.1, 0, 0]))), 2: replace(more, seen=5)}
+    merge(bodies, tracks)
+    assert list(bodies) == ([1] if one else [1, 2])
+    if not one:  # known for good: in a later frame they may happen to move alike
+        assert bodies[2].distinct == {1}
+
+
+def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
+    tracks = table(seen_from(path(MOVING), corners(8, 12), 13))
+    body = body_along(path(MOVING), np.arange(8), tracks)
+    body = replace(
+        body, measured=False, velocity=MOVING, covariance=0.01 * np.eye(6), velocity_covariance=0.01 * np.eye(6)
+    )
+    for shift, velocity, same in ((0.1, 0.3, True), (1.0, 0.3, False), (0.1, 1.5, False)):
+        new = new_body(
+            2, body.middle + shift * np.array([1.0, 0, 0]), np.array([0, 0, 0, velocity, 0, 0]), TIMES, 0.0, 0.1
+        )
+        assert (membership.reappeared({1: body}, new) is body) == same
+        assert membership.reappeared({1: replace(body, measured=True)}, new) is None
+    again = continued(new_body(2, body.middle, MOVING, TIMES, 0.0, 0.1), body)
+    assert again.id == 1
+    assert np.allclose(again.T, body.T), "the frame goes on"
+    np.testing.assert_allclose(again.middle, body.middle)
+
+
+def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:
+    """Still features behind a body that rests may count as its own; they must not make it larger."""
+    local = np.concatenate([corners(8, 9), [[0.12, 0.0, 0.0]]])
+    still = np.tile(path(MOVING)[SLOT], (WINDOW, 1, 1))
+    tracks = table(seen_from(still, local, 10))
+    body = body_along(still, np.arange(8), tracks)
+    membership.update_members({1: body}, FRAME, tracks)
+    assert tracks.sure[:8].all() and not tracks.sure[8]
+
+
+@pytest.mark.parametrize(("sure", "moving", "kept"), [(True, False, True), (False, False, False), (True, True, False)])
+def test_a_body_at_rest_before_a_standing_camera_keeps_what_has_moved_with_it(
+    sure: bool, moving: bool, kept: bool
+) -> None:
+    """What stays at its pixels belongs to a body that rests, if its motion with it was certain before."""
+    still = np.tile(path(MOVING)[SLOT], (WINDOW, 1, 1))
+    tracks = table(seen_from(still, corners(8, 9), 10))
+    body = replace(body_along(still, np.arange(8), tracks), moving=moving)
+    tracks.still[:8], tracks.sure[:8] = True, sure
+    membership.update_members({1: body}, FRAME, tracks)
+    assert (tracks.body[:8] == (1 if kept else -1)).all()
+
+
+@pytest.mark.parametrize(("velocity", "same"), [(MOVING, True), (LID, False)])
+def test_a_part_that_has_moved_apart_is_never_merged_again(velocity: Array, same: bool) -> None:
+    """A lid rests on its box for as long as it likes; a piece that never moved otherwise is the body's."""
+    local = corners(16, 4, lid=6)
+    poses, rows = path(MOVING), np.arange(10, 16)
+    tracks = table(np.concatenate([seen_from(poses, local[:10], 5), seen_from(path(velocity), local[10:], 6)]))
+    bodies = {1: body_along(poses, np.arange(10), tracks), 2: body_along(path(velocity), rows, tracks, id=2)}
+    bodies[2] = replace(bodies[2], apart_from=1)
+    merge(bodies, tracks)
+    assert bodies[2].distinct == (frozenset() if same else {1})
+    at_rest = table(seen_from(poses, local, 7))
+    bodies[2] = replace(bodies[2], alike=100, history=poses)
+    at_rest.body[:16] = np.where(np.arange(16) < 10, 1, 2)
+    at_rest.local[:16], at_rest.local_information[:16] = tracks.local[:16], tracks.local_information[:16]
+    merge(bodies, at_rest)
+    assert list(bodies) == ([1] if same else [1, 2])

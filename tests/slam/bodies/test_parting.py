@@ -1,0 +1,136 @@
+"""Landmarks that part from the rest in a frame, before it is known what moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import slam
+from frontends import create
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.detector import MovingObjectDetector
+from slam.bodies.fits import fit_positions, make_room, record
+from slam.config import SystemConfig
+from slam.data import StereoFeatures
+from slam.geometry.se3 import exp, inverse, log
+from slam.models import EstimatorModels
+from slam.tracks.table import Tracks
+from tests.slam.scene import RIG
+
+SIGMA = 0.3  # pixel noise [px]; the detector is told one pixel
+FRAMES = ObjectsConfig().window
+IDENTITY = np.eye(4)
+
+
+def seen(points, rng):
+    """Pixels (uL, vL, uR) (N, 3) of points (N, 3) to a camera at the origin."""
+    left, right = RIG.project(points)
+    return np.column_stack([left, right[:, 0]]) + SIGMA * rng.standard_normal((len(points), 3))
+
+
+def features_at(z):
+    """Features at pixels (uL, vL, uR) (N, 3)."""
+    n, right = len(z), np.column_stack([z[:, 2], z[:, 1]])
+    right[np.isnan(z[:, 2])] = np.nan
+    return StereoFeatures(
+        0.0, z[:, :2], right, np.full(n, 12.0), np.zeros(n), np.ones(n), np.ones(n, np.int8),
+        np.eye(n, 16, dtype=np.float32),
+    )  # fmt: skip
+
+
+class Room:
+    """A wall with a few nearer points before it, as a detector followed them for some frames from a camera at rest.
+
+    The last of the near ones is too young to be tested.
+    """
+
+    def __init__(self, near, seed=0, count=90):
+        self.rng = rng = np.random.default_rng(seed)
+        depth = rng.uniform(1.8, 2.2, count)
+        self.points = np.column_stack(
+            [rng.uniform(-0.45, 0.45, count) * depth, rng.uniform(-0.35, 0.35, count) * depth, depth]
+        )
+        self.points[:near] = np.column_stack([rng.uniform(-0.07, 0.07, (near, 2)), rng.uniform(0.95, 1.05, near)])
+        self.near, self.ids = near, np.arange(count)
+        self.detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
+        self.tracks = tracks = Tracks.empty(16, ObjectsConfig().window, count)
+        tracks.ids[:] = tracks.row[:] = self.ids
+        tracks.begin(self.ids, self.ids, features_at(np.zeros((count, 3))), self.points)
+        for frame in range(FRAMES):
+            make_room(tracks, frame)
+            known = self.ids[(self.ids != near - 1) | (frame > FRAMES - 3)]
+            record(tracks, known, frame, RIG, IDENTITY, features_at(seen(self.points, rng)), 1.0)
+        fit_positions(tracks, self.ids)
+        self.detector._number = FRAMES - 1
+
+    def parting(self, shift, T_world_left=IDENTITY, monocular=()):
+        """Which landmarks part in the next frame, in which the near points have moved by `shift` (3,) [m]."""
+        points = self.points + np.where(self.ids[:, None] < self.near, shift, 0.0)
+        z = seen(points, self.rng)
+        z[list(monocular), 2] = np.nan
+        found = self.detector.parting(self.tracks, features_at(z), self.ids, self.ids, T_world_left)
+        return np.isin(self.ids, found)
+
+
+@pytest.mark.parametrize("near", [6, 12])
+def test_near_landmarks_that_move_are_told_from_a_wrong_pose(near):
+    """The pose is wrong by 5 mm and 5 mrad, which moves the wall by more than the near group moved: 12 mm, 4 px.
+
+    Also those without a right pixel, and those that are among them but not known for long.
+    """
+    wrong = exp(np.array([0.0, 0.005, 0.0, 0.005, 0.0, 0.0]))
+    parts = Room(near).parting((0.012, 0.0, 0.0), wrong, monocular=[0])
+    assert parts[:near].all() and parts[near:].sum() <= 2
+
+
+def test_nothing_parts_in_a_still_scene():
+    assert sum(Room(8, seed).parting((0.0, 0.0, 0.0)).sum() for seed in range(20)) <= 4
+
+
+def test_what_has_parted_stays_in_doubt_for_some_frames():
+    room = Room(12)
+    assert room.parting((0.012, 0.0, 0.0))[:11].all()
+    doubted = []
+    for _ in range(5):
+        room.tracks.parted[:] -= 1  # as a step does
+        doubted.append(room.parting((0.0, 0.0, 0.0))[:12].any())
+    assert doubted == [True] * 3 + [False] * 2
+
+
+@pytest.fixture(scope="module")
+def start():
+    """The box of paper B before a moving camera as it starts to move, at frame 60: the features of its images."""
+    sequence = slam.open_sequence("synthetic:box?camera=moving&frames=100")
+    frontend = create("surf", sequence.rig, **SystemConfig.for_kind(sequence.kind).frontend)
+    return sequence, {k: frontend.extract(sequence.frame(k)) for k in range(40, 76)}
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
+def test_a_box_that_starts_to_move_does_not_carry_the_camera_along(start, backend):
+    """Without this test of landmarks the position is off by up to 20 standard deviations in frames 65 to 70."""
+    sequence, features = start
+    system = slam.StereoSlam(sequence.rig, "surf", backend)
+    first, errors = inverse(sequence.ground_truth.poses[40]), []
+    for k, seen_features in features.items():
+        estimate = system.process_features(seen_features).estimate
+        error = log(inverse(first @ sequence.ground_truth.poses[k]) @ estimate.T_world_left)[3:]
+        errors.append(np.sqrt(error @ np.linalg.solve(estimate.covariance[3:, 3:], error)))
+    assert np.max(errors[20:]) < 4.5 and np.median(errors[20:]) < 2.0
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_boxes_that_move_from_the_first_frame_on_draw_the_camera_less(backend):
+    """Errors of the camera after 15 frames: without this test of landmarks they are twice as large."""
+    errors = {tested: [error_after(15, seed, backend, tested) for seed in range(3)] for tested in (True, False)}
+    assert np.mean(errors[True]) < 0.75 * np.mean(errors[False])
+
+
+def error_after(frames, seed, backend, tested):
+    """Distance of the camera from where it is [m] after so many frames before moving boxes."""
+    sequence = slam.open_sequence(f"synthetic:boxes?density=300&sigma=0.2&seed={seed}&layout={seed}")
+    system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, None))
+    if not tested:
+        system.objects.parting = lambda *_: np.zeros(0, np.int64)
+    poses = [system.process_features(sequence.simulate(k).features).estimate.T_world_left for k in range(frames + 1)]
+    world = poses[0] @ inverse(sequence.ground_truth.poses[0])
+    return float(np.linalg.norm(log(inverse(poses[-1]) @ world @ sequence.ground_truth.poses[frames])[3:]))

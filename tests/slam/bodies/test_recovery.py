@@ -1,0 +1,129 @@
+"""Where a body is, by the few points that are seen of it, or by what looks like it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam.bodies import membership
+from slam.bodies.bodies import new_body, with_extent
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.estimator import BodyEstimator
+from slam.bodies.frame import Frame, Setup
+from slam.bodies.recovery import located
+from slam.data import RecentPoses, StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import exp, transform
+from slam.models import models_for
+from slam.object_data import ObjectObservations
+from slam.tracks.table import Tracks
+
+RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
+WINDOW = 12
+MODELS = models_for("driving")
+ESTIMATOR = BodyEstimator(RIG, MODELS)
+CAMERAS = RecentPoses(np.array([-0.1, 0.0]), np.tile(np.eye(4), (2, 1, 1)), 1e-10 * np.eye(12))
+POINTS = np.array([[0.3, 0.0, 0.0], [-0.3, 0.4, 0.1], [0.0, -0.6, 0.2], [0.2, 0.5, -0.1]])
+
+
+def scene(seen, off, rng, deviation=0.5):
+    """A body at 15 m, predicted wrongly by `off` (6,), of which so many points are seen; and where they are.
+
+    It was seen a tenth of a second ago; since then it has moved by a `deviation` [m].
+    """
+    T = np.eye(4)
+    T[:3, 3] = 4.0, 0.0, 15.0
+    truth = T @ exp(off)
+    uv, uv_right = RIG.project(transform(truth, POINTS[:seen]))
+    noise = 0.3 * rng.standard_normal((seen, 3))
+    features = StereoFeatures(
+        0.0, uv + noise[:, :2], uv_right + noise[:, [2, 1]], np.ones(seen), np.zeros(seen), np.ones(seen),
+        np.ones(seen, np.int8), np.eye(seen, 64, dtype=np.float32),
+    )  # fmt: skip
+    tracks = Tracks.empty(64, WINDOW)
+    rows = begin(tracks, features, np.arange(seen), transform(T, POINTS[:seen]))
+    body = new_body(1, T[:3, 3], np.zeros(6), np.zeros(WINDOW), 0.0, 2.0)
+    body = with_extent(replace(body, covariance=np.diag([0.05**2] * 3 + [deviation**2] * 3)), POINTS)
+    membership.add_members(body, tracks, rows)
+    tracks.local[rows], tracks.local_information[rows] = POINTS[:seen], 1e4 * np.eye(3)
+    before = ObjectObservations(
+        1, np.arange(4), *RIG.project(transform(T, POINTS)), T, np.zeros(6), np.repeat([0.5, 10 * deviation], 3)
+    )
+    first = RecentPoses(np.array([-0.1]), np.eye(4)[None], 1e-10 * np.eye(6))
+    body = replace(body, belief=ESTIMATOR.updated(None, 1, before, first))
+    return body, tracks, features, truth
+
+
+def begin(tracks, features, rows, points):
+    """Tracks of features (K,) at points (K, 3); their rows in the table."""
+    at = np.flatnonzero(~tracks.used)[: len(rows)]
+    tracks.row[at] = rows
+    tracks.begin(at, at, features, points)
+    return at
+
+
+def frame_of(features, max_speed=40.0):
+    """The frame of some features, with the camera at the world's origin."""
+    setup = Setup(RIG, ObjectsConfig(max_speed=max_speed), MODELS)
+    stamps = np.concatenate([[-0.1, 0.0], np.full(WINDOW - 2, np.nan)])
+    local = RIG.triangulate(features.uv_left, features.uv_right)
+    return Frame(setup, 1, features, local, stamps, np.tile(np.eye(4), (WINDOW, 1, 1)), CAMERAS)
+
+
+def place(body, tracks, features):
+    """Its pose after the frame, None where it was not measured."""
+    belief = located(body, tracks, frame_of(features), ESTIMATOR)
+    return belief.estimate.T_world_object if belief.estimate.measured else None
+
+
+@pytest.mark.parametrize("seen", [2, 3])
+def test_few_points_move_a_body_but_do_not_turn_it_wildly(seen):
+    off = np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.4])
+    body, tracks, features, truth = scene(seen, off, np.random.default_rng(seen))
+    T = place(body, tracks, features)
+    assert T is not None
+    assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.25
+    assert np.degrees(np.arccos((np.trace(T[:3, :3]) - 1) / 2)) < 3.0
+
+
+def test_points_that_do_not_agree_with_the_motion_say_nothing():
+    body, tracks, features, _ = scene(3, np.zeros(6), np.random.default_rng(5))
+    features.uv_left[0] += 40.0
+    features.uv_left[1] -= 40.0
+    assert place(body, tracks, features) is None
+
+
+def test_a_point_that_disagrees_is_followed_on_and_counted():
+    body, tracks, features, _ = scene(4, np.zeros(6), np.random.default_rng(5))
+    features.uv_left[3] += 9.0
+    features.uv_right[3] += 9.0
+    tracks.row[:4] = np.arange(4)
+    assert place(body, tracks, features) is not None
+    assert tracks.row[:4].tolist() == [0, 1, 2, 3]
+    assert tracks.misfit[:4].tolist() == [0, 0, 0, 1]
+
+
+FAR = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 1.0])
+
+
+def test_a_body_seen_again_takes_its_points_from_the_tracks_that_follow_them():
+    body, tracks, features, truth = scene(4, FAR, np.random.default_rng(6), deviation=2.0)
+    tracks.row[:4] = -1
+    followers = begin(tracks, features, np.arange(4), transform(truth, POINTS))
+    T = place(body, tracks, features)
+    assert T is not None and np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.5
+    assert tracks.row[:4].tolist() == [0, 1, 2, 3]
+    assert (tracks.number[followers] == -1).all()
+
+
+def test_what_looks_like_a_body_where_that_cannot_have_gone_is_not_it():
+    body, tracks, features, _ = scene(4, FAR, np.random.default_rng(6))  # off by eight of its standard deviations
+    tracks.row[:4] = -1
+    assert place(body, tracks, features) is None
+
+
+def test_two_points_do_not_place_a_body_that_may_be_anywhere():
+    body, tracks, features, _ = scene(2, np.zeros(6), np.random.default_rng(6), deviation=2.0)
+    assert place(body, tracks, features) is None

@@ -1,0 +1,63 @@
+"""A change of the rig's correction is no motion of what is seen."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from slam.bodies.config import ObjectsConfig
+from slam.bodies.detector import MovingObjectDetector
+from slam.bodies.fits import constant_velocity
+from slam.data import Estimate, StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import inverse, transform
+from slam.models import models_for
+from slam.tracks.table import Tracks
+
+RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
+CHANGE = 0.4  # of all disparities [px]
+FRAMES, AT = 8, 5  # the correction changes before this frame
+DT = 0.1
+NO_BACKEND = SimpleNamespace()  # the camera's last poses are then the online ones
+NO_LANDMARKS = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3))
+
+
+def mend(z):
+    """Right pixels that are farther to the left."""
+    return z - np.array([0.0, 0.0, CHANGE])
+
+
+def features_at(T, points, k):
+    """What a rig sees whose disparities are too small before the change, and right after it."""
+    uv, uv_right = RIG.project(transform(inverse(T), points))
+    if k < AT:
+        uv_right = uv_right + np.array([CHANGE, 0.0])
+    n = len(points)
+    one = np.ones(n)
+    return StereoFeatures(DT * k, uv, uv_right, one, 0 * one, one, np.ones(n, np.int8), np.eye(n, 64, dtype=np.float32))
+
+
+def velocities(revised):
+    """Velocities along the line of sight [m/s] that the tracks of still points some 40 m ahead seem to have."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-8, -2, 40], [8, 2, 50], (40, 3))
+    detector = MovingObjectDetector(RIG, ObjectsConfig(max_speed=25.0, size=2.0), models_for("driving"))
+    tracks = Tracks.empty(64)
+    for k in range(FRAMES):
+        T = np.eye(4)
+        T[2, 3] = 0.8 * k
+        if k == AT and revised:
+            detector.revise(tracks, mend)
+        features = features_at(T, points, k)
+        estimate = Estimate(features.stamp, T, 1e-6 * np.eye(6), *NO_LANDMARKS)
+        tracks = tracks.begun(len(points), detector.window)
+        detector.step(NO_BACKEND, tracks, features, estimate)
+    rows = np.flatnonzero(tracks.found)
+    times = np.nan_to_num(detector._stamps - features.stamp)
+    return constant_velocity(tracks, rows, times, 25.0).velocity[:, 2]
+
+
+def test_tracks_stand_still_when_the_correction_changes():
+    assert np.median(np.abs(velocities(revised=False))) > 1.0
+    assert np.median(np.abs(velocities(revised=True))) < 0.2  # what is of second order in the change is left
