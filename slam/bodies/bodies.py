@@ -21,7 +21,6 @@ from slam.tracks.table import Tracks
 
 _YOUNG = 4  # frames in which a body moves as it did when it was found
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
-_REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
 
@@ -39,7 +38,6 @@ class Body:
     lower: Array  # corner (3,) of the extent of its points, body coordinates
     upper: Array  # the opposite corner
     size: float  # what it measures across at least [m]
-    reach: float  # its points lie no farther from its origin [m]
     seen_at: float  # when its points were last found together [s]
     velocity_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of the velocity (6, 6)
     seen: int = 1  # number of frames in which it was measured
@@ -100,7 +98,7 @@ def new_body(
     none = np.zeros(3)
     return Body(
         id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, none, none,
-        size, np.inf, stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
+        size, stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
     )  # fmt: skip
 
 
@@ -186,8 +184,7 @@ def with_extent(body: Body, local: Array) -> Body:
     if len(local) < 3:
         return body
     lower, upper = outermost(local)
-    body = replace(body, lower=lower, upper=upper)
-    return body if math.isfinite(body.reach) else replace(body, reach=_REACH * body.across)
+    return replace(body, lower=lower, upper=upper)
 
 
 def outermost(points: Array) -> tuple[Array, Array]:

@@ -25,14 +25,13 @@ from slam.bodies.fits import fit_positions, fit_velocities, make_room, record, r
 from slam.bodies.following import follow
 from slam.bodies.frame import NO_IDS, Frame, Setup
 from slam.bodies.merging import merge
-from slam.bodies.parting import moved_since, parting
+from slam.bodies.parting import parting
 from slam.bodies.proof import PROOF, Way, by_left_image, with_frame
 from slam.bodies.recovery import located, observed
 from slam.bodies.regions import Region, follow_regions
 from slam.bodies.scene import Scene, displacements
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
-from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform
 from slam.interfaces import Backend
@@ -135,22 +134,13 @@ class MovingObjectDetector(ObjectDetector):
         self, tracks: Tracks, features: StereoFeatures, at: IndexArray, rows: IndexArray, T_world_left: Array
     ) -> IdArray:
         """See `ObjectDetector`; a landmark stays in doubt for some frames."""
-        s, c, now = self.setup, self.setup.config, self._number + 1
         followed = tracks.number[at] >= 0
-        at, rows = at[followed], rows[followed]
+        at, rows, now = at[followed], rows[followed], self._number + 1
         if not now:
             return NO_IDS
-        parted = at[parting(s, tracks, now, features, at, rows, T_world_left)]
-        tracks.parted[parted] = 1 + c.confirm
+        parts, moved = parting(self.setup, tracks, now, features, at, rows, T_world_left)
+        tracks.parted[at[parts]] = 1 + self.setup.config.confirm
         doubted = tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)]
-        if now >= self.window:
-            return np.sort(doubted)
-        first = (tracks.dof[at] > 0).argmax(axis=1)  # slots are frames as long as the window is not full
-        pixels = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-        ages = now - first.astype(float)
-        moved = moved_since(
-            s.rig, T_world_left, tracks.anchor[at], ages, pixels, s.sigma, c.doubtful, c.suspect, c.min_support
-        )
         return np.union1d(doubted, tracks.ids[at[moved]])
 
     def step(
@@ -280,7 +270,7 @@ class MovingObjectDetector(ObjectDetector):
         members = group.members
         body = replace(group.body(self._next_body, frame, tracks), far=far)
         parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
-        known = membership.reappeared(parts, body)
+        known = membership.reappeared(parts, body, self.setup.config.max_speed)
         if known is not None:
             tracks.give_up(np.flatnonzero(tracks.body == known.id))
             body = continued(body, known)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from slam.bodies.bodies import Body
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import inverses, predicted_pixels, within_reach
+from slam.bodies.track_kernels import inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray
 from slam.geometry.arrays import among
-from slam.geometry.se3 import points_by_pose, transform
+from slam.geometry.se3 import inverse, points_by_pose, transform
 from slam.tracks import follow as features_of_tracks
 from slam.tracks.table import Tracks
 
@@ -70,7 +71,9 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> N
         return
     s, c, f, T = frame.setup, frame.setup.config, frame.features, frame.T_world_left
     places = tracks.position[rows]
-    z, S = predicted_pixels(s.rig.rectified_parameters, T, places, tracks.covariance[rows], s.sigma)
+    z, J = s.rig.project_stereo(transform(inverse(T), places))
+    G = J @ T[:3, :3].T
+    S = G @ tracks.covariance[rows] @ np.swapaxes(G, 1, 2) + s.sigma**2 * np.eye(3)
     least = np.where(tracks.doubtful[rows], 0.5 * c.search_limit, c.search_radius)
     windows = features_of_tracks.Windows((SIGMAS,), (c.d_match,), c.ratio, c.search_limit, least)
     looks = tracks.look[rows], tracks.laplacian[rows]
@@ -96,10 +99,9 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
         return
     local = frame.local[free]
     deviation = np.sqrt(2.0) * s.depth_noise(local[:, 2])
-    allowed = within_reach(
-        tracks.position[left], transform(frame.T_world_left, local), np.einsum("nii->n", tracks.covariance[left]),
-        deviation**2, c.max_speed * frame.dt, SIGMAS,
-    )  # fmt: skip
+    unknown = SIGMAS * np.sqrt(np.einsum("nii->n", tracks.covariance[left])[:, None] + deviation**2)
+    away = cdist(tracks.position[left], transform(frame.T_world_left, local))
+    allowed = away < c.max_speed * frame.dt + unknown
     looks, features = (tracks.look[left], tracks.laplacian[left]), frame.features.select(free)
     found = features_of_tracks.match_everywhere(*looks, features, c.wide_d_match, c.wide_ratio, allowed)
     tracks.find(left[found.tracks], free[found.features])

@@ -42,9 +42,7 @@ _ENOUGH = 6  # frames after which a member must fit, and after which one that di
 _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
 _RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
 _LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
-_WEAK = 1e-8  # numerics: variance that is added to a known pose's [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
-_APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,66 +231,39 @@ def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
 
 
 def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
-    """The body in whose extent most of these tracks lie, if their past fits its motion, too; else None.
-
-    Args:
-        bodies: all bodies.
-        tracks: all tracks.
-        rows: which of them.
-        own: a body made of them alone.
-    """
+    """The body in whose extent most of these tracks lie, if it moves as `own`, a body made of them alone; else None."""
     for body in bodies.values():
-        near = _distances(replace(body, reach=np.inf), tracks, rows, _MERGED) < _NEAR
-        if not body.measured or 2 * near.sum() <= len(rows):
+        near = _distances(body, tracks, rows, _MERGED) < _NEAR
+        if not body.measured or 2 * near.sum() <= len(rows) or _explained(body, tracks, rows) >= 2 * EXPLAINED:
             continue
-        alone = float(squares(*in_body_axes(own, tracks, rows)[:2]).sum())
-        points, A, known = in_body_axes(body, tracks, rows)
-        fixed = float(squares(points, A).sum())
-        still = float(_still(tracks, rows, known).sum())
-        by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
-        certain = _squares_with_pose_error(points, A, body)
-        apart = body.seen > PROBATION and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
-        if fixed < 2 * EXPLAINED * still and not apart:
+        theirs = np.flatnonzero((tracks.body == body.id) & tracks.found)
+        if body.seen <= PROBATION or distinctness(own, rows, body, theirs, tracks) < 1.0:
             return body
     return None
 
 
-def _squares_with_pose_error(points: Array, A: Array, body: Body) -> float:
-    """χ² of fixed points, in body coordinates by slot (N, W, 3) with information (N, W, 3, 3), if the pose may be off.
-
-    In every frame the points share the displacement by the error of the body's pose, of known covariance.
-    """
-    y = weighted_means(points, A)
-    shared = np.linalg.inv(_spread_of_place(body, y.mean(axis=0)))
-    pull = times_vectors(A, points - y[:, None]).sum(axis=0)
-    explained = (pull * np.linalg.solve(A.sum(axis=0) + shared, pull[..., None])[..., 0]).sum()
-    return float(squares(points, A).sum() - explained)
+def _explained(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> float:
+    """Which share of the χ² of tracks that stand still the motion of a body leaves."""
+    points, A, known = in_body_axes(body, tracks, rows)
+    return float(squares(points, A).sum()) / max(float(_still(tracks, rows, known).sum()), _LEAST)
 
 
-def _spread_of_place(body: Body, y: Array) -> Array:
-    """Covariance (3, 3), in body axes, of where the body's point y (3,) is, given that of its pose."""
-    J = -points_by_pose(y[None])[0]
-    return np.asarray(J @ body.covariance @ J.T + _WEAK * np.eye(3))
-
-
-def with_reach(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
-    """The body with a reach that includes tracks that have moved with it."""
-    away = np.linalg.norm(tracks.position[rows] - body.T[:3, 3], axis=1)
-    return replace(body, reach=max(body.reach, float(away.max(initial=0.0))))
-
-
-def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
+def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body | None:
     """The body out of view that a new one is, by position and velocity, perhaps seen from another side; else None.
 
-    The middle of the part that is seen may be off the body's middle by half its size.
+    The middle of the part that is seen may be off the body's middle by half its size, and no body is faster than
+    `max_speed` [m/s].
     """
     best, least = None, _RETURNED
     for body in bodies.values():
         if body.measured or not body.proven:
             continue
-        y, R = 0.5 * (body.lower + body.upper), body.T[:3, :3]
-        place = R @ _spread_of_place(body, y) @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
-        gap = new.middle - body.middle
+        gap, size = new.middle - body.middle, 0.5 * (body.across + new.across)
+        if np.linalg.norm(gap) > size + max_speed * (new.seen_at - body.seen_at):
+            continue
+        J = -points_by_pose(0.5 * (body.lower + body.upper)[None])[0]
+        R = body.T[:3, :3]
+        place = R @ J @ body.covariance @ J.T @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
         change = new.velocity[3:] - body.velocity[3:]
         velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
         off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))
@@ -302,16 +273,8 @@ def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
 
 
 def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
-    """Whether the members `rows` of another body have moved with this one all the time.
-
-    The test is much stricter than that of `body_around`: nearly all that the still world leaves unexplained must be
-    explained.
-    """
-    if not len(rows):
-        return False
-    points, A, known = in_body_axes(whole, tracks, rows)
-    still = float(_still(tracks, rows, known).sum())
-    return float(squares(points, A).sum()) < _PART_EXPLAINED * still
+    """Whether the members `rows` of another body have moved with this one all the time: hardly any χ² is left."""
+    return len(rows) > 0 and _explained(whole, tracks, rows) < _PART_EXPLAINED
 
 
 def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
@@ -342,11 +305,8 @@ def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float
     wider = margin * body.across
     local = transform(inverse(body.T), tracks.position[rows])
     away = (local - np.clip(local, body.lower - wider, body.upper + wider)) @ body.T[:3, :3].T
-    near = (local**2).sum(axis=1) < body.reach**2
-    out = np.full(len(rows), np.inf)
-    P = tracks.covariance[rows[near]]
-    out[near] = (away[near] * times_vectors(inverses(P, _RIDGE, _LEAST), away[near])).sum(axis=1)
-    return out
+    P = inverses(tracks.covariance[rows], _RIDGE, _LEAST)
+    return np.asarray((away * times_vectors(P, away)).sum(axis=1))
 
 
 def _improve(body: Body, tracks: Tracks, slot: int) -> None:

@@ -41,7 +41,6 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
         body = bodies[id] = replace(body, alike=alike) if alike != body.alike else body
         young = body.seen < _MERGES and (whole is None or whole.id != body.apart_from)
         if whole is not None and (young or alike > _MERGES):
-            whole = bodies[whole.id] = membership.with_reach(whole, tracks, mine)
             membership.add_members(whole, tracks, mine, sure=True)
             del bodies[id]
             tracks.give_up(np.flatnonzero(tracks.body == id))

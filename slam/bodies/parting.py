@@ -13,11 +13,10 @@ import numpy as np
 
 from slam.bodies.fits import measure
 from slam.bodies.frame import Setup
-from slam.bodies.scene import FARTHEST, Displacements, classify_scene, places_in_view, tail
+from slam.bodies.scene import FARTHEST, Displacements, Scene, classify_scene, places_in_view, tail
 from slam.bodies.track_kernels import fit_fixed_points, inverses
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.pnp import measurement_rows
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.tracks.table import Tracks
 
@@ -30,8 +29,12 @@ _RIDGE = 1e-6  # numerics: share of the trace
 def parting(
     setup: Setup, tracks: Tracks, now: int, features: StereoFeatures, at: IndexArray, rows: IndexArray,
     T_world_left: Array,
-) -> BoolArray:  # fmt: skip
+) -> tuple[BoolArray, BoolArray]:  # fmt: skip
     """Which landmarks (K,) part from the rest, or lie among those that do and are not known for long enough.
+
+    And which moved since they were first seen, in a run's first frames: what moves from the beginning on would else
+    pull the camera along until its tracks are known, and that error stays, as the world's axes are those of the first
+    frame. Means of tracks are no better than their first points then.
 
     Args:
         setup: cameras and settings.
@@ -42,67 +45,43 @@ def parting(
         rows: of their features (K,).
         T_world_left: the camera's pose (4, 4) as far as it is known: an error of it moves all landmarks alike.
     """
-    c, t, out = setup.config, tracks, np.zeros(len(at), bool)
+    c, t = setup.config, tracks
+    parts, moved = np.zeros((2, len(at)), bool)
+    z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
     mine = np.flatnonzero((t.body[at] < 0) & (t.count(at) >= c.min_frames))
-    known = at[mine]
     position, covariance = np.empty_like(t.position), np.empty_like(t.covariance)
-    fit_fixed_points(t.A, t.p, t.anchor, known, position, covariance)
-    before, P = position[known], covariance[known]
-    z = measurement_rows(features.uv_left[rows[mine]], features.uv_right[rows[mine]])
-    points, A, dof = measure(setup.rig, T_world_left, before, z, setup.sigma)
-    local = transform(inverse(T_world_left), before)
-    tested = np.flatnonzero((dof > 0) & (local[:, 2] > FARTHEST * np.sqrt(np.trace(P, axis1=1, axis2=2))))
-    ages = 1 + (now - 1 - np.arange(c.window)) % c.window
-    seen = t.dof[known[tested]] > 0
-    W = inverses(inverses(A[tested], _RIDGE, 0.0) + P[tested], _RIDGE, 0.0)
-    moved = Displacements(
-        before[tested] - T_world_left[:3, 3], (points - before)[tested], W, (seen @ ages) / seen.sum(axis=1)
-    )
-    view = places_in_view(local[tested])
-    scene = classify_scene(moved, view, c.suspect, _FEW, (_LEAST_NOISE / setup.sigma) ** 2)
-    if not scene.groups:
-        return out
-    young = np.setdiff1d(np.arange(len(at)), mine[tested])
+    fit_fixed_points(t.A, t.p, t.anchor, at[mine], position, covariance)
+    ages, seen = 1 + (now - 1 - np.arange(c.window)) % c.window, t.dof[at[mine]] > 0
+    age = (seen @ ages) / np.maximum(seen.sum(axis=1), 1)
+    known, view, scene = _compared(setup, T_world_left, position[at[mine]], covariance[at[mine]], age, z[mine])
+    young = np.setdiff1d(np.arange(len(at)), mine[known])
     local = transform(inverse(T_world_left), t.position[at[young]])
     young, place = young[local[:, 2] > 0], places_in_view(local[local[:, 2] > 0])
-    for members in (group.members for group in scene.groups):
-        out[mine[tested[members]]] = True
-        low, high = view[members].min(axis=0), view[members].max(axis=0)
+    for group in scene.groups:
+        parts[mine[known[group.members]]] = True
+        low, high = view[group.members].min(axis=0), view[group.members].max(axis=0)
         beyond = _AROUND * (high - low)
-        out[young] |= ((place > low - beyond) & (place < high + beyond)).all(axis=1)
-    return out
+        parts[young] |= ((place > low - beyond) & (place < high + beyond)).all(axis=1)
+    if now < c.window:  # slots are frames
+        first = (t.dof[at] > 0).argmax(axis=1)
+        was = inverses(t.A[at, first], _RIDGE, 0.0)
+        known, _, scene = _compared(setup, T_world_left, t.anchor[at], was, now - first.astype(float), z)
+        moved[known] = ~scene.rest | (scene.alone > c.doubtful * tail(scene.alone[scene.rest]))
+    return parts, moved
 
 
-def moved_since(
-    rig: StereoRig, T_world_left: Array, first: Array, frames: Array, pixels: Array, sigma: float, doubtful: float,
-    suspect: float, support: int,
-) -> BoolArray:  # fmt: skip
-    """Which points (N,) moved otherwise than the scene since they were first seen: for a run's first frames.
+def _compared(
+    setup: Setup, T_world_left: Array, before: Array, P: Array, age: Array, z: Array
+) -> tuple[IndexArray, Array, Scene]:
+    """How points `before` (N, 3), of covariances P (N, 3, 3), have moved in `age` (N,) frames to pixels z (N, 3).
 
-    What moves from the beginning on would else pull the camera along until its tracks are known, and that error stays:
-    the world's axes are those of the first frame. The noise is that of these displacements themselves. Tracks are then
-    too short for their means, of which `parting` asks, to be any better than their first points.
-
-    Args:
-        rig: the cameras.
-        T_world_left: the camera's pose (4, 4), which may be wrong.
-        first: where the points were first seen (N, 3), in world coordinates [m].
-        frames: since then (N,).
-        pixels: (uL, vL, uR) of each in this frame (N, 3); those without a right pixel are not tested.
-        sigma: pixel noise [px].
-        doubtful: χ²(3) from which a single point moved.
-        suspect: χ²(6) from which a group did.
-        support: least number of points of a group.
+    Returns:
+        those whose depth is known (K,), where the camera saw them (K, 3), and the scene in the noise of the rest.
     """
-    moves = np.zeros(len(pixels), bool)
-    points, information, dof = measure(rig, T_world_left, first, pixels, sigma)
-    local = transform(inverse(T_world_left), first)
-    known = np.flatnonzero((dof == 3) & (local[:, 2] > 0))
-    if len(known) < 3 * support:
-        return moves
-    A, was = information[known], first[known]
-    ridge = _RIDGE * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    moved = Displacements(was - T_world_left[:3, 3], points[known] - was, 0.5 * (A + ridge), frames[known])
-    scene = classify_scene(moved, places_in_view(local[known]), suspect, support, (_LEAST_NOISE / sigma) ** 2)
-    moves[known[~scene.rest | (scene.alone > doubtful * tail(scene.alone[scene.rest]))]] = True
-    return moves
+    points, A, dof = measure(setup.rig, T_world_left, before, z, setup.sigma)
+    local = transform(inverse(T_world_left), before)
+    known = np.flatnonzero((dof > 0) & (local[:, 2] > FARTHEST * np.sqrt(np.trace(P, axis1=1, axis2=2))))
+    W = inverses(inverses(A[known], _RIDGE, 0.0) + P[known], _RIDGE, 0.0)
+    moved = Displacements(before[known] - T_world_left[:3, 3], (points - before)[known], W, age[known])
+    view = places_in_view(local[known])
+    return known, view, classify_scene(moved, view, setup.config.suspect, _FEW, (_LEAST_NOISE / setup.sigma) ** 2)

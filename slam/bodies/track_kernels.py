@@ -41,26 +41,6 @@ def inverses(M, share, least):
     return out
 
 
-@kernel
-def predicted_pixels(camera, T_world_left, points, P, sigma):
-    """Pixels (uL, vL, uR) (N, 3) at which a camera sees points (N, 3) that have covariances P (N, 3, 3), in the world.
-
-    And the covariances (N, 3, 3) of the innovations of pixels with noise `sigma`. Behind the camera, pixels are NaN.
-    """
-    z, S = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-    local, J, G = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    for n in range(len(points)):
-        transform_back(T_world_left, points[n], local)
-        residual(camera, local, np.zeros(3), z[n], J)
-        for k in range(3):
-            z[n, k] = -z[n, k]
-            by_point(J[k], T_world_left, G[k])
-        turn(G, P[n], S[n])
-        for k in range(3):
-            S[n, k, k] += sigma * sigma
-    return z, S
-
-
 # ---------------------------------------------------------------------------------------------- windows of tracks
 
 
@@ -342,15 +322,3 @@ def points_on_rays(camera, T_world_left, points, measured, sigma, far, steps):
                 for j in range(3):
                     A[n, i, j] += g[i] * g[j] / (sigma * sigma)
     return out, A, dof
-
-
-@kernel
-def within_reach(start, found, start_variance, found_variance, way, sigmas):
-    """Which places (M, 3) are no farther than `way` [m] from the starts (N, 3), given the variances [m²]: (N, M)."""
-    out = np.empty((len(start), len(found)), np.bool_)
-    for n in range(len(start)):
-        x, y, z = start[n]
-        for m in range(len(found)):
-            square = (found[m, 0] - x) ** 2 + (found[m, 1] - y) ** 2 + (found[m, 2] - z) ** 2
-            out[n, m] = square < (way + sigmas * np.sqrt(start_variance[n] + found_variance[m])) ** 2
-    return out
