@@ -149,7 +149,7 @@ FAULTS = (
     ),
     # moving bodies
     Fault(
-        "noise of depth counts as a body's own extent", "slam/bodies/points.py",
+        "noise of depth counts as a body's own extent", "slam/bodies/belief.py",
         "values, axes = np.linalg.eigh(total - noise)", "values, axes = np.linalg.eigh(total)",
         "tests/slam/bodies/test_first_sight.py tests/slam/bodies",
     ),

@@ -9,43 +9,126 @@ world.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, RecentPoses
-from slam.geometry.se3 import Array
+from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.se3 import Array, transform
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
 from slam.window.marginal import marginalised
 from slam.window.problem import Carried, Places, RelativePrior, Rows, Window
 from slam.window.stereo import RectifiedStereo
 
+Projection = Callable[[Array], tuple[Array, Array]]
 EVEN = 0.5  #: fixed: a body rather exists than not above this probability, which it has before its first evidence
 _LEAST = 2.0  # ratio of the likelihoods of a measured body, at least: a body at rest shows no motion, but is there
 _LARGEST = 20.0  # χ² that counts of the typical member: many members share one error of the camera's pose
 _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
 
 
-def when_measured(probability: float, gain: float) -> float:
-    """The probability after a frame in which the body was measured.
+_FAR = 4.0  # so many times the median distance from the median point is no part of the body
+MIN_POINTS = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
+MAX_REJECTIONS = 3  #: so many running, and a point restarts
+_STEPS = 3  # numerics: of Gauss-Newton; the prior is weak where depth is known well
 
-    Args:
-        probability: before.
-        gain: by how much χ² the body's motion explains its typical member better than a fixed point does.
+
+def compact(points: Array, far: float) -> BoolArray:
+    """Which of the points (N, 3) lie less than `far` times the median distance from their median point."""
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else np.zeros(0)
+    return np.asarray(distance <= far * np.median(distance) if len(points) else np.zeros(0, bool))
+
+
+def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
+    """The frame of a body seen for the first time: origin at the mean of its points, axes of the world.
+
+    Its points h (M, 3) are in camera coordinates, NaN without a depth. Which were taken (M,) is returned as well: false
+    stereo matches are not.
     """
+    world = transform(T_world_left, h)
+    seen = np.isfinite(world).all(axis=1)
+    near = np.zeros(len(h), bool)
+    near[seen] = compact(world[seen], _FAR)
+    T = np.eye(4)
+    T[:3, 3] = world[near].mean(axis=0)
+    return T, near
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Where the points of a body lie: a Gaussian with mean (3,) and covariance (3, 3) in some frame."""
+
+    mean: Array
+    covariance: Array
+
+    def seen_from(self, T: Array) -> Shape:
+        """The same in another frame, to which T (4, 4) takes coordinates."""
+        R = T[:3, :3]
+        return Shape(R @ self.mean + T[:3, 3], R @ self.covariance @ R.T)
+
+
+def shape_of(points: Array, covariances: Array) -> Shape:
+    """The spread of a body's points (M, 3), less what their uncertainties (M, 3, 3) make it seem larger.
+
+    No extent is taken to be less than half the middle one: a body is seldom flatter than that, and would be taken for
+    flat wrongly where depth is all noise. Fewer than four points show no shape: then next to nothing is said.
+    """
+    if len(points) < MIN_POINTS:
+        return Shape(points.mean(axis=0), 100 * covariances.mean(axis=0))
+    mean, noise = points.mean(axis=0), covariances.mean(axis=0)
+    offset = points - mean
+    total = offset.T @ offset / max(1, len(points) - 1)
+    values, axes = np.linalg.eigh(total - noise)
+    least = max(values[1] / 4, 1e-4 * float(np.trace(total)), 1e-3 * float(np.trace(noise)))
+    return Shape(mean, (axes * np.maximum(values, least)) @ axes.T)
+
+
+def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Shape) -> tuple[Array, Array]:
+    """Points (M, 3) by pixels z (M, 3), given that they belong to a body of known shape, and their covariances.
+
+    All in left-camera coordinates. Far off, stereo scatters the points of a body further in depth than the body is
+    deep, so that a turn would seem much better visible than it is. With the shape as prior each point is drawn to the
+    others as far as its depth is noise. `h` is where they triangulate to.
+    """
+    prior = np.linalg.inv(shape.covariance)
+    for _ in range(_STEPS):
+        predicted, J = project(h)
+        weight = np.swapaxes(J, 1, 2) / sigma**2
+        covariance = np.linalg.inv(weight @ J + prior)
+        gradient = (weight @ (z - predicted)[:, :, None])[:, :, 0] + (shape.mean - h) @ prior
+        h = h + (covariance @ gradient[:, :, None])[:, :, 0]
+    return h, covariance
+
+
+def points_to_replace(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:
+    """Which points (p,) of a body make room for `wanted` ones, so that it has `most` at most.
+
+    Those `unseen` for more frames than their `sights`. Where hardly any are in view, as when a body has turned round,
+    others leave, too.
+    """
+    age = unseen / sights
+    order = np.argsort(-age, kind="stable")
+    in_view = int((unseen == 0).sum())
+    lacking = min(wanted, most // 2 - in_view) - (most - len(age))
+    surplus = len(age) + wanted - most
+    leaving = order[: max(0, min(surplus, max(int((age > 1).sum()), lacking), len(age) - in_view))]
+    gone = np.zeros(len(age), bool)
+    gone[leaving] = True
+    return gone
+
+
+def when_measured(probability: float, gain: float) -> float:
+    """The probability after a frame that measured the body, which explains a member better than the world by `gain`."""
     ratio = max(_LEAST, math.exp(0.5 * min(gain, _LARGEST)))
     return min(_CERTAIN, probability * ratio / (1.0 - probability + probability * ratio))
 
 
 def when_missed(probability: float, seen: int, age: int) -> float:
-    """The probability after a frame in which the body was not measured.
-
-    Args:
-        probability: before.
-        seen: number of frames in which it was measured, and
-        age: number of frames since it was found: their ratio says how surely it is measured where it exists.
-    """
+    """The probability after a frame that did not measure a body, `seen` in so many of the frames of its `age`."""
     detection = (seen + 1.0) / (age + 2.0)
     return probability * (1.0 - detection) / (1.0 - probability * detection)
 
@@ -161,13 +244,10 @@ def window(b: BodyBelief, stereo: RectifiedStereo, motion: Carried) -> Window:
 
 
 def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Carried, drift: float) -> BodyBelief:
-    """The belief without its oldest frame, which becomes part of the prior, and without points that were given up.
+    """The belief without its oldest frame, which becomes part of the prior with the points that it has measured.
 
-    Points that the frame has measured join the prior. `drift` is the density of the random walk of a point's direction
-    with the angle from which it is seen [rad / √rad].
-
-    Raises:
-        numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
+    `drift` is the density of the random walk of a point's direction with the angle of view [rad / √rad]. Raises
+    LinAlgError where the information of what leaves is not positive definite.
     """
     rows, places = b.rows, b.places
     member, here, alive = np.zeros(len(b.points), bool), np.zeros(len(b.points), bool), b.alive

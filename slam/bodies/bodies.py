@@ -79,16 +79,9 @@ class Body:
 def new_body(
     id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float, uncertainty: Array | None = None
 ) -> Body:  # fmt: skip
-    """A body found with a twist at its centre; its poses over the window follow from a constant velocity.
+    """A body found with a twist [ω, v] (6,) at its centre (3,); its poses by slot follow from a constant velocity.
 
-    Args:
-        id: for it.
-        centre: origin (3,) of its frame in world coordinates, now.
-        twist: [ω, v] (6,).
-        times: of the window's slots less the present (W,) [s].
-        stamp: the present [s].
-        size: what it measures across at least [m].
-        uncertainty: covariance of the twist (6, 6); None where it is known.
+    The window's slots have `times` (W,) less the present [s]; `uncertainty` (6, 6) is that of the twist.
     """
     history = np.tile(np.eye(4), (len(times), 1, 1))
     history[:, :3, :3] = so3_exp(times[:, None] * twist[:3])
@@ -103,10 +96,7 @@ def new_body(
 
 
 def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
-    """The body predicted over `dt` [s] with constant velocity, not measured yet.
-
-    Impulses on its velocities, of the variances that the motion model gives, add `dt` times themselves to the pose.
-    """
+    """The body predicted over `dt` [s] with constant velocity, not measured yet."""
     T = body.T.copy()
     T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
     T[:3, 3] += dt * body.velocity[3:]
@@ -140,10 +130,9 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
 
 
 def continued(body: Body, known: Body) -> Body:
-    """A new body that turns out to be a known one: it takes over that one's id, frame and probability of existence.
+    """A new body that turns out to be a known one takes over its id and predicted frame; the estimate begins anew.
 
-    The estimate of it begins anew, and so does the evidence that it moves. Its frame stays as predicted, but for a
-    shift from the part seen before to the part seen now.
+    The frame is shifted from the middle of the part seen before to that of the part seen now.
     """
     frame = known.T.copy()
     frame[:3, 3] += body.middle - known.middle
@@ -197,11 +186,7 @@ def outermost(points: Array) -> tuple[Array, Array]:
 
 
 def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Array, Array, BoolArray]:
-    """What tracks measured in each slot of the window, in the body's coordinates.
-
-    Returns:
-        points (N, W, 3) in body coordinates, information (N, W, 3, 3), and whether there is any (N, W).
-    """
+    """What tracks measured by slot in body coordinates: points (N, W, 3), information (N, W, 3, 3), and whether any."""
     t = tracks
     points, A, known = windows_in_body(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
     return points, A, known
@@ -228,10 +213,7 @@ def _worth_reporting(body: Body, estimate: ObjectEstimate, config: ObjectsConfig
 
 
 def _enclosing(points: Array) -> Array:
-    """Lower and upper corner (2, 3) of a box about points (K, 3), false ones among them left out.
-
-    The percentiles are widened by what they cut off evenly spread points, at most to the outermost point.
-    """
+    """Corners (2, 3) of a box about points (K, 3): percentiles widened by what they cut off evenly spread points."""
     lower, upper = outermost(points)
     more = CUT / (1.0 - 2.0 * CUT) * (upper - lower)
     return np.stack([np.maximum(lower - more, points.min(axis=0)), np.minimum(upper + more, points.max(axis=0))])

@@ -18,16 +18,14 @@ from slam.bodies.bodies import (
     with_evidence,
     with_extent,
 )
-from slam.bodies.camera import recent_poses, with_estimate
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.estimator import FRAMES, BodyEstimator
+from slam.bodies.finder import parting
 from slam.bodies.fits import fit_positions, fit_velocities, make_room, record, revise_tracks
-from slam.bodies.following import follow
-from slam.bodies.frame import NO_IDS, Frame, Setup
-from slam.bodies.merging import merge
-from slam.bodies.parting import parting
+from slam.bodies.following import follow, located, observed
+from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
+from slam.bodies.membership import merge
 from slam.bodies.proof import PROOF, Way, by_left_image, with_frame
-from slam.bodies.recovery import located, observed
 from slam.bodies.regions import Region, follow_regions
 from slam.bodies.scene import Scene, displacements
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
@@ -97,13 +95,7 @@ class ObjectDetector:
 
 
 class MovingObjectDetector(ObjectDetector):
-    """Finds moving bodies without being told.
-
-    Args:
-        rig: the cameras.
-        config: settings.
-        models: pixel noise of the estimators, and how they assume that bodies move.
-    """
+    """Finds moving bodies without being told; `models` say how noisy pixels are, and how bodies move."""
 
     def __init__(self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> None:
         self.setup = Setup(rig, config, models)
@@ -256,16 +248,10 @@ class MovingObjectDetector(ObjectDetector):
     def _found(
         self, group: finder.MovingGroup, tracks: Tracks, frame: Frame, whole: int | None = None, far: bool = False
     ) -> None:
-        """Make a body of tracks with a common twist, or continue with them one that was out of view.
+        """Make a body of tracks with a common twist, or continue with them one that was out of view under its id.
 
-        That keeps its id, but not its points. Where the tracks belong to another body, both are merged later.
-
-        Args:
-            group: the tracks that move.
-            tracks: all tracks.
-            frame: the present one.
-            whole: id of the body that they are a part of, with a motion of their own; None for none.
-            far: whether they were followed for farther than they are wide already.
+        `whole` is the body that they are a part of, with a motion of their own; `far` says that they were followed for
+        farther than they are wide already.
         """
         members = group.members
         body = replace(group.body(self._next_body, frame, tracks), far=far)

@@ -14,14 +14,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.bodies.belief import BodyBelief, Points, begun, carried, slid, window
-from slam.bodies.points import (
+from slam.bodies.belief import (
     MAX_REJECTIONS,
     MIN_POINTS,
+    BodyBelief,
+    Points,
     Shape,
+    begun,
+    carried,
     first_frame,
     points_to_replace,
     shape_of,
+    slid,
+    window,
     with_shape,
 )
 from slam.chi_square import chi_square_limit, chi_square_limits
@@ -70,12 +75,7 @@ class _Expected:
 
 
 class BodyEstimator:
-    """Estimates bodies one by one; all that is known of one is its `BodyBelief`.
-
-    Args:
-        rig: the cameras, rectified.
-        models: pixel noise, gate, and how bodies move.
-    """
+    """Estimates bodies one by one; all that is known of one is its `BodyBelief`."""
 
     def __init__(self, rig: StereoRig, models: EstimatorModels) -> None:
         self.stereo = RectifiedStereo.of(rig)
@@ -87,19 +87,10 @@ class BodyEstimator:
     def updated(
         self, belief: BodyBelief | None, id: int, seen: ObjectObservations | None, cameras: RecentPoses
     ) -> BodyBelief | None:
-        """The belief after one more frame, the newest of the camera's poses.
+        """The belief after one more frame, the newest of the camera's `FRAMES` + 1 last poses.
 
         A body of which nothing is known, or of which nothing agrees with what is known though it was located
-        (`ObjectObservations.T_world_object`), begins anew, if at least three points have a depth.
-
-        Args:
-            belief: before; None for none.
-            id: of the body.
-            seen: its points in this frame; None where it was not seen.
-            cameras: its last `FRAMES` + 1 poses, or as many as there are.
-
-        Returns:
-            None where there is no belief before and it cannot begin.
+        (`ObjectObservations.T_world_object`), begins anew, if at least three points have a depth; else it stays None.
         """
         measured = None if seen is None else self._measured(seen)
         after = None
@@ -352,11 +343,7 @@ def _between(cameras: RecentPoses) -> Array:
 
 
 def _places(frame: int, points: IndexArray, h: Array, shape: Shape) -> Places:
-    """That points at h (M, 3) in a frame's camera belong to a body of a shape, given there.
-
-    A Gaussian about the shape's middle: its information, and the point in each point's chart that it is centred on, are
-    those of the chart at h.
-    """
+    """That points at h (M, 3) in a frame's camera belong to a body of a shape there: a Gaussian in the charts at h."""
     eye = np.eye(4)
     basis, origin = chart_kernels.relative_charts(eye, h)
     _, D, _ = chart_kernels.chart_changes(eye, h, basis, np.tile(np.eye(3), (len(h), 1, 1)))

@@ -1,4 +1,11 @@
-"""Finding bodies: groups of tracks that move on their own, and the body that one of them makes."""
+"""Groups of tracks that move on their own: before the update, and after it, when they make a body.
+
+A near body that starts to move would carry the camera along. Points of a far wall hardly tell a step sideways from a
+turn, and three points before it decide. So before each update the landmarks found in a frame are compared with where
+their tracks saw them: those that lie together, and whose motion is not that of the rest, are two explanations of one
+frame, by the camera's motion and by theirs. The camera keeps with the rest, which is wider spread, and the covariance
+of its pose grows by what the withheld measurements would have told.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +15,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.bodies import membership
+from slam.bodies.belief import compact
 from slam.bodies.bodies import Body, in_body_axes, new_body
-from slam.bodies.fits import constant_velocity, fit_velocities
-from slam.bodies.frame import Frame
-from slam.bodies.points import compact
+from slam.bodies.fits import constant_velocity, fit_velocities, measure
+from slam.bodies.frame import Frame, Setup
 from slam.bodies.regions import Region
-from slam.bodies.scene import LAG, Scene, classify_scene, displacements, known_well
-from slam.data import BoolArray, IndexArray
+from slam.bodies.scene import (
+    FARTHEST,
+    LAG,
+    Displacements,
+    Scene,
+    classify_scene,
+    displacements,
+    known_well,
+    places_in_view,
+    tail,
+)
+from slam.bodies.track_kernels import fit_fixed_points, inverses
+from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
-from slam.geometry.se3 import Array, points_by_pose
+from slam.geometry.pnp import measurement_rows
+from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
+_AROUND = 0.5  # of a group's extent in view, how far beyond it landmarks of unknown motion are taken for a part of it
+_LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
+_RIDGE = 1e-6  # numerics: share of the trace
 
 
 def find_groups(
@@ -28,11 +50,8 @@ def find_groups(
 ) -> tuple[Scene, IndexArray, list[tuple[int | None, IndexArray]]]:
     """Test the free tracks against the world, and the tracks on bodies against these; notes in place what is in doubt.
 
-    What moves otherwise than the body on which it lies is a part of that.
-
-    Returns:
-        the still world, as it appears to move; rows of tracks in groups that may move; and those that have moved alike
-        for some frames, each group with the id of the body that it is a part of, or None.
+    Returns the still world, as it appears to move; rows of tracks in groups that may move; and those groups that moved,
+    each with the id of the body that it is a part of, or None.
     """
     c = frame.setup.config
     least = LAG * frame.dt * c.min_speed
@@ -113,11 +132,10 @@ def moving_group(frame: Frame, tracks: Tracks, members: IndexArray) -> MovingGro
 
 
 def _with_common_twist(frame: Frame, tracks: Tracks, members: IndexArray) -> MovingGroup:
-    """Tracks with the twist that fits them best.
+    """Tracks with the twist of ``V = v + ω × r`` that fits them best over the window.
 
-    Velocities of a rigid body's points are ``V = v + ω × r``, linear in [ω, v]. Without a prior the depth noise of few,
-    close points would turn it wildly. The twist is the mean over the window: the present one differs by what a third of
-    its time allows.
+    A prior on ω keeps the depth noise of few, close points from turning it wildly. The present twist differs from the
+    mean by what a third of the window's time allows.
     """
     models = frame.setup.models
     motion = constant_velocity(tracks, members, frame.times, frame.setup.config.max_speed)
@@ -137,3 +155,55 @@ def region_group(frame: Frame, tracks: Tracks, region: Region) -> MovingGroup:
     P[3:, 3:] = region.covariance[3:, 3:]
     twist = np.concatenate([np.zeros(3), region.state[3:]])
     return MovingGroup(region.rows, tracks.position[region.rows].mean(axis=0), twist, P)
+
+
+def parting(
+    setup: Setup, tracks: Tracks, now: int, features: StereoFeatures, at: IndexArray, rows: IndexArray,
+    T_world_left: Array,
+) -> tuple[BoolArray, BoolArray]:  # fmt: skip
+    """Which landmarks `at` (K,), seen as features `rows`, part from the rest, or are too young and lie among those.
+
+    And which moved since they were first seen, in a run's first frames, in which means of tracks are no better: what
+    moves from the beginning on would else pull the camera along, and the world's axes with it.
+    """
+    c, t = setup.config, tracks
+    parts, moved = np.zeros((2, len(at)), bool)
+    z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
+    mine = np.flatnonzero((t.body[at] < 0) & (t.count(at) >= c.min_frames))
+    position, covariance = np.empty_like(t.position), np.empty_like(t.covariance)
+    fit_fixed_points(t.A, t.p, t.anchor, at[mine], position, covariance)
+    ages, seen = 1 + (now - 1 - np.arange(c.window)) % c.window, t.dof[at[mine]] > 0
+    age = (seen @ ages) / np.maximum(seen.sum(axis=1), 1)
+    mean = position[at[mine]], covariance[at[mine]]
+    known, view, scene = _compared(setup, T_world_left, *mean, age, z[mine], FARTHEST)
+    young = np.setdiff1d(np.arange(len(at)), mine[known])
+    local = transform(inverse(T_world_left), t.position[at[young]])
+    young, place = young[local[:, 2] > 0], places_in_view(local[local[:, 2] > 0])
+    for group in scene.groups:
+        parts[mine[known[group.members]]] = True
+        low, high = view[group.members].min(axis=0), view[group.members].max(axis=0)
+        beyond = _AROUND * (high - low)
+        parts[young] |= ((place > low - beyond) & (place < high + beyond)).all(axis=1)
+    if now < c.window:  # slots are frames
+        first = (t.dof[at] > 0).argmax(axis=1)
+        was = inverses(t.A[at, first], _RIDGE, 0.0)
+        known, _, scene = _compared(setup, T_world_left, t.anchor[at], was, now - first.astype(float), z, 0.0)
+        moved[known] = ~scene.rest | (scene.alone > c.doubtful * tail(scene.alone[scene.rest]))
+    return parts, moved
+
+
+def _compared(
+    setup: Setup, T_world_left: Array, before: Array, P: Array, age: Array, z: Array, far: float
+) -> tuple[IndexArray, Array, Scene]:
+    """How points `before` (N, 3), of covariances P (N, 3, 3), have moved in `age` (N,) frames to pixels z (N, 3).
+
+    Those with a depth of more than `far` deviations (K,), where the camera saw them (K, 3), and what that says of the
+    scene, in the noise of the rest.
+    """
+    points, A, dof = measure(setup.rig, T_world_left, before, z, setup.sigma)
+    local = transform(inverse(T_world_left), before)
+    known = np.flatnonzero((dof > 0) & (local[:, 2] > far * np.sqrt(np.trace(P, axis1=1, axis2=2))))
+    W = inverses(inverses(A[known], _RIDGE, 0.0) + P[known], _RIDGE, 0.0)
+    moved = Displacements(before[known] - T_world_left[:3, 3], (points - before)[known], W, age[known])
+    view, c = places_in_view(local[known]), setup.config
+    return known, view, classify_scene(moved, view, c.suspect, c.min_support, (_LEAST_NOISE / setup.sigma) ** 2)

@@ -1,8 +1,4 @@
-"""What tracks measured, as points in world coordinates, and how that fits a fixed point or a constant velocity.
-
-Sums over the window of `slam.tracks.table.Tracks` give the least-squares fixed point, the least-squares point with an
-even velocity, and the χ² of both.
-"""
+"""What tracks measured, as points in world coordinates, and how that fits a fixed point or a constant velocity."""
 
 from __future__ import annotations
 
@@ -28,18 +24,11 @@ EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain
 
 
 def measure(rig: StereoRig, T_world_left: Array, points: Array, measured: Array, sigma: float) -> tuple:
-    """Points (N, 3) measured by pixels, their information (N, 3, 3), and the number of measured values of each (N,).
+    """Points (N, 3) measured by pixels (N, 3), their information (N, 3, 3), and how many numbers were measured (N,).
 
-    Each is linearised on the measured ray, at the depth of the expected point: so the left pixel is met exactly, and
-    the depth is linear in the disparity and therefore free of bias; only where the expected point is far off, at the
-    measured depth. Rows whose uR is NaN have no information along the ray; unusable rows have none at all.
-
-    Args:
-        rig: the cameras, rectified.
-        T_world_left: pose (4, 4) of the left camera.
-        points: expected points (N, 3) in world coordinates.
-        measured: (N, 3) = (uL, vL, uR).
-        sigma: pixel noise [px].
+    Each is linearised on the measured ray, at the depth of the expected one of the `points` (N, 3): so the left pixel
+    is met exactly, and the depth is linear in the disparity and therefore free of bias; only where the expected point
+    is far off, at the measured depth. Rows whose uR is NaN have no information along the ray; unusable rows none.
     """
     found: tuple = points_on_rays(rig.rectified_parameters, T_world_left, points, measured, sigma, _TOO_FAR, _STEPS)
     return found
@@ -80,13 +69,9 @@ class ConstantVelocity:
 
 
 def constant_velocity(tracks: Tracks, rows: IndexArray, times: Array, max_speed: float) -> ConstantVelocity:
-    """Points with an even velocity, fitted to the windows of tracks.
+    """Points with an even velocity, fitted to windows of tracks whose slots have `times` (W,) less the present [s].
 
-    Args:
-        tracks: all tracks.
-        rows: which of them.
-        times: of the window's slots less the present (W,) [s].
-        max_speed: deviation of velocities before anything is known [m/s].
+    `max_speed` is the deviation of velocities before anything is known [m/s].
     """
     points, *rest = constant_velocities(tracks.A, tracks.p, rows, times, max_speed**-2)
     return ConstantVelocity(tracks.anchor[rows] + points, *rest)
@@ -110,17 +95,10 @@ def revise_tracks(
     tracks: Tracks, bodies: Mapping[int, Body], poses: Array, slot: int, rig: StereoRig,
     correct: Callable[[Array], Array],
 ) -> None:  # fmt: skip
-    """Move the points of all tracks to where their pixels say that they are, corrected again; in place.
+    """Move the points of all tracks, and of bodies, to where their pixels say that they are, corrected again; in place.
 
-    Without it a change of all disparities looks as if all that is far away had moved along the line of sight.
-
-    Args:
-        tracks: the tracks.
-        bodies: the bodies by id; their members' points move in them.
-        poses: T_world_left (W, 4, 4) in the frames of the window's slots.
-        slot: of the newest frame.
-        rig: the cameras.
-        correct: corrects rectified rows (uL, vL, uR) (N, 3) [px] again, as of `slam.calibration.model.Revision`.
+    Without it a change of all disparities looks as if all that is far away had moved along the line of sight. `poses`
+    (W, 4, 4) are the camera's by slot, `slot` is the newest.
     """
     rows, slots = np.nonzero(tracks.dof)
     points = tracks.anchor[rows] + tracks.p[rows, slots]

@@ -1,4 +1,4 @@
-"""What the detector's parts know of the frame in work."""
+"""What the detector's parts know of the frame in work, and the camera's last poses from any back end."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from slam.bodies.config import ObjectsConfig
-from slam.data import IdArray, IndexArray, RecentPoses, StereoFeatures
+from slam.data import Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
+from slam.interfaces import Backend, RecentBackend
 from slam.models import EstimatorModels, ObjectModels
 
 _SHARE = 0.05  # of the depth, as the radius of what may be a body where bodies have no least size
@@ -101,3 +102,48 @@ class Frame:
 
 
 NO_IDS: IdArray = np.zeros(0, np.int64)  #: none
+
+
+def with_estimate(
+    path: RecentPoses | None, estimate: Estimate, rig: StereoRig, sigma: float, landmarks: Array, most: int
+) -> RecentPoses:
+    """The online poses of the last frames, `most` at most, with the (6, 6) blocks of each frame's own noise.
+
+    That is what its `landmarks`, (M, 3) in camera coordinates, would leave uncertain if they were known.
+    """
+    information = np.linalg.inv(estimate.covariance + 1e-12 * np.eye(6))
+    if len(landmarks):
+        J = (rig.project_stereo(landmarks)[1] @ points_by_pose(landmarks)).reshape(-1, 6)
+        information = information + J.T @ J / sigma**2
+    own = np.linalg.inv(information)
+    n = 0 if path is None else min(len(path), most - 1)
+    blocks = np.zeros((6 * n + 6, 6 * n + 6))
+    blocks[-6:, -6:] = own
+    if path is None or n == 0:
+        return RecentPoses(np.array([estimate.stamp]), estimate.T_world_left[None], blocks)
+    blocks[:-6, :-6] = path.covariance[-6 * n :, -6 * n :]
+    return RecentPoses(
+        np.append(path.stamps[-n:], estimate.stamp), np.concatenate([path.poses[-n:], estimate.T_world_left[None]]),
+        blocks,
+    )  # fmt: skip
+
+
+def recent_poses(backend: Backend, n: int, path: RecentPoses, covariance: Array) -> RecentPoses:
+    """The camera's last n poses as the back end gives them, or else by its online poses.
+
+    Over a few frames nearly all of an online pose's uncertainty is one error that they share: the place in the map. So
+    a pose is off by what the newest is off, carried along, and by the two frames' own noises (`with_estimate`). The
+    newest pose has just its covariance (6, 6). A back end that has corrected its past may give fewer poses for a while.
+    """
+    k = len(path)
+    if isinstance(backend, RecentBackend):
+        recent = backend.recent(n)
+        if len(recent) >= min(n, k):
+            return recent
+    by_newest = adjoint(inverse(path.poses) @ path.poses[-1])  # of a common error, as each pose's perturbation
+    newest = path.covariance[-6:, -6:]
+    stacked = by_newest.reshape(6 * k, 6)
+    P = stacked @ covariance @ stacked.T
+    earlier = stacked[:-6]
+    P[:-6, :-6] += earlier @ newest @ earlier.T + path.covariance[:-6, :-6]
+    return RecentPoses(path.stamps, path.poses, P)

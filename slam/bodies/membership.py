@@ -1,11 +1,13 @@
-"""Which tracks belong to a body, and which features lie on it.
+"""Which tracks belong to a body, which features lie on it, and which bodies are one.
 
 A track's measurements are compared with a fixed point in the world and with a fixed point in the body. The difference
-of the two χ² over the window, a log-likelihood ratio, decides.
+of the two χ² over the window, a log-likelihood ratio, decides. What lies in the extent of an older body and went with
+it is a part of it; a young body that shows more of a thing than the older one takes that one's place.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -13,11 +15,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.bodies.bodies import Body, in_body_axes, with_extent
+from slam.bodies.belief import MAX_REJECTIONS
+from slam.bodies.bodies import Body, continued, in_body_axes, with_extent
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.points import MAX_REJECTIONS
 from slam.bodies.track_kernels import inverses, squares, weighted_means
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray
@@ -43,6 +45,8 @@ _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is
 _RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
 _LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
+_MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
+_DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +75,7 @@ def _limits(most: int) -> Array:
 
 
 def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Body:
-    """A new body with its poses over the window and its extent fitted to what tracks measured.
-
-    A constant velocity is only the first guess for a body that starts to move: poses and points are improved in turn.
-    """
+    """A new body with its poses over the window, which were those of a constant velocity, fitted to tracks."""
     body = _with_poses_fitted(replace(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
     points, A, _ = in_body_axes(body, tracks, rows)
     return with_extent(replace(body, T=body.history[slot]), weighted_means(points, A))
@@ -121,11 +122,8 @@ def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
 def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> dict[int, Array]:
     """Add the tracks that fit a measured body to its members, and remove those that do not, in place.
 
-    Inside a body that stereo resolves no proof of motion is needed. For bodies farther away depth noise is larger than
-    the body, so that all around it seems to lie inside.
-
-    Returns:
-        by body, by how much χ² it explains its seen members better than the still world (K,).
+    Inside a body that stereo resolves no proof of motion is needed. Returns by how much χ² each body explains its seen
+    members better than the still world (K,).
     """
     gains, config = {}, frame.setup.config
     bodies = {id: body for id, body in every.items() if body.measured}
@@ -166,9 +164,9 @@ def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[n
 
 
 def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
-    """Remove members that do not fit the body, in place; returns the gain of the seen ones that stay (K,).
+    """Remove members that do not fit the body, in place.
 
-    That is the `MembershipTest.gain` less what the body's poses, fitted to its members, gain by chance.
+    Returns the gains of the seen ones that stay (K,), less what the body's poses, fitted to them, gain by chance.
     """
     mine = np.flatnonzero(tracks.body == body.id)
     v, seen = membership_test(body, tracks, mine), tracks.found[mine]
@@ -200,11 +198,7 @@ def take_to(tracks: Tracks, rows: NDArray[np.intp], change: Array) -> None:
 def tracks_on_bodies(
     bodies: Mapping[int, Body], tracks: Tracks, margin: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of seen tracks that lie on a body, members or not, and of those near one that may lie on it.
-
-    A track inside a body's extent lies on it, unless it is known to stand still. Tracks on a body that is not proven
-    yet belong to the second group.
-    """
+    """Rows of seen tracks on a proven body, members or inside its extent, and of those that may lie on any body."""
     seen, known = tracks.found, tracks.body >= 0
     on = np.zeros(len(tracks), bool)
     for body in bodies.values():
@@ -280,9 +274,8 @@ def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
 def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
     """How far tracks of two bodies are from having moved like one rigid body; from 1 on they have not.
 
-    It is the increase of χ² if all tracks share the poses of one body, in the frames in which both bodies are known,
-    relative to the larger of two limits: the increase by chance (99 %), and that by motions that differ by the share
-    `_UNLIKE`. The second is needed for fast bodies, because errors of stereo are correlated over successive frames.
+    The increase of χ² if all share the poses of one, relative to the larger of its 99 % limit and that of motions that
+    differ by the share `_UNLIKE`, since errors of stereo are correlated over successive frames.
     """
     both = one.known & other.known
     one, other = replace(one, known=both), replace(other, known=both)
@@ -298,10 +291,7 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
 
 
 def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float) -> Array:
-    """Squared distances (N,) of free tracks from a body's extent, in units of their own noise.
-
-    The extent is widened by `margin`, a share of what it measures across.
-    """
+    """Squared distances (N,) of tracks from a body's extent, widened by a share `margin`, in their own noise."""
     wider = margin * body.across
     local = transform(inverse(body.T), tracks.position[rows])
     away = (local - np.clip(local, body.lower - wider, body.upper + wider)) @ body.T[:3, :3].T
@@ -323,3 +313,68 @@ def _improve(body: Body, tracks: Tracks, slot: int) -> None:
 def _still(tracks: Tracks, rows: NDArray[np.intp], known: BoolArray) -> Array:
     """χ² (N,) of "one fixed point in the world" in the slots of tracks that are `known` (N, W)."""
     return squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))
+
+
+def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
+    """Merge bodies that move as an older one does, in place: young ones at once, others only if that lasts.
+
+    The parts of an articulated body move alike now and then.
+    """
+    for id in sorted(bodies, reverse=True):
+        body = bodies.get(id)  # it may have taken the place of another
+        if body is None or not body.measured:
+            continue
+        mine = _members(tracks, id)
+        whole = bodies.get(-1 if body.apart_from is None else body.apart_from)
+        if whole is not None and whole.measured and whole.id not in body.distinct:
+            body = bodies[id] = _told_apart(body, mine, whole, _members(tracks, whole.id), tracks)
+        older = {id: b for id, b in bodies.items() if id < body.id and id not in body.distinct}
+        whole = body_around(older, tracks, mine, body)
+        alike = body.alike + 1 if whole is not None else 0
+        body = bodies[id] = replace(body, alike=alike) if alike != body.alike else body
+        young = body.seen < _MERGES and (whole is None or whole.id != body.apart_from)
+        if whole is not None and (young or alike > _MERGES):
+            add_members(whole, tracks, mine, sure=True)
+            del bodies[id]
+            tracks.give_up(np.flatnonzero(tracks.body == id))
+        elif whole is None and young:
+            _outgrow(bodies, body, list(older.values()), tracks)
+
+
+def _outgrow(bodies: dict[int, Body], body: Body, older: list[Body], tracks: Tracks) -> None:
+    """Let a young body replace older ones with the same motion of which fewer members are seen."""
+    for known in older:
+        mine, theirs = _members(tracks, body.id), _members(tracks, known.id)
+        if not known.measured or known.id == body.apart_from or len(theirs) >= len(mine):
+            continue
+        if math.dist(body.middle, known.middle) > body.across + known.across:
+            continue
+        if not moves_with(body, tracks, theirs):
+            continue
+        body = bodies[body.id] = _told_apart(body, mine, known, theirs, tracks)
+        if known.id not in body.distinct and distinctness(body, mine, known, theirs, tracks) < 1.0:
+            bodies[known.id] = _in_place_of(known, body, theirs, tracks)
+            tracks.body[tracks.body == body.id] = known.id
+            del bodies[body.id]
+            return
+
+
+def _told_apart(body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks) -> Body:
+    """A body that knows of another one, if their seen members have moved apart by now: they are never one again."""
+    apart = distinctness(body, mine, other, theirs, tracks) > _DISTINCT
+    return replace(body, distinct=body.distinct | {other.id}) if apart else body
+
+
+def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks) -> Body:
+    """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
+    tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.found))
+    grown = continued(body, known)
+    own = np.flatnonzero(tracks.body == body.id)
+    take_to(tracks, own, inverse(grown.T) @ body.T)
+    add_members(grown, tracks, mine, sure=True)
+    return grown
+
+
+def _members(tracks: Tracks, id: int) -> NDArray[np.intp]:
+    """Rows of a body's seen members."""
+    return np.flatnonzero((tracks.body == id) & tracks.found)

@@ -87,14 +87,8 @@ def with_frame(
     """The evidence that a body moves still, after one more frame, and what this frame counts for its `PROOF`.
 
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
-
-    Args:
-        evidence: before.
-        moved: how far the members (N,) went.
-        scene: the still world, as it appears to move.
-        way: where the body was.
-        left: what the left image says, see `by_left_image`; zero for a body that is proven.
-        far: whether it was followed for farther than it is wide: then its way alone counts.
+    `left` is what the left image says; for a body that was followed `far`, for farther than it is wide, its way alone
+    counts.
     """
     by_frames = -float(np.log10(max(_by_frames(way), 10.0**-_MOST)))
     by_members = 0.0

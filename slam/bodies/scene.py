@@ -86,15 +86,10 @@ def displacements(
     tracks: Tracks, rows: IndexArray, ages: IndexArray, centres: Array, slide: float,
     body: tuple[Array, Array, BoolArray] | None = None,
 ) -> Displacements:  # fmt: skip
-    """How far tracks (N,) went in the world, or in the axes of a body.
+    """How far tracks (N,) went in the world, or in the axes of a body, given what they measured in these.
 
-    Args:
-        tracks: all tracks.
-        rows: which of them.
-        ages: of the window's slots in frames (W,).
-        centres: positions of the left camera by slot (W, 3).
-        slide: variance of a feature's direction with the angle from which it is seen [rad].
-        body: what they measured in its axes, from `slam.bodies.bodies.in_body_axes`; None for the world.
+    The window's slots have `ages` (W,) in frames, and the camera was at `centres` (W, 3); `slide` is the variance of a
+    feature's direction with the angle from which it is seen [rad].
     """
     t = tracks
     rays = t.position[rows] - centres[int(np.argmin(ages))]
@@ -129,15 +124,10 @@ def limit(test: float, size: IndexArray | int) -> Array:
 
 
 def classify_scene(moved: Displacements, place: Array, test: float, support: int, least_scale: float = 1.0) -> Scene:
-    """Groups that moved on their own, and every track's displacement against the rest.
+    """Groups of `support` tracks at least that moved on their own, and every track's displacement against the rest.
 
-    Args:
-        moved: displacements of the tracks.
-        place: where tracks are seen (N, 3): x/z, y/z, and log z.
-        test: χ²(6) from which a large group moved; see `limit`.
-        support: least number of tracks in a group.
-        least_scale: every χ² is divided by the ratio of the rest's median to what it should be, and by this at least;
-            below 1 the noise may turn out smaller than modelled.
+    Tracks are seen at `place` (N, 3): x/z, y/z, log z; `test` is the χ²(6) from which a large group moved. Every χ² is
+    divided by the ratio of the rest's median to what it should be, and by `least_scale` at least.
     """
     n = len(moved.d)
     if n < 3 * support:
@@ -164,8 +154,7 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
 def _full_windows(place: Array, support: int) -> tuple[IndexArray, IndexArray, Array, Array]:
     """Windows with enough tracks, of every size, each half a width from the next along every axis.
 
-    Returns:
-        starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
+    As starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
     """
     at = place.T[:, None, None] / _SIZES.T[:, :, None, None] + [[0.0], [0.5]]
     x, y, z = np.clip(np.floor(at).astype(np.int64) + _CELLS // 2, 0, _CELLS - 1)  # (S, 2, N) each, the 2 of offsets
@@ -192,9 +181,5 @@ def _mean_gap(moved: Displacements, rows: IndexArray, common: Array) -> float:
 
 
 def tail(alone: Array) -> float:
-    """How much heavier the tail of tracks' χ²(3) is than it should be, 1 at least.
-
-    The errors of a track last for some frames where a camera goes around what it sees, and those of false tracks are
-    of any size. Where that is so in the whole scene, small groups of such tracks agree by chance.
-    """
+    """How much heavier the tail of tracks' χ²(3) is, 1 at least: small groups agree by chance then."""
     return max(1.0, float(np.quantile(alone, 0.75)) / _UPPER_QUARTILE) if len(alone) else 1.0

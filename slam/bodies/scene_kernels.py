@@ -201,22 +201,10 @@ def _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, la
 def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, support, least_scale):
     """Groups of tracks that moved alike, and otherwise than the rest: the clearest first, until there is none.
 
-    Args:
-        L: Λ of the tracks (N, 21).
-        eta: η of the tracks (N, 6).
-        dWd: ``dᵀ W d`` of the tracks (N,).
-        place: where they are seen (N, 3).
-        starts: of the windows in the list of their tracks (M + 1,).
-        tracks: that list.
-        centres: of the windows (M, 3), and
-        widths: theirs (M, 3).
-        asked: χ²(6) from which a window with so many tracks moved (N + 1,).
-        support: least number of tracks in a group.
-        least_scale: least ratio of the rest's median χ² to what it should be, by which all are divided.
-
-    Returns:
-        the group of each track (N,), −1 for the rest; χ²(6) of each group (G,); χ²(3) of every track against the rest
-        (N,); the rest's common motion (6,); and the ratio by which χ² was divided.
+    Tracks have sums as of `normal_equations` and are seen at `place` (N, 3). Windows of `centres` and `widths` (M, 3)
+    have `starts` (M + 1,) in the list of their `tracks`; `asked` (N + 1,) is the χ²(6) from which one with so many
+    moved. Returns the group of each track (N,), −1 for the rest; χ²(6) of each group (G,); χ²(3) of every track against
+    the rest (N,); the rest's common motion (6,); and the ratio by which χ² was divided, `least_scale` at least.
     """
     n = len(dWd)
     work = np.empty(n), np.empty(21), np.empty(6), np.empty(21), np.empty((6, 6))

@@ -76,18 +76,10 @@ def fit_fixed_points(A, p, anchor, rows, position, covariance):
 
 @kernel
 def constant_velocities(A, p, rows, times, prior):
-    """Points with an even velocity that fit the windows best.
+    """Points (M, 3) at time 0 and even velocities (M, 3) [m/s] that fit the windows best, with their covariances.
 
-    Args:
-        A: information by slot.
-        p: points by slot.
-        rows: of the tracks.
-        times: of the slots (W,) [s]; the point is where it is at 0.
-        prior: information on each axis of the velocity before anything is known [s²/m²].
-
-    Returns:
-        points (M, 3) and their covariances (M, 3, 3), velocities (M, 3) [m/s] and theirs (M, 3, 3), and χ²(3) of the
-        velocities (M,).
+    And χ²(3) of the velocities (M,). Slots have `times` (W,) [s]; `prior` is the information on each axis of the
+    velocity before anything is known [s²/m²].
     """
     n = len(rows)
     points, P, velocity, PV = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
@@ -126,22 +118,9 @@ def constant_velocities(A, p, rows, times, prior):
 def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, rays, centres, slide):
     """How far tracks went from the older to the recent frames of their windows: see `slam.bodies.scene`.
 
-    Args:
-        A: information by slot, and so on: see `slam.tracks.table.Tracks`.
-        p: points by slot.
-        dof: numbers measured by slot.
-        older_A: information of what has left the window.
-        older_b: the same times the points.
-        older_age: its ages, weighted.
-        rows: of the tracks.
-        ages: of the slots (W,) in frames.
-        most_recent: so many frames are recent, at most.
-        rays: from the camera to the tracks (M, 3).
-        centres: of the camera by slot (W, 3), in the same axes.
-        slide: variance of a feature's direction that comes with each angle by which it is seen otherwise [rad].
-
-    Returns:
-        displacements (M, 3), their information (M, 3, 3), and the lag (M,) in frames.
+    Slots have `ages` (W,) in frames, of which `most_recent` are recent at most; `rays` (M, 3) point from the camera,
+    which was at `centres` (W, 3), to the tracks. `slide` is the variance of a feature's direction with each angle by
+    which it is seen otherwise [rad]. Displacements (M, 3), their information (M, 3, 3), and lags (M,) [frames].
     """
     d, W, lag = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3)), np.empty(len(rows))
     now, before, P_now, P_before = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -243,19 +222,9 @@ def _square(points, A, mean):
 
 @kernel
 def windows_in_body(A, p, dof, anchor, rows, history, known):
-    """What tracks measured, in the coordinates of a body.
+    """What tracks measured, in the coordinates of a body with poses `history` (W, 4, 4) at the slots `known` (W,).
 
-    Args:
-        A: information by slot.
-        p: points by slot, relative to the anchors.
-        dof: numbers measured by slot.
-        anchor: of the tracks, in world coordinates.
-        rows: of the tracks.
-        history: poses of the body by slot (W, 4, 4).
-        known: at which slots there is one (W,).
-
-    Returns:
-        points (M, W, 3), their information (M, W, 3, 3), and whether there is any (M, W).
+    Points (M, W, 3), their information (M, W, 3, 3), and whether there is any (M, W).
     """
     size = A.shape[1]
     points, turned = np.empty((len(rows), size, 3)), np.empty((len(rows), size, 3, 3))

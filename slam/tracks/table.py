@@ -169,7 +169,7 @@ class Tracks(LandmarkTable):
     expelled: BoolArray = _column(bool)
     # whether its feature stays at its pixel while the camera stands (N,): it belongs to no body
     still: BoolArray = _column(bool)
-    # frames for which, as a landmark, it is in doubt since it parted from the rest (N,), see `slam.bodies.parting`
+    # frames for which, as a landmark, it is in doubt since it parted from the rest (N,), see `slam.bodies.finder`
     parted: IdArray = _column(np.int64)
 
     @classmethod

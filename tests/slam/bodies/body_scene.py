@@ -9,8 +9,8 @@ import numpy as np
 
 import backends
 from slam.bodies.belief import BodyBelief
-from slam.bodies.camera import recent_poses, with_estimate
 from slam.bodies.estimator import FRAMES, BodyEstimator
+from slam.bodies.frame import recent_poses, with_estimate
 from slam.data import Observations
 from slam.evaluation.metrics import nees
 from slam.geometry import se3

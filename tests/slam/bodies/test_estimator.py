@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import least_squares
 
 import backends
-from slam.bodies.camera import recent_poses, with_estimate
 from slam.bodies.estimator import FRAMES, BodyEstimator
+from slam.bodies.frame import recent_poses, with_estimate
 from slam.data import RecentPoses
 from slam.errors import ConfigurationError
 from slam.evaluation.metrics import chi_square_band

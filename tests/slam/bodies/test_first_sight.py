@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.bodies.belief import slid
+from slam.bodies.belief import shape_of, slid
 from slam.bodies.estimator import FRAMES
-from slam.bodies.points import shape_of
 from slam.window.problem import Carried
 from slam.window.stereo import RectifiedStereo
 from tests.slam.bodies.body_scene import box_scene

@@ -13,7 +13,7 @@ from slam.bodies import membership
 from slam.bodies.bodies import Body, continued, new_body, with_extent
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.fits import fit_positions
-from slam.bodies.merging import merge
+from slam.bodies.membership import merge
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse, transform

@@ -11,8 +11,8 @@ from slam.bodies import membership
 from slam.bodies.bodies import new_body, with_extent
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.estimator import BodyEstimator
+from slam.bodies.following import located
 from slam.bodies.frame import Frame, Setup
-from slam.bodies.recovery import located
 from slam.data import RecentPoses, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp, transform
