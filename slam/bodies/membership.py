@@ -28,7 +28,7 @@ from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
-_MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
+_MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
 _PART_EXPLAINED = 0.05  # share of χ² that the motion of a body leaves of what was found of it before
 _FREEDOM = 6.0  # fixed: of a body's pose in every frame
 PROBATION = 12  #: frames in which a body must have moved for certain, and is not told from another one
@@ -227,7 +227,8 @@ def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
 def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
     """The body in whose extent most of these tracks lie, if it moves as `own`, a body made of them alone; else None."""
     for body in bodies.values():
-        near = _distances(body, tracks, rows, _MERGED) < _NEAR
+        wider = _MERGED * (1.0 + own.across / body.across)
+        near = _distances(body, tracks, rows, wider) < _NEAR
         if not body.measured or 2 * near.sum() <= len(rows) or _explained(body, tracks, rows) >= 2 * EXPLAINED:
             continue
         theirs = np.flatnonzero((tracks.body == body.id) & tracks.found)
