@@ -31,16 +31,16 @@ _LARGEST = 20.0  # χ² that counts of the typical member: many members share on
 _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
 
 
-_FAR = 4.0  # so many times the median distance from the median point is no part of the body
+_FAR = 3.0  # so many times the median distance from the median point is no part of the body
 MIN_POINTS = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
 MAX_REJECTIONS = 3  #: so many running, and a point restarts
 _STEPS = 3  # numerics: of Gauss-Newton; the prior is weak where depth is known well
 
 
-def compact(points: Array, far: float) -> BoolArray:
-    """Which of the points (N, 3) lie less than `far` times the median distance from their median point."""
+def compact(points: Array) -> BoolArray:
+    """Which of the points (N, 3) lie near their median point."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else np.zeros(0)
-    return np.asarray(distance <= far * np.median(distance) if len(points) else np.zeros(0, bool))
+    return np.asarray(distance <= _FAR * np.median(distance) if len(points) else np.zeros(0, bool))
 
 
 def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
@@ -52,7 +52,7 @@ def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
     world = transform(T_world_left, h)
     seen = np.isfinite(world).all(axis=1)
     near = np.zeros(len(h), bool)
-    near[seen] = compact(world[seen], _FAR)
+    near[seen] = compact(world[seen])
     T = np.eye(4)
     T[:3, 3] = world[near].mean(axis=0)
     return T, near

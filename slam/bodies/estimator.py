@@ -51,16 +51,12 @@ _LEAST = 2  # points that must agree with a body that has more: one agrees with 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Observations of a body in the rectified rig: `z` (M, 3), and where they triangulate to, `local` (M, 3)."""
+    """Observations of a body in the rectified rig."""
 
     given: ObjectObservations
-    z: Array
-    local: Array
-
-    @property
-    def deep(self) -> BoolArray:
-        """Which have a depth (M,)."""
-        return np.asarray(np.isfinite(self.local).all(axis=1))
+    z: Array  # pixels (M, 3)
+    local: Array  # where they triangulate to (M, 3)
+    deep: BoolArray  # which have a depth (M,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +88,11 @@ class BodyEstimator:
         A body of which nothing is known, or of which nothing agrees with what is known though it was located
         (`ObjectObservations.T_world_object`), begins anew, if at least three points have a depth; else it stays None.
         """
-        measured = None if seen is None else self._measured(seen)
-        after = None
+        measured = after = None
+        if seen is not None:
+            z = self.stereo.measure(Observations(seen.points, seen.uv_left, seen.uv_right))
+            local = self.stereo.triangulate(z)
+            measured = _Seen(seen, z, local, np.isfinite(local).all(axis=1))
         if belief is not None and len(cameras) > 1:
             with suppress(np.linalg.LinAlgError):
                 after = self._followed(belief, id, measured, cameras)
@@ -102,12 +101,6 @@ class BodyEstimator:
             with suppress(np.linalg.LinAlgError):
                 return self._begun(id, measured, cameras) or after
         return after
-
-    # --- parts ---
-
-    def _measured(self, seen: ObjectObservations) -> _Seen:
-        z = self.stereo.measure(Observations(seen.points, seen.uv_left, seen.uv_right))
-        return _Seen(seen, z, self.stereo.triangulate(z))
 
     def _begun(self, id: int, seen: _Seen, cameras: RecentPoses) -> BodyBelief | None:
         """A new belief: the body's frame is put where it is said to be, or at the mean of its points."""
@@ -137,11 +130,12 @@ class BodyEstimator:
             b = slid(b, self.stereo, carried(b, earlier, self.models), self.drift)
             cameras, earlier = _of(cameras, cameras.stamps[1:]), _of(cameras, b.stamps)
         expected = self._expected(b, cameras)
-        after = None if seen is None else self._corrected(b, expected, id, seen, cameras)
-        if after is not None:
-            return after
-        none = np.zeros(0, np.int64)
-        rejected = none if seen is None else np.sort(seen.given.points[isin(seen.given.points, b.points.ids)])
+        rejected = none = np.zeros(0, np.int64)
+        if seen is not None:
+            after = self._corrected(b, expected, id, seen, cameras)
+            if after is not None:
+                return after
+            rejected = np.sort(seen.given.points[isin(seen.given.points, b.points.ids)])
         return self._reported(self._predicted(expected.belief, cameras), id, cameras, False, none, rejected)
 
     def _corrected(

@@ -39,7 +39,6 @@ from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
-_FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 _AROUND = 0.5  # of a group's extent in view, how far beyond it landmarks of unknown motion are taken for a part of it
 _LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
 _RIDGE = 1e-6  # numerics: share of the trace
@@ -117,7 +116,7 @@ class MovingGroup:
 
 def moving_group(frame: Frame, tracks: Tracks, members: IndexArray) -> MovingGroup | None:
     """Those of the tracks `members` (K,) that lie together and move alike; None if they are too few or too far."""
-    members = members[compact(tracks.position[members], _FAR)]
+    members = members[compact(tracks.position[members])]
     for _ in range(_ROUNDS + 1):
         if len(members) < frame.setup.config.min_support:
             return None

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
+from slam.bodies.belief import MIN_POINTS
 from slam.bodies.bodies import Body
 from slam.bodies.fits import EXPLAINED, times_vectors
 from slam.bodies.frame import Frame
@@ -39,7 +40,6 @@ _SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to ag
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
 _MOST = 40.0  # numerics: of the evidence of a frame
-_LEAST = 4  # members and frames, for a scatter
 _MEDIAN = chi_square_limit(3, 0.5)  # of χ²(3)
 _LASTS = 0.2  # [px] of the left image's errors that all features near one another share: those of a good calibration
 _TINY = 1e-9  # numerics: of squared angles
@@ -92,7 +92,7 @@ def with_frame(
     """
     by_frames = -float(np.log10(max(_by_frames(way), 10.0**-_MOST)))
     by_members = 0.0
-    if len(moved.d) >= _LEAST:
+    if len(moved.d) >= MIN_POINTS:
         by_members = -float(np.log10(max(_by_members(moved, scene, way.by_rig), 10.0**-_MOST)))
         evidence = max(0.0, evidence + (by_frames if far else min(by_frames, by_members)) - _ALLOWANCE)
     if by_frames >= way.bar and (far or by_members >= way.bar):
@@ -126,10 +126,10 @@ def by_left_image(tracks: Tracks, rows: IndexArray, frame: Frame, scene: Scene) 
     that all share: of the camera's motion, and of the lens. It is worth nothing where the second explains nearly all
     that it does.
     """
-    rows = rows[np.count_nonzero(tracks.dof[rows], axis=1) >= _LEAST]
+    rows = rows[np.count_nonzero(tracks.dof[rows], axis=1) >= MIN_POINTS]
     known, n = tracks.dof[rows] > 0, len(rows)
     dof = int(2 * known.sum()) - 3 * n - 3
-    if n < _LEAST or dof < _LEAST:
+    if n < MIN_POINTS or dof < MIN_POINTS:
         return 0.0
     eyes, ages, each = frame.poses[:, :3, 3], frame.ages, np.arange(n)
     frames = float(ages[np.isfinite(frame.stamps)].max())
@@ -171,7 +171,7 @@ def by_left_image(tracks: Tracks, rows: IndexArray, frame: Frame, scene: Scene) 
 def _by_frames(way: Way) -> float:
     """Probability of so long a way, even or evenly accelerated, if it is chance, as the scatter about it is."""
     n = len(way.places)
-    if n < _LEAST:
+    if n < MIN_POINTS:
         return 1.0
     t = way.times - way.times.mean()
     basis, _ = np.linalg.qr(np.stack([np.ones(n), t, t * t], axis=1))

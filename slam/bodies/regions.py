@@ -22,9 +22,7 @@ from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
 _NEAR = 7.8  # derived: χ²(3) at 95 %, of tracks inside the region
-_FRAMES = 4  # in which a region has had the tracks that fix a motion
 _SHARE = 0.6  # of the tracks inside that must agree with it
-_PATIENCE = 3  # frames for which a region is followed without a track
 _OVERLAP = 3.0  # velocities of successive frames come from the same window: their covariance is larger by so much
 
 
@@ -59,7 +57,7 @@ class Region:
         is seen shares the error of the camera's pose, so that does not fall with the number of tracks.
         """
         share = self.agreeing > _SHARE * (self.agreeing + self.contradicting)
-        if len(self.rows) < MINIMAL_POINTS or self.frames < _FRAMES or not share:
+        if len(self.rows) < MINIMAL_POINTS or self.frames < frame.setup.config.min_frames or not share:
             return False
         moved = self.state[:3] - self.start
         length = float(np.linalg.norm(moved))
@@ -120,7 +118,7 @@ def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> list[
         mine &= t.unexplained(r.state[3:], r.covariance[3:, 3:]) <= AGREES
         free &= ~mine
         r = _supported(r, t, mine)
-        if r.unseen <= _PATIENCE:
+        if r.unseen <= frame.setup.config.patience:
             followed.append(r)
     return followed + _new_regions(t, np.flatnonzero(free))
 
