@@ -92,7 +92,7 @@ class BodyEstimator:
         if seen is not None:
             z = self.stereo.measure(Observations(seen.points, seen.uv_left, seen.uv_right))
             local = self.stereo.triangulate(z)
-            measured = _Seen(seen, z, local, np.isfinite(local).all(axis=1))
+            measured = _Seen(seen, z, local, np.asarray(np.isfinite(local).all(axis=1)))
         if belief is not None and len(cameras) > 1:
             with suppress(np.linalg.LinAlgError):
                 after = self._followed(belief, id, measured, cameras)

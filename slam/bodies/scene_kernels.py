@@ -16,7 +16,7 @@ from slam.runtime.compilation import helper, kernel
 PRIOR = np.array([1e-4] * 3 + [1e-6] * 3)  #: keeps Λ of nearly collinear tracks invertible [1/rad², 1/m²]
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
 _SOFT, _SHARP = 3, 2  # numerics: rounds of reweighting: Huber's first, which has one minimum, then a sharper one
-_LARGEST = 0.4  # share of all tracks that a body may have: the still world has most
+LARGEST = 0.4  #: share of all tracks that a body may have: the still world has most
 _FITS = 14.2  # derived: χ²(3) at 99.7 % of a member and its group's motion
 _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
 _BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
@@ -222,7 +222,7 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
             doubted[m] = not rest[m]
         if 3 * left < n or len(clear) == 0:
             break
-        _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, _LARGEST * left, clear)
+        _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, LARGEST * left, clear)
         found = 0
         for _ in range(_MOST):
             window = np.argmax(clear)
