@@ -35,7 +35,7 @@ from slam.bodies.scene_kernels import LARGEST
 from slam.bodies.track_kernels import fit_fixed_points, inverses
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
-from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
@@ -175,7 +175,7 @@ def parting(
     ages, seen = 1 + (now - 1 - np.arange(c.window)) % c.window, t.dof[at[mine]] > 0
     age = (seen @ ages) / np.maximum(seen.sum(axis=1), 1)
     mean = position[at[mine]], covariance[at[mine]]
-    known, view, scene = _compared(setup, T_world_left, *mean, age, z[mine], FARTHEST, MINIMAL_POINTS)
+    known, view, scene = _compared(setup, T_world_left, *mean, age, z[mine], FARTHEST)
     young = np.setdiff1d(np.arange(len(at)), mine[known])
     local = transform(inverse(T_world_left), t.position[at[young]])
     young, place = young[local[:, 2] > 0], places_in_view(local[local[:, 2] > 0])
@@ -187,28 +187,27 @@ def parting(
     if now < c.window:  # slots are frames
         first = (t.dof[at] > 0).argmax(axis=1)
         was = inverses(t.A[at, first], _RIDGE, 0.0)
-        known, _, scene = _compared(
-            setup, T_world_left, t.anchor[at], was, now - first.astype(float), z, 0.0, c.min_support
-        )
+        known, _, scene = _compared(setup, T_world_left, t.anchor[at], was, now - first.astype(float), z, 0.0)
         moved[known] = ~scene.rest | (scene.alone > c.doubtful * tail(scene.alone[scene.rest]))
     return parts, moved
 
 
 def _compared(
-    setup: Setup, T_world_left: Array, before: Array, P: Array, age: Array, z: Array, far: float, few: int
+    setup: Setup, T_world_left: Array, before: Array, P: Array, age: Array, z: Array, far: float
 ) -> tuple[IndexArray, Array, Scene]:
     """How points `before` (N, 3), of covariances P (N, 3, 3), have moved in `age` (N,) frames to pixels z (N, 3).
 
-    Those whose depth is more than `far` deviations (K,), where the camera saw them (K, 3), and what this says of groups
-    of a `few` or more, in the noise of the rest.
+    Those whose depth is more than `far` deviations (K,), where the camera saw them (K, 3), and the groups among them,
+    in the noise of the rest.
     """
+    c = setup.config
     points, A, dof = measure(setup.rig, T_world_left, before, z, setup.sigma)
     local = transform(inverse(T_world_left), before)
     known = np.flatnonzero((dof > 0) & (local[:, 2] > far * np.sqrt(np.trace(P, axis1=1, axis2=2))))
     W = inverses(inverses(A[known], _RIDGE, 0.0) + P[known], _RIDGE, 0.0)
     moved = Displacements(before[known] - T_world_left[:3, 3], (points - before)[known], W, age[known])
     view = places_in_view(local[known])
-    scene = classify_scene(moved, view, setup.config.suspect, few, (_LEAST_NOISE / setup.sigma) ** 2)
+    scene = classify_scene(moved, view, c.suspect, c.min_support, (_LEAST_NOISE / setup.sigma) ** 2)
     if (~scene.rest).sum() > LARGEST * len(known):  # then it is rather the poses before that are wrong
         scene = replace(scene, groups=[])
     return known, view, scene
