@@ -92,11 +92,9 @@ class ObjectDatabase:
                 points.astype(float), descriptors.astype(np.float32), np.sign(laplacian).astype(np.int8),
                 origin.astype(float),
             )  # fmt: skip
-        n = len(database.points)
-        if not (
-            database.points.shape == (n, 3) and database.origin.shape == (3,) and database.laplacian.shape == (n,)
-            and database.descriptors.ndim == 2 and len(database.descriptors) == n
-        ):  # fmt: skip
+        n = len(points)
+        shapes = points.shape, origin.shape, laplacian.shape, descriptors.shape[:1]
+        if shapes != ((n, 3), (3,), (n,), (n,)) or descriptors.ndim != 2:
             raise ConfigurationError(f"{source}: its arrays do not belong together")
         if not all((np.abs(a.astype(float)) < _FARTHEST).all() for a in arrays):
             raise ConfigurationError(f"{source}: a number is not finite, or impossibly large")
@@ -133,12 +131,9 @@ def body_frame(A: Array, B: Array, C: Array) -> Array:
 
 
 def why_degenerate(points: Array, least_side: float, least_sine: float) -> str:
-    """Why three points (3, 3) make no frame: one line, or empty where they do.
+    """Why points A, B, C (3, 3) [m] make no frame: one line, or empty where they do.
 
-    Args:
-        points: A, B, C, a row each [m].
-        least_side: least distance of two of them [m].
-        least_sine: least sine of every angle of the triangle.
+    Two of them are at least `least_side` [m] apart, and every angle has a sine of at least `least_sine`.
     """
     if not np.isfinite(points).all():
         return "a point has no depth"
@@ -164,18 +159,10 @@ def detect(
     features: StereoFeatures, matches: tuple[NDArray[np.intp], NDArray[np.intp]], points: Array,
     database: ObjectDatabase, least_side: float, least_sine: float,
 ) -> ObjectMotion:  # fmt: skip
-    """The object's motion by Procedure 1.
+    """The object's motion by Procedure 1, from `matches` of the database's rows and the features' (K,) (step c).
 
-    The three matched features with the largest determinant (of the Hessian, the detector's response) are taken (step
-    a); where they make no frame, the next ones.
-
-    Args:
-        features: of the current scene.
-        matches: rows of the database and of the features that correspond (step c).
-        points: positions (K, 3) of the matched features in world coordinates [m].
-        database: of the object.
-        least_side: see `why_degenerate`.
-        least_sine: likewise.
+    The three with the largest determinant (of the Hessian, the detector's response) are taken (step a); where they make
+    no frame, see `why_degenerate`, the next ones. `points` (K, 3) are the features' in world coordinates [m].
     """
     known, rows = matches
     if len(rows) < 3:
@@ -217,13 +204,8 @@ def _placed(current: Array, initial: Array, origin: Array) -> Array:
 class Procedure1Detector(ObjectDetector):
     """The papers' detector in the system's place for one; the object is number 1.
 
-    Its body frame lies in the database's origin, along the world's axes in the initial scene.
-
-    Args:
-        rig: the cameras.
-        config: settings; `database` names the file of the object's features where none is given.
-        models: pixel noise.
-        database: the object's features.
+    Its body frame lies in the database's origin, along the world's axes in the initial scene. Without a `database` the
+    file that the settings name is read.
     """
 
     def __init__(
