@@ -35,15 +35,10 @@ _DEPTHS = 0.2  # share of the depth by which stereo may be off
 def follow(tracks: Tracks, bodies: Mapping[int, Body], frame: Frame) -> None:
     """Find the features of the tracks that have none yet; sets rows, looks and misses, in place.
 
-    A landmark that was found has its feature already. The others are looked for where their fit (or their body's
-    motion) says, in windows as wide as that is uncertain. What is left, and was not known for long enough to have a
-    velocity, is looked for as far off as `max_speed` allows.
-
-    Members of bodies take over their feature's descriptor even if `slam.bodies.following.located` does not confirm the
-    match afterwards, because the body's pose is wrong more often than the match. Members of a body that was not
-    measured in the last frame keep theirs: otherwise they would take over descriptors of what occludes the body.
-    Features matched with them stay available to free tracks until the body is located. Otherwise nothing that newly
-    comes into view of such a body would be detected.
+    Tracks are looked for where their fit, or their body's motion, says, in windows as wide as that is uncertain; then
+    those too young to have a velocity as far off as `max_speed` allows. Members of a body that was not measured in the
+    last frame keep their descriptors, which would else become those of what occludes the body, and leave the features
+    that they match to free tracks: they may newly come into view.
     """
     alive = np.flatnonzero(tracks.number >= 0)
     _advance(tracks, bodies, alive, frame.dt)

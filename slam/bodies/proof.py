@@ -119,12 +119,10 @@ def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> float:
 def by_left_image(tracks: Tracks, rows: IndexArray, frame: Frame, scene: Scene) -> float:
     """What the left image alone says of tracks (N,): −log10 of the chance that they stand still, at whatever depth.
 
-    What stereo matched wrongly, a wall for instance with the right pixel of the rail before it, moves as the camera
-    does, smoothly and with all its neighbours; but to the left camera it stands still, at another depth. So three
-    hypotheses are compared: points that stand still at the depth that stereo says, at any depth, and with a velocity
-    that all of them share. The third is tested against the second by an F test, and by what it says against errors
-    that all share: of the camera's motion, and of the lens. It is worth nothing where the second explains nearly all
-    that it does.
+    What stereo matched wrongly, a wall with the right pixel of the rail before it, moves as the camera does, smoothly
+    and with all its neighbours; but to the left camera it stands still, at another depth. So an even velocity that all
+    points share is tested against points that stand still at any depth, by an F test, and against errors that all
+    share: of the camera's motion, and of the lens. It is worth nothing where the second explains nearly all of it.
     """
     rows = rows[np.count_nonzero(tracks.dof[rows], axis=1) >= MIN_POINTS]
     known, n = tracks.dof[rows] > 0, len(rows)
