@@ -327,8 +327,11 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
             continue
         mine = _members(tracks, id)
         whole = bodies.get(-1 if body.apart_from is None else body.apart_from)
-        if whole is not None and whole.measured and whole.id not in body.distinct:
-            body = bodies[id] = _told_apart(body, mine, whole, _members(tracks, whole.id), tracks)
+        if (
+            whole is not None and whole.measured and whole.id not in body.distinct
+            and distinctness(body, mine, whole, _members(tracks, whole.id), tracks) > _DISTINCT
+        ):  # fmt: skip
+            body = bodies[id] = replace(body, distinct=body.distinct | {whole.id})
         older = {id: b for id, b in bodies.items() if id < body.id and id not in body.distinct}
         whole = body_around(older, tracks, mine, body)
         alike = body.alike + 1 if whole is not None else 0
@@ -346,24 +349,18 @@ def _outgrow(bodies: dict[int, Body], body: Body, older: list[Body], tracks: Tra
     """Let a young body replace older ones with the same motion of which fewer members are seen."""
     for known in older:
         mine, theirs = _members(tracks, body.id), _members(tracks, known.id)
-        if not known.measured or known.id == body.apart_from or len(theirs) >= len(mine):
+        larger = known.measured and known.id != body.apart_from and len(theirs) < len(mine)
+        near = math.dist(body.middle, known.middle) <= body.across + known.across
+        if not (larger and near and moves_with(body, tracks, theirs)):
             continue
-        if math.dist(body.middle, known.middle) > body.across + known.across:
-            continue
-        if not moves_with(body, tracks, theirs):
-            continue
-        body = bodies[body.id] = _told_apart(body, mine, known, theirs, tracks)
-        if known.id not in body.distinct and distinctness(body, mine, known, theirs, tracks) < 1.0:
+        apart = distinctness(body, mine, known, theirs, tracks)
+        if apart > _DISTINCT:  # they are never one again
+            body = bodies[body.id] = replace(body, distinct=body.distinct | {known.id})
+        elif apart < 1.0:
             bodies[known.id] = _in_place_of(known, body, theirs, tracks)
             tracks.body[tracks.body == body.id] = known.id
             del bodies[body.id]
             return
-
-
-def _told_apart(body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks) -> Body:
-    """A body that knows of another one, if their seen members have moved apart by now: they are never one again."""
-    apart = distinctness(body, mine, other, theirs, tracks) > _DISTINCT
-    return replace(body, distinct=body.distinct | {other.id}) if apart else body
 
 
 def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks) -> Body:
