@@ -179,7 +179,11 @@ def parting(
     young = np.setdiff1d(np.arange(len(at)), mine[known])
     local = transform(inverse(T_world_left), t.position[at[young]])
     young, place = young[local[:, 2] > 0], places_in_view(local[local[:, 2] > 0])
-    for group in scene.groups:
+    held = 0
+    for group in sorted(scene.groups, key=lambda one: -one.test):
+        held += len(group.members)
+        if held > LARGEST * len(known):  # it is rather the poses before that were wrong
+            break
         parts[mine[known[group.members]]] = True
         low, high = view[group.members].min(axis=0), view[group.members].max(axis=0)
         beyond = _AROUND * (high - low)
@@ -207,7 +211,4 @@ def _compared(
     W = inverses(inverses(A[known], _RIDGE, 0.0) + P[known], _RIDGE, 0.0)
     moved = Displacements(before[known] - T_world_left[:3, 3], (points - before)[known], W, age[known])
     view = places_in_view(local[known])
-    scene = classify_scene(moved, view, c.suspect, c.min_support, (_LEAST_NOISE / setup.sigma) ** 2)
-    if (~scene.rest).sum() > LARGEST * len(known):  # then it is rather the poses before that are wrong
-        scene = replace(scene, groups=[])
-    return known, view, scene
+    return known, view, classify_scene(moved, view, c.suspect, c.min_support, (_LEAST_NOISE / setup.sigma) ** 2)
