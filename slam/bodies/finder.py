@@ -179,11 +179,8 @@ def parting(
     young = np.setdiff1d(np.arange(len(at)), mine[known])
     local = transform(inverse(T_world_left), t.position[at[young]])
     young, place = young[local[:, 2] > 0], places_in_view(local[local[:, 2] > 0])
-    held = 0
-    for group in sorted(scene.groups, key=lambda one: -one.test):
-        held += len(group.members)
-        if held > LARGEST * len(known):  # it is rather the poses before that were wrong
-            break
+    few = (~scene.rest).sum() <= LARGEST * len(known)  # else it is rather the poses before that were wrong
+    for group in scene.groups if few else ():
         parts[mine[known[group.members]]] = True
         low, high = view[group.members].min(axis=0), view[group.members].max(axis=0)
         beyond = _AROUND * (high - low)
