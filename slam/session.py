@@ -36,7 +36,6 @@ from slam.interfaces import Backend, MapBackend
 from slam.rig_error import CommonError
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.mapper import Mapper
-from slam.tracks.monocular import FirstViews
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
 from slam.tracks.step import Step
@@ -67,7 +66,6 @@ class State:
     checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
     # in which the camera has not been found yet; None without one, or once it is found
     prior_map: SavedMap | None = None
-    views: FirstViews | None = None  # features without depth that are followed until two views give it
     past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
     restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
 
@@ -79,7 +77,7 @@ class State:
         """The state after one more frame."""
         located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
         return replace(
-            self, tracks=step.tracks, views=step.views, atlas=atlas, index=step.index,
+            self, tracks=step.tracks, atlas=atlas, index=step.index,
             stamp=step.features.stamp, tracking=step.tracking,
             standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, mapped=self.mapped or len(step.added) > 0,

@@ -103,10 +103,7 @@ class Tracker:
             aligned = align(self._session.rig, self._aligning, features, matches, tracks, backend.positions)
         if aligned is not features:
             corrected = _shifted_as(corrected, features, aligned)
-        step = Step(
-            index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking,
-            state.views,
-        )  # fmt: skip
+        step = Step(index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking)
         suspects = self._suspects(step)
         moving = isin(matches.ids, suspects)
         matches, withheld = matches.select(~moving), matches.select(moving)

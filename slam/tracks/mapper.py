@@ -101,6 +101,7 @@ class Mapper:
             backend.remove(strangers)
         if tracks is not None:
             tracks = tracks.begun(0, tracks.dof.shape[1])
+            tracks.waiting_since[:] = -1
             tracks.erase_landmarks(np.flatnonzero(~np.isin(tracks.ids, known)))
         return tracks
 
@@ -155,13 +156,13 @@ class Mapper:
         there = isin(matches.ids, landmarks.ids)
         local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
         P = frame_covariance(self.rig, local, stereo, sigma)
-        views, found, depths = depths_by_motion(
-            self.rig, step.views, features.select(rows), T, P, step.index, sigma, self.config.max_depth_error
+        known, depths = depths_by_motion(
+            self.rig, step.tracks, features, rows, T, P, step.index, sigma, self.config.max_depth_error
         )
         front = np.flatnonzero(in_front(depths.local))
         wanted = max(self.config.target_in_view - len(matches) - len(step.added), 0)
-        best = front[np.sort(np.argsort(-features.response[rows[found[front]]], kind="stable")[:wanted])]
-        step, count = replace(self._with_new(step, rows[found[best]]), views=views), len(step.added)
+        best = front[np.sort(np.argsort(-features.response[known[front]], kind="stable")[:wanted])]
+        step, count = self._with_new(step, known[best]), len(step.added)
         if len(best):
             backend.place(step.added.ids[count:], depths.local[best], depths.covariances[best])  # type: ignore[attr-defined]
         return step
