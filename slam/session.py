@@ -20,6 +20,7 @@ from slam.calibration import RemainingRigError, SelfCalibration
 from slam.checks import definite
 from slam.config import SystemConfig
 from slam.data import (
+    CommonError,
     Estimate,
     FrameResult,
     FrameStatus,
@@ -33,12 +34,10 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, MapBackend
-from slam.rig_error import CommonError
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.mapper import Mapper
 from slam.tracks.standing import Standing
-from slam.tracks.state import TrackingState
-from slam.tracks.step import Step
+from slam.tracks.step import Step, TrackingState
 from slam.tracks.table import Tracks
 
 #: Standard deviations of the initial pose [m], [rad] of a back end that starts in a map. They are wide, because the

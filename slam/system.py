@@ -20,15 +20,14 @@ from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.input.extraction import Extracted, Extractor, as_frame
-from slam.input.features import documented, following
-from slam.input.rectification import Rectification
+from slam.input.features import Rectification, documented, following
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
 from slam.models import EstimatorModels
 from slam.naming import count
 from slam.papers.procedure1 import Procedure1Detector
+from slam.runtime.compilation import Stages
 from slam.runtime.memory import keep_freed_memory
-from slam.runtime.stages import Stages
 from slam.runtime.threads import OneThread, one_blas_thread, prefetch
 from slam.session import Elsewhere, Session, State
 from slam.third_party import named_failures

@@ -10,11 +10,13 @@ import numpy as np
 from slam.atlas.atlas import Atlas
 from slam.bodies.detector import ObjectDetector
 from slam.data import (
+    CommonError,
     Estimate,
     FrameResult,
     FrameStatus,
     IdArray,
     Prediction,
+    Revision,
     StereoFeatures,
     UpdateReport,
     UpdateStatus,
@@ -24,14 +26,12 @@ from slam.geometry.se3 import inverse
 from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Frontend, RestingBackend
 from slam.object_data import MovingObject
-from slam.rig_error import CommonError, Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
 from slam.third_party import checked
 from slam.tracks.alignment import align, take_patches
-from slam.tracks.localizer import LandmarkMatches, Search
+from slam.tracks.localizer import Search
 from slam.tracks.standing import Standing
-from slam.tracks.state import HIDDEN
-from slam.tracks.step import Step
+from slam.tracks.step import HIDDEN, LandmarkMatches, Step
 from slam.tracks.table import Tracks
 
 
@@ -143,7 +143,10 @@ class Tracker:
         """Which features move, and the moving bodies."""
         features, standing = step.features, step.standing
         labels, objects = self.objects.step(state.backend, step.tracks, features, step.estimate, standing.witnesses)
-        labels = labels.with_undecided(standing.leaving(len(features)))
+        if standing.stands:  # a feature that does not stay is undecided, unless it moves
+            leaving = np.setdiff1d(np.arange(len(features)), standing.witnesses)
+            undecided = np.setdiff1d(np.union1d(labels.undecided, leaving), labels.moving)
+            labels = replace(labels, undecided=undecided)
         return replace(step, labels=labels, objects=objects)
 
     def manage(self, state: State, step: Step) -> Step:

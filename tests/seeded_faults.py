@@ -77,7 +77,7 @@ FAULTS = (
         "tests/backends/test_insert.py tests/backends/test_smoother.py",
     ),
     Fault(
-        "pixel noise not scaled to the rectified image", "slam/input/rectification.py",
+        "pixel noise not scaled to the rectified image", "slam/input/features.py",
         "return replace(models, pixel_sigma=models.pixel_sigma * scale, T_world_left=T.tolist(), objects=objects)",
         "return replace(models, T_world_left=T.tolist(), objects=objects)",
         "tests/slam/input/test_rectification.py",
@@ -143,7 +143,7 @@ FAULTS = (
         "tests/slam/tracks tests/slam/tracks",
     ),
     Fault(
-        "a hidden landmark counts as missed", "slam/tracks/visibility.py",
+        "a hidden landmark counts as missed", "slam/tracks/management.py",
         "out[rows] = ~hidden_landmarks(view, rows, features, radius)", "out[rows] = True",
         "tests/slam/tracks tests/slam/tracks",
     ),

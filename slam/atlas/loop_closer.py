@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 from slam.atlas.atlas import Atlas
 from slam.atlas.closing import close
 from slam.atlas.config import AtlasConfig
-from slam.atlas.keyframes import Keyframe, Loop, step_covariance, view_has_changed
+from slam.atlas.keyframes import Keyframe, Loop, step_covariance
 from slam.atlas.verification import keyframe_landmarks, verify
-from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.data import BoolArray, Correction, IdArray, StereoFeatures
 from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.rig_error import Correction
 from slam.runtime.threads import one_blas_thread
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
@@ -231,3 +230,14 @@ class LoopCloser:
         """Whether two verified loops put the camera at positions closer together than the scene's depth."""
         T, U = (atlas.poses_in_map[loop.first] @ loop.T_first_second for loop in (one, other))
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
+
+
+def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig) -> bool:
+    """Whether a camera's view differs enough from a keyframe's for a new one: other features, or another viewpoint.
+
+    `motion` is the camera's pose (4, 4) in the keyframe's coordinates.
+    """
+    if np.linalg.norm(motion[:3, 3]) > AtlasConfig.keyframe_distance * keyframe.depth:
+        return True
+    uv = rig.left.project(transform(inverse(motion), keyframe.points.astype(float)))
+    return bool(rig.left.in_image(uv).mean() < AtlasConfig.keyframe_share)

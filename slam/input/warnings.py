@@ -14,7 +14,7 @@ from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
 from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of
 from slam.models import EstimatorModels
-from slam.tracks.state import ENOUGH_FEATURES
+from slam.tracks.step import ENOUGH_FEATURES
 
 logger = logging.getLogger("slam.input")
 

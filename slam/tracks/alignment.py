@@ -18,7 +18,7 @@ from slam.geometry.arrays import Array, isin
 from slam.geometry.rig import StereoRig
 from slam.interfaces import AligningFrontend
 from slam.third_party import checked
-from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.step import LandmarkMatches
 from slam.tracks.table import LandmarkTable, Patch
 
 _LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more

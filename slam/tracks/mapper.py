@@ -15,19 +15,20 @@ from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend, MapBackend
 from slam.third_party import checked
 from slam.tracks.config import MapConfig
-from slam.tracks.localizer import LandmarkMatches, Localizer
+from slam.tracks.localizer import Localizer
 from slam.tracks.management import (
+    MapView,
     bad_landmarks,
     crowded_landmarks,
     doubled_landmarks,
+    expected_landmarks,
     known_features,
     new_landmarks,
     surplus_landmarks,
 )
 from slam.tracks.monocular import depths_by_motion, frame_covariance, unclaimed
-from slam.tracks.step import Step
+from slam.tracks.step import LandmarkMatches, Step
 from slam.tracks.table import LandmarkTable, Tracks
-from slam.tracks.visibility import MapView, expected_landmarks
 
 
 class Mapper:

@@ -24,8 +24,8 @@ from slam.geometry.arrays import Table
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, points_by_pose
 from slam.tracks.follow import Matches, Windows, follow, pairs_in_boxes
+from slam.tracks.management import MapView
 from slam.tracks.table import LandmarkTable, Tracks
-from slam.tracks.visibility import MapView
 
 _PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
 _RADIUS = 20.0  # most that a feature moves between two frames, besides the camera's rotation [px]

@@ -91,10 +91,6 @@ class Standing:
         """Whether the camera stands at a known place, or something hides what it knows: then no other is looked for."""
         return self.stands and (self.blind > 0 or not lost)
 
-    def leaving(self, features: int) -> NDArray[np.intp]:
-        """Rows of a frame's N = `features` features that do not stay, if the camera stands."""
-        return np.setdiff1d(np.arange(features), self.witnesses) if self.stands else np.zeros(0, np.intp)
-
     def after(self, rig: StereoRig, sigma: float, features: StereoFeatures) -> Standing:
         """What a frame's features with a right pixel say; `sigma` is the pixel noise [px]."""
         stereo = np.flatnonzero(features.has_stereo)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from slam.atlas.config import AtlasConfig
-from slam.atlas.keyframes import Keyframe, covariance_growth, step_covariance, view_has_changed
+from slam.atlas.keyframes import Keyframe, covariance_growth, step_covariance
+from slam.atlas.loop_closer import view_has_changed
 from slam.atlas.verification import refined_pose, verify
 from slam.calibration import RigModel
 from slam.calibration.model import Revision, RigCorrection

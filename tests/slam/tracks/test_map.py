@@ -6,15 +6,16 @@ import pytest
 from slam.data import StereoFeatures
 from slam.tracks.config import MapConfig
 from slam.tracks.management import (
+    MapView,
     bad_landmarks,
     crowded_landmarks,
     doubled_landmarks,
+    expected_landmarks,
     known_features,
     new_landmarks,
     surplus_landmarks,
 )
 from slam.tracks.table import LandmarkTable
-from slam.tracks.visibility import MapView, expected_landmarks
 from tests.slam.scene import RIG
 
 CONFIG = MapConfig(target_in_view=20, separation=5.0)
