@@ -23,7 +23,7 @@ from slam.runtime.threads import one_blas_thread
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
 from slam.tracks.localizer import Localizer
-from slam.tracks.management import depth_is_known
+from slam.tracks.mapper import depth_is_known
 from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
 

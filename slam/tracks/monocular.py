@@ -24,8 +24,7 @@ from slam.geometry.arrays import Table
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, points_by_pose
 from slam.tracks.follow import Matches, Windows, follow, pairs_in_boxes
-from slam.tracks.management import MapView
-from slam.tracks.table import LandmarkTable, Tracks
+from slam.tracks.table import Tracks
 
 _PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
 _RADIUS = 20.0  # most that a feature moves between two frames, besides the camera's rotation [px]
@@ -122,13 +121,12 @@ def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma:
     return np.asarray(np.linalg.inv(rows.T @ rows + 1e-6 * np.eye(6)))
 
 
-def unclaimed(view: MapView, landmarks: LandmarkTable, features: StereoFeatures, rows: NDArray) -> NDArray[np.intp]:
-    """Those of the features `rows` (K,) that no landmark in view claims: none nearby in the image looks alike."""
-    shown = np.flatnonzero(view.in_image)
-    if not len(rows) or not len(shown):
+def unclaimed(uv: Array, descriptors: NDArray[np.float32], features: StereoFeatures, rows: IndexArray) -> IndexArray:
+    """Those of the features `rows` (K,) to which no landmark in view, at pixels (M, 2), is near and looks alike."""
+    if not len(rows) or not len(uv):
         return np.asarray(rows)
-    at, which = pairs_in_boxes(view.uv_left[shown], np.full((len(shown), 2), _CLAIM), features.uv_left[rows])
-    gap = np.linalg.norm(landmarks.descriptors[shown[at]] - features.descriptors[rows[which]], axis=1)
+    at, which = pairs_in_boxes(uv, np.full((len(uv), 2), _CLAIM), features.uv_left[rows])
+    gap = np.linalg.norm(descriptors[at] - features.descriptors[rows[which]], axis=1)
     return np.delete(rows, which[gap < _D_MATCH])
 
 
