@@ -19,7 +19,6 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.runtime.threads import one_blas_thread
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
 from slam.tracks.localizer import Localizer
@@ -67,7 +66,6 @@ class LoopCloser:
         association = replace(association, wide_hypotheses=_HYPOTHESES, consistency_sigmas=lax)
         self._localizer = Localizer(self._rig, association, models)
 
-    @one_blas_thread
     def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> Atlas:
         """The atlas after a frame; `path` returns the path in odom so far."""
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
@@ -93,7 +91,6 @@ class LoopCloser:
         same = self._is_same_view(atlas, loop, step.features)
         return close(atlas, loop, step.common, path, same)
 
-    @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
         """Find a camera that may be anywhere by the keyframes; None if no place fits or several do.
 

@@ -39,7 +39,7 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
         raise MeasurementError(f"features: the stamp must be finite and within {LATEST_STAMP:g} s, got {stamp}")
     rows = len(features) if isinstance(features.uv_left, np.ndarray) and features.uv_left.ndim else 0
     columns: dict[str, Any] = {name: _column(name, getattr(features, name), rows) for name in _COLUMNS}
-    size = np.array([rig.width, rig.height])
+    size = np.array([rig.left.width, rig.left.height])
     for name in ("uv_left", "uv_right"):
         if ((columns[name] < -size) | (columns[name] > 2 * size)).any():  # NaN compares false
             raise MeasurementError(f"features: a pixel of {name} lies far outside of the image")
@@ -128,7 +128,7 @@ def _require_images(images: Any, rig: StereoRig) -> None:
     for side, image in (("left", images.left), ("right", images.right)):
         if image is None and side == "right":
             continue
-        shape = (rig.height, rig.width)
+        shape = (rig.left.height, rig.left.width)
         if not isinstance(image, np.ndarray) or image.dtype != np.float32 or image.shape != shape:
             got = f"{image.dtype} of shape {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
             raise MeasurementError(f"features: the {side} image must be float32 of shape {shape}, got {got}")
@@ -184,7 +184,7 @@ class Rectification:
 
         A fisheye sees rays across its axis, whose pixels in the rectified pair lie at infinity.
         """
-        right, size = self._ways.rectify_right(uv), np.array([self.rig.width, self.rig.height])
+        right, size = self._ways.rectify_right(uv), np.array([self.rig.left.width, self.rig.left.height])
         far = (np.abs(right - 0.5 * size) > 1.5 * size).any(axis=1, keepdims=True)  # NaN compares false
         return np.where(far, np.nan, right)
 

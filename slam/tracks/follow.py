@@ -52,14 +52,8 @@ def follow(
 ) -> Matches:  # fmt: skip
     """Match tracks to features inside windows around where the tracks are expected.
 
-    Args:
-        pixels: where they are expected (M, 2); tracks whose pixels are not finite are not matched.
-        innovation: covariances of these pixels' innovations (M, 2, 2) [px²], of which the windows are ellipses.
-        descriptors: of the tracks (M, D).
-        laplacian: signs of their Laplacians (M,).
-        features: of the frame.
-        windows: where to look, and what is a match.
-        taken: which of the features (N,) are no candidates; None for none.
+    Tracks whose `pixels` (M, 2) are not finite are not matched. The windows are ellipses of the innovations'
+    covariances (M, 2, 2) [px²]. Features that are `taken` (N,) are no candidates.
     """
     from slam.tracks import follow_kernels
 

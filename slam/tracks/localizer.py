@@ -50,12 +50,8 @@ class Localizer:
     def similar_view(self, T_world_left: Array, seen_from: Array, positions: Array) -> BoolArray:
         """Which landmarks (N,) are seen from a pose (4, 4) at a similar angle and distance as at their first sight.
 
-        From another viewpoint, the point that a descriptor describes shifts over the surface, and then changes.
-
-        Args:
-            T_world_left: the camera's present pose.
-            seen_from: the camera's position at first sight (N, 3) [m]; NaN if unknown, and then nothing is ruled out.
-            positions: of the landmarks (N, 3) [m].
+        From another viewpoint, the point that a descriptor describes shifts over the surface, and then changes. The
+        camera was at `seen_from` (N, 3) [m] at first sight; where that is unknown, NaN, nothing is ruled out.
         """
         then, now = positions - seen_from, positions - T_world_left[:3, 3]
         before, after = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)

@@ -145,7 +145,7 @@ class Mapper:
         matches = matches.select(isin(matches.ids, step.report.used))
         expected = rows[:0]
         if not step.tracking.unmatched:
-            size = (self.rig.width, self.rig.height)
+            size = (self.rig.left.width, self.rig.left.height)
             shown = expected_landmarks(view, step.features, size, m.view_margin, m.occlusion_radius)
             shown &= self._localizer.similar_view(view.T_world_left, tracks.seen_from[rows], view.positions)
             expected = rows[shown]
@@ -234,7 +234,7 @@ def _spread(uv: Array, rows: IndexArray, occupied: Array, wanted: int, rig: Ster
     if not len(rows):
         return np.zeros(0, np.intp)
     columns, lines = config.grid
-    size = np.array([rig.width / columns, rig.height / lines])
+    size = np.array([rig.left.width / columns, rig.left.height / lines])
 
     def cell(pixels: Array) -> IndexArray:
         c = np.clip((pixels / size).astype(int), 0, (columns - 1, lines - 1))
@@ -267,14 +267,9 @@ def _spread(uv: Array, rows: IndexArray, occupied: Array, wanted: int, rig: Ster
 def expected_landmarks(
     view: MapView, features: StereoFeatures, size: tuple[int, int], margin: float, radius: float
 ) -> BoolArray:
-    """Which landmarks (N,) should have been detected: well inside the image and not hidden.
+    """Which landmarks (N,) should have been detected: inside an image of this `size` by a `margin` [px], not hidden.
 
-    Args:
-        view: the map from the pose after the update.
-        features: of the frame.
-        size: width and height of the image [px].
-        margin: distance from the border [px] within which detection is not certain.
-        radius: a landmark is hidden if most of the features within this [px] are clearly nearer than it is.
+    A landmark is hidden if most of the features within `radius` [px] are clearly nearer than it is.
     """
     with np.errstate(invalid="ignore"):
         inside = ((view.uv_left >= margin) & (view.uv_left <= np.array(size) - 1 - margin)).all(axis=1)

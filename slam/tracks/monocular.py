@@ -55,18 +55,11 @@ class Depths(Table):
 def two_view_depth(
     rig: StereoRig, uv_then: Array, uv_now: Array, T_then_now: Array, motion_covariance: Array, sigma: float
 ) -> Depths:
-    """Triangulate points from two views of the left camera, to first order of the pixels' and the motion's errors.
+    """Triangulate points from pixels (N, 2) in two views, to first order of the pixels' and the motion's errors.
 
     Both rays pass each other at a distance. The point between them is the estimate; that the true distance is zero is
-    one more measurement of it, which also says whether the two views show one point.
-
-    Args:
-        rig: the cameras.
-        uv_then: left pixels (N, 2) in the first view.
-        uv_now: the same in the second.
-        T_then_now: poses (4, 4) or (N, 4, 4) of the second camera in the first one's coordinates.
-        motion_covariance: of these poses (6, 6) or (N, 6, 6), for a perturbation ``T exp(ξ)``.
-        sigma: pixel noise [px].
+    one more measurement of it, which also says whether the two views show one point. The second camera's poses in the
+    first one's coordinates (N, 4, 4) have covariances (N, 6, 6), or all share one; `sigma` is the pixel noise [px].
     """
     n = len(uv_now)
     T = np.broadcast_to(T_then_now, (n, 4, 4))
@@ -134,21 +127,11 @@ def depths_by_motion(
     rig: StereoRig, tracks: Tracks, features: StereoFeatures, rows: IndexArray, T_world_left: Array, covariance: Array,
     frame: int, sigma: float, depth_error: float,
 ) -> tuple[IndexArray, Depths]:  # fmt: skip
-    """Follow features without depth into a frame, in place: they have rows of the tracks until two views give depth.
+    """Follow features `rows` (K,) without depth into a frame, in place, until two views give depth.
 
-    Args:
-        rig: the cameras.
-        tracks: the table.
-        features: of the frame.
-        rows: of those features without depth that could become landmarks (K,).
-        T_world_left: pose (4, 4) after the update.
-        covariance: of the pose by this frame (6, 6), see `frame_covariance`.
-        frame: the frame's number.
-        sigma: pixel noise [px].
-        depth_error: largest relative standard deviation of a new landmark's depth.
-
-    Returns:
-        the rows of `features` (N,) whose depth has become known, and these depths.
+    The frame has the pose (4, 4) with a covariance (6, 6) as in `frame_covariance`; `sigma` is the pixel noise [px],
+    `depth_error` the largest relative standard deviation of a depth. Returns the rows of `features` (N,) whose depth
+    has become known, and these depths.
     """
     directions = _rays(rig, features.uv_left[rows]) @ T_world_left[:3, :3].T
     waiting = np.flatnonzero(tracks.waiting_since >= 0)

@@ -75,14 +75,10 @@ class TrackingState:
     def after(
         self, measured: bool, stands: bool, uncertain: bool, stereo_features: int, lost_after: int
     ) -> TrackingState:
-        """The state after a frame.
+        """The state after a frame in which the pose was `measured` or not, and the camera `stands` or not.
 
-        Args:
-            measured: the pose was measured.
-            stands: the camera stands.
-            uncertain: the prediction is too uncertain to say where in the image landmarks are.
-            stereo_features: number of features with depth in the frame.
-            lost_after: frames without a measured pose after which a camera with an uncertain prediction is lost.
+        It is lost after `lost_after` frames without a measured pose, if the prediction is too `uncertain` to say where
+        in the image landmarks are.
         """
         if measured:
             return TrackingState(doubted=self.doubted, believed=self.believed, stood=stands, hidden_at=self.hidden_at)
