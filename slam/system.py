@@ -241,11 +241,11 @@ class StereoSlam:
             standing, prediction = (state.standing, begun) if begun else t.predict(state, features)
         with stage("associate"):  # correct features, find landmarks (paper A, IV): `slam.tracks.localizer`
             step = t.associate(state, features, standing, prediction)
-            if isinstance(step, Elsewhere):  # the camera was found somewhere else in the map
+            if isinstance(step, Elsewhere):  # a kidnapped camera, found elsewhere in the map: `slam.session`
                 return step
         with stage("update"):  # the landmarks' pixels correct pose and map
             step = t.update(state, step)
-            if isinstance(step, Elsewhere):  # the place is unknown: a new map begins
+            if isinstance(step, Elsewhere):  # the place is unknown: a new map begins, see `slam.session`
                 return step
         with stage("estimate"):  # the pose; the calibration learns from it
             step = t.estimate(state, step)
