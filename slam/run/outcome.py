@@ -73,7 +73,7 @@ def outcome(
 
 
 def _counted(statuses: Sequence[str], missed: int) -> str:
-    """How many frames were tracked, counted as in a run's table: the first one, where it began a map, is one of them."""
+    """How many frames were tracked, counted as in a run's table: the first one is one of them where it began a map."""
     every, first = len(statuses), statuses[0] == _STARTED
     if missed == every - 1:
         return "no frame after the first was tracked" if first else "no frame was tracked"

@@ -63,7 +63,8 @@ AGAIN = "features are found in both images, but not again in the next frame"
 )
 def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, more, words):
     rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, baseline, 320, 240)
-    assert outcome(record(0, features=features), rig, **more).startswith(f"no frame after the first was tracked; likely cause: {words}")
+    said = outcome(record(0, features=features), rig, **more)
+    assert said.startswith(f"no frame after the first was tracked; likely cause: {words}")
 
 
 def test_a_baseline_that_no_hand_carries_is_the_cause_unless_it_is_a_vehicle_s():
