@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Annotated, Any, TypeAlias
 
 import typer
@@ -228,9 +229,9 @@ def settings_command(
     section: Annotated[str | None, argument("A section, a setting, or a front end or back end.", "SECTION")] = None,
 ) -> None:
     """List all settings with default per kind of motion, unit and meaning."""
-    from slam.commands.settings import print_settings
+    from slam.run.settings_reference import listing
 
-    print_settings(section)
+    print("\n".join(listing(section, min(get_terminal_size().columns, 100))))
 
 
 @app.command("compare", short_help="Compare back ends on the same recordings.")

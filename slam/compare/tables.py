@@ -104,7 +104,7 @@ def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None
         lines.append((t.sequence, t.variant.name, t.variant.frontend, t.mode, t.seed, t.backend, run.outcome, *values))
     write_text(out / "runs.csv", csv_rows(lines))
     lines = [DIFFERENCE_COLUMNS]
-    for group, metric in ((group, metric) for group in every for metric in group.metrics):
+    for group, metric in ((one, metric) for one in every for metric in one.metrics):
         for other, d in group.differences(metric).items():
             head = group.sequence, group.variant.name, group.mode, metric.key, next(iter(group.runs)), other
             numbers = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p, d.p_holm))
