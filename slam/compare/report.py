@@ -16,8 +16,7 @@ from slam.compare.statistics import FEWEST, LEVEL, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import Group, count_tests, most_tests
 from slam.files import read_object, write_text
-from slam.run.panels import backend_colours
-from slam.run.plots import drawn
+from slam.run.plots import backend_colours, drawn
 from slam.run.results import BY_KEY
 from slam.run.run_data import RunData
 from slam.run.schema import STAGE_NAMES

@@ -174,7 +174,10 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _begin_worker() -> None:
-    """Leave interrupts to the parent, and end when it is gone, however it went."""
+    """Leave interrupts to the parent, end when it is gone, however it went, and do not compete with the others."""
+    import cv2
+
+    cv2.setNumThreads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
