@@ -11,8 +11,8 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, one_line
-from slam.mapping.config import MapConfig
 from slam.system import StereoSlam
+from slam.tracks.config import MapConfig
 from tests.fuzz.settings import CLASSES
 from tests.slam.scene import RIG
 
