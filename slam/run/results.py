@@ -183,7 +183,8 @@ def facts(summary: Mapping[str, Any]) -> str:
     found = figures(summary)
     shown = [m for m in METRICS if "picture" in m.shown and found.get(m.key)]
     words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
-    return "; ".join([*words, *filter(None, [re.sub(r" \([^)]*\)", "", verdict_of_run(summary))])])
+    judged = re.sub(r" \([^)]*\)| of the pose", "", verdict_of_run(summary))
+    return "; ".join([*words, *filter(None, [judged])])
 
 
 def _measured(summary: Mapping[str, Any]) -> int:
