@@ -21,7 +21,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, quaternion
 from slam.geometry.trajectory import Trajectory
 from slam.outputs import Output, require_outputs
-from slam.run.run_data import RunData, read_objects
+from slam.run.run_data import RunData
 from slam.run.schema import body_colour
 from slam.system import StereoSlam
 
@@ -131,12 +131,12 @@ def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
     Raises SlamError where the folder does not hold a finished run, and as `Viewer` does.
     """
     with noting_inputs() as inputs:
-        run, objects = RunData.read(folder, folder.name), read_objects(folder)
+        run = RunData.read(folder, folder.name)
     require_outputs(outputs(target, "--to"), inputs, overwrite)
     with Viewer(target) as viewer:
         for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):
             viewer.show_pose(number, float(stamp), pose)
-            for seen, name, position in objects:
+            for seen, name, position in run.objects:
                 if abs(seen - stamp) < 1e-6:
                     mark = viewer.rr.Points3D([position], colors=body_colour(int(name)), radii=0.03)
                     viewer.log(f"/objects/{name}", mark)
