@@ -126,6 +126,27 @@ def test_a_row_of_times_may_hold_more_than_the_time(two_folders: Path, row: str)
     assert np.allclose(open_sequence(two_folders).stamps, 7 + 0.3 * np.arange(6))
 
 
+@pytest.mark.parametrize(
+    ("heading", "row", "first", "step"),
+    [
+        ("timestamp\n", "{s:.6f}", 1.7e9, 0.1),
+        ("frame,timestamp\n", "{i},{s:.6f}", 1.7e9, 0.1),
+        ("Time Stamp [s];file\n", "{s:.6f};{i:06d}.png", 1.7e9, 0.1),
+        ("", "{ns}", 1.7e9, 0.1),
+        ("#id t exposure\n", "{ns} {s:.9f} 1.2", 1.7e9, 0.1),
+        ("", "{i} {ns}", 1.7e9, 0.1),
+        ("", "2023-11-14 22:13:2{i}.500000", 1.7e9 + 0.5, 1.0),
+    ],
+)
+def test_times_as_other_programs_write_them(two_folders: Path, heading, row, first, step) -> None:
+    """A heading is no row, which would shift all times by one; nanoseconds are no seconds."""
+    rows = [row.format(i=i, s=1.7e9 + 0.1 * i, ns=17 * 10**17 + i * 10**8) + "\n" for i in range(6)]
+    (two_folders / "times.txt").write_text(heading + "".join(rows))
+    sequence = open_sequence(two_folders)
+    assert np.allclose(sequence.stamps, first + step * np.arange(6), rtol=0, atol=1e-5) and len(sequence) == 6
+    assert any("taken as nanoseconds" in line for line in sequence.warnings) == ("ns" in row)
+
+
 def test_one_camera_twice_is_refused(two_folders: Path, videos: Path) -> None:
     queries = [f"{two_folders}?left=left&right=left", f"{videos}?left=left.avi&right=left.avi"]
     (two_folders / "link").symlink_to(two_folders / "left")
@@ -168,6 +189,13 @@ def test_words_for_left_and_right() -> None:
     assert of_sides(["a_leftImg8bit.png", "a_rightImg8bit.png"]) == (["a_leftImg8bit.png"], ["a_rightImg8bit.png"])
     assert of_sides(["brightness.png", "leftover.png"]) is of_sides(["HALL_1.png", "DOOR_1.png"]) is None
     assert keys_of([["a.png", "b.png"]]) is None
+
+
+def test_numbered_images_of_one_camera_are_no_pair(tmp_path: Path) -> None:
+    for k in range(6):
+        (tmp_path / f"cam{k}.png").write_text("")
+    with pytest.raises(SequenceError, match="no sequence of a known format"):
+        open_sequence(tmp_path)
 
 
 def test_times_and_rate_can_be_told(two_folders: Path) -> None:
@@ -224,7 +252,8 @@ def test_kitti_s_calib_txt_beside_the_images_is_read_and_another_one_named(two_f
     "names",
     [
         ("image_left", "image_right"), ("camera0", "camera1"), ("infra1", "infra2"), ("cam1", "cam2"), ("L", "R"),
-        ("Left", "Right"), ("cam_left", "cam_right"), ("left_images", "right_images"),
+        ("Left", "Right"), ("cam_left", "cam_right"), ("left_images", "right_images"), ("Camera_0", "Camera_1"),
+        ("image_lcam_front", "image_rcam_front"), ("Infrared 1", "Infrared 2"), ("ir1", "ir2"),
     ],
 )  # fmt: skip
 def test_folders_by_other_usual_names(two_folders: Path, names: tuple[str, str]) -> None:

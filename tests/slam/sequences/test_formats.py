@@ -61,6 +61,20 @@ def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path, buil
             sequence.frames(start, stop)
 
 
+def test_single_frames_of_recordings_and_worlds(kitti: Path, build: SimpleNamespace) -> None:
+    for sequence in (open_sequence(kitti), slam.open_sequence("synthetic:desk?frames=4&width=64&height=48")):
+        (expected,) = sequence.frames(2, 3)
+        for frame in (sequence.frame(2), sequence[np.int64(2)]):
+            assert (frame.index, frame.stamp) == (2, expected.stamp)
+            assert np.array_equal(frame.left, expected.left) and np.array_equal(frame.right, expected.right)
+        for k in (-1, 6, 1.5):
+            with pytest.raises(SequenceError, match=f"there is no frame {k}; it has"):
+                sequence[k]
+    build.cut(kitti / "image_0" / "000001.png")
+    with pytest.raises(SequenceError, match="the left image of frame 1 cannot be read"):
+        open_sequence(kitti)[1]
+
+
 def test_names_of_folders(kitti: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(kitti.parent))
     monkeypatch.setenv("USERPROFILE", str(kitti.parent))
