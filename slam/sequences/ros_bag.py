@@ -14,10 +14,10 @@ import numpy as np
 from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError, one_line, text_of
 from slam.geometry.rig import StereoRig
 from slam.naming import suggestion
-from slam.sequences.calibration import array, naming
-from slam.sequences.calibration_keys import Entries, Entry, rig_of
+from slam.sequences.calibration import Entries, Entry, array, naming
 from slam.sequences.images import Size, decode_image, require_image_size, size_text
 from slam.sequences.names import SIDES
+from slam.sequences.rigs import rig_of
 
 #: Types of messages that hold an image.
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"

@@ -47,7 +47,8 @@ STAMPS = {
     f"stamp {text}": partial(at, value)
     for text, value in {
         "None": None, "text": "1.0", "NaN": math.nan, "inf": math.inf, "-inf": -math.inf, "earlier": 0.0,
-        "array": np.array([9.0]), "complex": 9j, "true": True, "decimal": Decimal(9), "huge": 10**400, "nanoseconds": 17 * 10**17,
+        "array": np.array([9.0]), "complex": 9j, "true": True, "decimal": Decimal(9), "huge": 10**400,
+        "nanoseconds": 17 * 10**17,
     }.items()
 }  # fmt: skip
 VALUES = {
