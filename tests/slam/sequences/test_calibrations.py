@@ -154,7 +154,7 @@ SIDES = ("left", "right")
         {"intrinsics": dict.fromkeys(SIDES, FLAT), "extrinsic": {"rotation": EYE, "translation": [-0.2, 0, 0]}},
         {"KK_left": M, "kc_left": [0] * 5, "KK_right": M, "om": [0, 0, 0], "T": [-0.2, 0, 0]},
         {"mtxL": M, "distL": [[0] * 5], "mtxR": M, "rot": EYE, "trans": [[-0.2], [0], [0]]},
-        dict.fromkeys(SIDES, {**FLAT, "coeffs": [0] * 5, "model": "distortion.none"}) | {"baseline": 0.2},
+        {key: {**FLAT, "coeffs": [0] * 5, "model": "distortion.none"} for key in SIDES} | {"baseline": 0.2},
         {"f": 50, "cu": 31.5, "cv": 23.5, "base": 0.2},
         {"FX_px": 50, "FY_px": 51, "CX_px": 31.5, "CY_px": 23.5, "Baseline_m": 0.2},
     ],
