@@ -215,8 +215,8 @@ class Search:
     def _in_windows(self, uv: Array, innovation: Array, rows: NDArray[np.intp]) -> Matches:
         """Matches of the landmarks at `rows` (M,), in windows around their pixels (M, 2)."""
         looks = self.landmarks.descriptors[rows], self.landmarks.laplacian[rows]
-        found = follow(uv, innovation, *looks, self.features, Windows.of(self.config))
-        return Matches(rows[found.tracks], found.features)
+        pairs = follow(uv, innovation, *looks, self.features, Windows.of(self.config))
+        return Matches(rows[pairs.tracks], pairs.features)
 
     def _around(self, T_world_left: Array) -> tuple[Matches, int]:
         """Matches in small windows around a pose, and the number of landmarks searched for."""
@@ -249,12 +249,12 @@ class Search:
             return LandmarkMatches.nothing()
         matches = matches.select(np.argsort(matches.tracks, kind="stable"))
         c, table = self.config, self.landmarks
-        found = LandmarkMatches(table.ids[matches.tracks], matches.features, consensus.T_world_left)
-        new = table.long_out_of_view(c.rematch_after) & (table.returning + 1 < c.kidnapped_after)
-        new = new[matches.tracks]
-        if not 0 < new.sum() < min(c.minimum_consistent, len(found)):
-            return found
-        return replace(found.select(~new), returning=found.ids[new])
+        agreeing = LandmarkMatches(table.ids[matches.tracks], matches.features, consensus.T_world_left)
+        awaited = table.long_out_of_view(c.rematch_after) & (table.returning + 1 < c.kidnapped_after)
+        awaited = awaited[matches.tracks]
+        if not 0 < awaited.sum() < min(c.minimum_consistent, len(agreeing)):
+            return agreeing
+        return replace(agreeing.select(~awaited), returning=agreeing.ids[awaited])
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:
