@@ -52,12 +52,10 @@ class MapAnchor:
         return np.linalg.lstsq(rig.root, self.rig.root @ self.common, rcond=None)[0], self.covariance[6:, 6:]
 
     def later(self, back: Array, shares: Array) -> Array:
-        """Covariance (6, 6) of a later pose, without the noise since.
+        """Covariance (6, 6) of a later pose, without the noise since; the anchor's pose there has the adjoint `back`.
 
-        The path since the anchor is not corrected by the common errors, so their estimate counts as an error too.
-
-        `back` (6, 6) is the adjoint of the anchor's pose in the later one's coordinates, `shares` (6, m) the derivative
-        of the motion since by the rig's errors.
+        The path since is not corrected by the common errors, so their estimate counts as an error too, by `shares`
+        (6, m), the derivative of the motion since.
         """
         J = np.concatenate([back, shares @ self.rig.root], axis=1)
         shared = shares @ self.rig.root @ self.common
@@ -208,9 +206,8 @@ class Atlas:
     ) -> Atlas:
         """A copy with a new back end from here on, which takes its first pose for exact; in the map it is uncertain.
 
-        `since` [s] is the time of the last measured pose; `before` the earlier back end's last estimate, with the rig's
-        uncertainty, `after` the new one's first, at the same pose; `common` the part of the pose's error that other
-        frames share.
+        The last pose was measured at `since` [s]. `before` is the earlier back end's last estimate, with the rig's
+        uncertainty, of which `common` is a part; `after` is the new one's first, at the same pose.
         """
         n = common.root.shape[1]
         error, error_covariance = (np.zeros(n), np.eye(n)) if self.anchor is None else self.anchor.belief(common)
@@ -229,8 +226,7 @@ class Atlas:
     def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as estimated at the time, or as revised in `path`.
 
-        `rig` says what the common errors stand for now. Without a path the poses are as they were estimated at the
-        time.
+        `rig` says what the common errors stand for now.
         """
         poses, count, m = self.poses.copy(), len(self), len(rig.root)
         if path is not None:
@@ -292,9 +288,7 @@ def covariance_after_unseen_motion(covariance: Array, duration: float, models: E
 
     The motion model takes changes of velocity for white noise, which bends and stops in a long gap are not. So the
     motion model's initial velocity uncertainty acts throughout the gap as well, up to a wholly unknown direction and
-    position.
-
-    `covariance` (6, 6) is by the motion model, `duration` [s] that of the gap.
+    position. `covariance` (6, 6) is by the motion model, `duration` [s] that of the gap.
     """
     speeds = np.array([models.initial_angular_velocity_sigma, models.initial_velocity_sigma])
     most = np.array([_UNKNOWN_DIRECTION, ANYWHERE])
