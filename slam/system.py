@@ -223,7 +223,7 @@ class StereoSlam:
         with self._named(f"frame {extracted.frame.index}"):
             result = self._process(extracted.features, extracted.checksum)
         if result.reason == REPEATED:
-            self._extractor.warn_of_repeated(extracted.frame.index)
+            self._extractor.input_warnings.note_repeated(extracted.frame.index)
         return replace(result, milliseconds={**extracted.milliseconds, **result.milliseconds})
 
     def _named(self, place: str) -> AbstractContextManager[None]:
@@ -340,7 +340,8 @@ class StereoSlam:
     @property
     def warnings(self) -> list[str]:
         """Warnings about images, stamps or baseline, one line each (see `slam.input.warnings`)."""
-        return self._extractor.warnings
+        said = self._extractor.input_warnings
+        return [*said.lines, *filter(None, [said.repeated])]
 
     def __getstate__(self) -> dict[str, object]:
         """State for copying and pickling; refused while another thread is in a step."""
