@@ -35,7 +35,7 @@ from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.evaluation.summary import consistency
 from slam.run.summary import RunRecord
-from slam.runtime import stages
+from slam.runtime import compilation
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
@@ -213,7 +213,7 @@ def main() -> int:
         file.write_text(",".join(HEADER) + "\n", encoding="utf-8")
     with file.open(newline="", encoding="utf-8") as before:
         done = {(r["sequence"], r["trial"], r["back end"], r["asked"], r["in view"]) for r in csv.DictReader(before)}
-    stages.working_time = time.process_time
+    compilation.working_time = time.process_time
     with file.open("a", newline="", encoding="utf-8") as after:
         for row in runs(cases, 1 if given.quick else given.trials, done):
             csv.writer(after).writerow(row)
