@@ -292,7 +292,8 @@ class _Run:
     def _tracking(self) -> dict[str, Any]:
         """The part of the summary on the tracking, which is known of every run."""
         options, record, rig = self.options, self.record, self.sequence.rig
-        warnings, driving = getattr(self.system, "warnings", ()), options.kind == "driving"
+        warnings = getattr(self.system, "warnings", ())
+        driving = options.kind == "driving"
         doubt = scale_doubt(record, rig, driving) or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
         tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving)

@@ -32,8 +32,6 @@ def near_name(folder: Path, text: str) -> str:
 
 def sequences_near(folder: Path, format_of: Format) -> str:
     """Which sequences lie below a folder, or it is a part of; else how to name the two cameras in it."""
-    if all((folder / name).is_file() for name in ("config.json", "frames.csv")):
-        return f"; it is the folder of a run: `slam plot {folder.name}` draws it, --config repeats it"
     below = sorted(str(path.relative_to(folder)) for path in _below(folder, format_of))
     if below:
         more = f", … ({len(below)})" if len(below) > _LISTED else ""

@@ -55,15 +55,6 @@ def test_a_folder_that_is_missing_or_empty(slam_command, tmp_path):
         fails_with_one_line(slam_command(command, "", "--out", tmp_path / "out"), "path is empty")
 
 
-def test_the_folder_of_a_run_is_no_sequence_and_is_named(slam_command, tmp_path):
-    """The hint was that it is a part of whatever sequence lies above it."""
-    (tmp_path / "done").mkdir()
-    for name in ("config.json", "frames.csv"):
-        (tmp_path / "done" / name).touch()
-    words = "it is the folder of a run: `slam plot done` draws it, --config repeats it"
-    fails_with_one_line(slam_command("run", tmp_path / "done", "--out", tmp_path / "out"), words)
-
-
 def test_a_truncated_image_is_said_and_the_rest_goes_on(slam_command, euroc, tmp_path):
     image = sorted((euroc / "mav0" / "cam0" / "data").iterdir())[1]
     image.write_bytes(image.read_bytes()[:-200])

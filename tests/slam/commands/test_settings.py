@@ -82,6 +82,14 @@ def test_settings_may_be_a_dict():
             SystemConfig().with_settings(wrong)
 
 
+def test_a_kind_beside_a_configuration_is_refused():
+    """It was ignored, also where the configuration was that of another kind."""
+    config = SystemConfig.for_kind("driving")
+    with pytest.raises(ConfigurationError, match="kind does not go with config"):
+        slam.StereoSlam(RIG, kind="handheld", config=config)
+    assert slam.StereoSlam(RIG, config=config).config.map == config.map
+
+
 def test_a_setting_of_an_earlier_version_is_one_line():
     gone = r"^setting {}: there is no such setting in this version$".format
     for tree, words in (
