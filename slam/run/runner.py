@@ -264,7 +264,7 @@ class _Run:
             with self._each():
                 summary |= results_of(sequence, system, record, final, score)
         summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # nothing else is random
-        summary |= {"configuration": options.config.to_json(), "versions": versions()}
+        summary["versions"] = versions()
         with self._each():
             write_json(out / "summary.json", summary)
         with self._each():
