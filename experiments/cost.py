@@ -37,8 +37,8 @@ class Part:
 PARTS = (
     Part(
         "frame", "Whole frames",
-        "Median times of a frame, images in memory, the detector of moving objects on, beside `cv2.SIFT` "
-        "on one image and ORB-SLAM3 on the same images; with overlap, times from one result to the next. CPU "
+        "Median times of a frame, images in memory, the detector of moving objects on, and their ratios to `cv2.SIFT` "
+        "on one image and to ORB-SLAM3 on the same images; with overlap, times from one result to the next. CPU "
         "time adds up all threads.",
     ),
     Part(
