@@ -142,6 +142,19 @@ def test_times_as_other_programs_write_them(two_folders: Path, heading, row, fir
     assert any("taken as nanoseconds" in line for line in sequence.warnings) == ("ns" in row)
 
 
+@pytest.mark.parametrize("row", ["{n:03d}.png,{t}", "{t} left/{n:03d}.png", "{t}"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_rows_of_times_belong_to_the_images_that_they_name_or_number(two_folders: Path, row: str, first: int) -> None:
+    for side in ("left", "right"):
+        rename(two_folders / side, lambda i: f"{i + first:03d}.png")
+        (two_folders / side / f"{2 + first:03d}.png").unlink()
+    rows = [row.format(n=i + first, t=7 + 0.3 * i) + "\n" for i in range(6)]
+    (two_folders / "times.txt").write_text("".join(rows))
+    sequence = open_sequence(two_folders)
+    assert np.allclose(sequence.stamps, 7 + 0.3 * np.array([0, 1, 3, 4, 5]))
+    assert [left for left, _ in seeds(sequence)] == [0, 1, 3, 4, 5]
+
+
 def test_one_camera_twice_is_refused(two_folders: Path, videos: Path) -> None:
     queries = [f"{two_folders}?left=left&right=left", f"{videos}?left=left.avi&right=left.avi"]
     (two_folders / "link").symlink_to(two_folders / "left")
