@@ -27,7 +27,7 @@ LARGEST = 4.1e7
 _ROTATION = 1e-2  # largest error of an element of RᵀR: files have six digits and more
 _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
 _SLOWEST = 100.0  # [s] between frames, at most, of times in a unit that nobody named
-_HEADING = re.compile(r"\D*(time|stamp)\D*", re.IGNORECASE)  # a first row that names the columns
+_HEADING = re.compile(r"\D*(time|stamp|\bt\b|\bsec|\b[num]s\b)\D*", re.IGNORECASE)  # a first row that names the columns
 _IMAGE = re.compile(r"\.(png|jpe?g|p[gp]m|bmp|tiff?|webp)$", re.IGNORECASE)
 _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
 

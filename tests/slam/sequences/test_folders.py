@@ -125,7 +125,7 @@ def test_images_in_two_formats_are_taken_once(two_folders: Path) -> None:
     [
         ("timestamp\n", "{s:.6f}", 1.7e9, 0.1),
         ("frame,timestamp\n", "{i},{s:.6f}", 1.7e9, 0.1),
-        ("Time Stamp [s];file\n", "{s:.6f};{i:06d}.png", 1.7e9, 0.1),
+        ("t [s];file\n", "{s:.6f};{i:06d}.png", 1.7e9, 0.1),
         ("", "{ns}", 1.7e9, 0.1),
         ("#id t exposure\n", "{ns} {s:.9f} 1.2", 1.7e9, 0.1),
         ("", "{i} {ns}", 1.7e9, 0.1),
