@@ -9,17 +9,7 @@ import numpy as np
 from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence, row_evidence
 from slam.calibration.model import Revision, RigCorrection, RigModel
-from slam.calibration.pairs import (
-    NO_MATCHES,
-    Pair,
-    Rows,
-    View,
-    match,
-    noise_variances,
-    pair_evidence,
-    pair_of,
-    parallax,
-)
+from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
     FOCALS,
     RigPosterior,
@@ -37,6 +27,7 @@ from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.rig_numbers import rig_numbers
 from slam.geometry.se3 import Array
+from slam.tracks.follow import Matches
 
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
@@ -188,17 +179,15 @@ class SelfCalibration:
         """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""
         c = self.config
         waiting = self._waiting
-        newest = match(waiting[-1], view) if waiting else NO_MATCHES
         # 0.5: a new view is taken when the last one has lost this share of the features it may lose
-        apart = not waiting or len(newest[0]) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
+        apart = not waiting or len(match(waiting[-1], view)) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
         ended = 0
         for first in waiting:
-            matched = newest if first is waiting[-1] else match(first, view)
-            n = len(matched[0])
-            if n > max(c.kept_share * len(first), c.minimum_common):
+            matched = match(first, view)
+            if len(matched) > max(c.kept_share * len(first), c.minimum_common):
                 break
             ended += 1
-            evidence = self._evidence(first, view, matched) if n >= c.minimum_common else None
+            evidence = self._evidence(first, view, matched) if len(matched) >= c.minimum_common else None
             if evidence is not None:
                 self._motion.add(evidence)
         if waiting and not ended and self.pairs < 6:  # 6: with fewer pairs, an incomplete one counts provisionally
@@ -243,7 +232,7 @@ class SelfCalibration:
         pixel, disparity = np.exp(self._variances)
         return np.diag([pixel, pixel, disparity])
 
-    def _evidence(self, first: View, second: View, matched: Rows) -> Evidence | None:
+    def _evidence(self, first: View, second: View, matched: Matches) -> Evidence | None:
         """The evidence of a pair of views with matched features; None without a solution."""
         mean = self._own.mean
         pair = pair_of(self.model, first, second, mean, self._noise, self._seen, matched)
@@ -252,9 +241,8 @@ class SelfCalibration:
             return None
         if parallax(self.model, pair) < self.config.minimum_parallax:
             return None
-        one, two = (points + self.model.shift(points, mean) for points in (pair.first, pair.second))
         self._scattered += 1
-        scatter = np.log(noise_variances(Pair(one, two, pair.R, pair.t), self.model.focal, self._noise))
+        scatter = np.log(noise_variances(pair, self.model.focal, self._noise))
         self._variances = self._variances + (scatter - self._variances) / self._scattered
         evidence = pair_evidence(self.model, pair, mean, self._noise)
         self.unsolved += evidence is None
