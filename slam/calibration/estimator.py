@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence, row_evidence
+from slam.calibration.evidence import Accumulator, Evidence, RigEvidence, row_evidence
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
@@ -199,12 +199,13 @@ class SelfCalibration:
             self._open, self._frames, self._solved = None, 0, 0
         self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
-    def evidence(self) -> RecordingEvidence | None:
+    def evidence(self) -> RigEvidence | None:
         """The evidence of this recording alone, without any prior; None if no motion was seen."""
         moved, rows = self._moved(), self._rows.total()
         if moved is None or rows is None or self._fields is None:
             return None
-        return RecordingEvidence(rows + moved, residual_likelihoods(self._prior, self._fields))
+        whole, scales = rows + moved, residual_likelihoods(self._prior, self._fields)
+        return RigEvidence(whole, whole.with_error(self._systematic), scales)
 
     def _moved(self) -> Evidence | None:
         """The evidence of motion: of the pairs, and of the incomplete one."""
@@ -219,8 +220,8 @@ class SelfCalibration:
         found = self.evidence()
         if found is None:
             return self._kept or SavedCalibration(self.posterior, rig_numbers(self.rig))
-        before = None if self._kept is None else self._kept.evidence
-        return joint_calibration(self.model, factory_prior(self.model), [found], self.config.systematic, before)
+        before = [] if self._kept is None or self._kept.evidence is None else [self._kept.evidence]
+        return joint_calibration(self.model, factory_prior(self.model), [*before, found])
 
     def summary(self) -> dict[str, Any]:
         """The result as plain types."""
@@ -257,10 +258,10 @@ class SelfCalibration:
         found = self.evidence()
         assert found is not None
         # The correction is to explain this recording, so it may take up what the residual fields do here.
-        self._own = solve(self._own_prior, moved, found.whole)
+        self._own = solve(self._own_prior, moved, found.plain)
         # What is still from the prior has no bias of this recording: the gain is the evidence's weight.
         gain = np.eye(len(self._systematic)) - self._own.covariance @ self._before
-        effect = self._own.covariance @ found.whole.cross
+        effect = self._own.covariance @ found.plain.cross
         self._by_bias = gain * self._systematic @ gain.T + found.fields * effect @ effect.T
 
 

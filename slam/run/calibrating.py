@@ -12,7 +12,7 @@ import numpy as np
 
 from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
-from slam.calibration.evidence import RecordingEvidence
+from slam.calibration.evidence import RigEvidence
 from slam.calibration.posterior import factory_prior
 from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
@@ -60,7 +60,7 @@ class Found:
     unsolved: int  # pairs of views for which no motion was found
     matched: float  # number of landmarks found again in a frame, the median
     posterior: RigPosterior  # from this recording alone
-    evidence: RecordingEvidence | None  # without any prior; None where no motion was seen
+    evidence: RigEvidence | None  # without any prior; None where no motion was seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +105,10 @@ def calibrate(
     require_outputs([Output(file, option) for file, option in files if file is not None], inputs, overwrite)
     configs = [_config(sequence, settings) for sequence in sequences]
     found = [_run(sequence, config, frames, show) for sequence, config in zip(sequences, configs)]
-    model, systematic = RigModel(rig), configs[0].self_calibration.systematic
+    model = RigModel(rig)
     evidence = [one.evidence for one in found if one.evidence is not None]
-    kept = joint_calibration(model, factory_prior(model), evidence, systematic)
-    apart = agreement(model, evidence, systematic)
+    kept = joint_calibration(model, factory_prior(model), evidence)
+    apart = agreement(model, evidence)
     agreed = "" if apart is None else agreement_in_words(apart)
     corrected = corrected_rig(model, kept.posterior.mean)
     pairs, unsolved = sum(one.pairs for one in found), sum(one.unsolved for one in found)
@@ -132,7 +132,9 @@ def calibrate(
     return Calibrated(found, kept, apart, agreed, judgement, worth, off, warning, units)
 
 
-def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: float, apart: Array | None) -> tuple[str, bool]:
+def _judged(
+    model: RigModel, posterior: RigPosterior, noise: float, matched: float, apart: Array | None
+) -> tuple[str, bool]:
     """What the errors of a calibration do to pixels and depths, in words, and whether correcting is expected to help.
 
     The noise [px] of a feature averages out over those of a frame, `matched` of them; the rig's error is in all alike.

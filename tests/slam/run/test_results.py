@@ -76,7 +76,9 @@ def test_doubtful_truth_is_named_and_not_the_covariance():
     """A run of frames whose truth was interpolated said "covariances are 12 times too small"."""
     tree = summary(1.0)
     tree["consistency"] |= {"doubtful truth over 10 m": 0.25}
-    assert verdict_of_run(tree).endswith("; not judged: 25 % of the stretches over 10 m, where the true path is doubtful")
+    assert verdict_of_run(tree).endswith(
+        "; not judged: 25 % of the stretches over 10 m, where the true path is doubtful"
+    )
     tree["consistency"]["mean NEES"] = float("nan")
     assert verdict_of_run(tree).startswith("covariances cannot be judged: the true path is doubtful")
 
