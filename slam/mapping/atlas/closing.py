@@ -18,9 +18,9 @@ from slam.mapping.atlas.pose_graph import Chain, PoseGraph
 from slam.rig_error import CommonError
 
 _DIMENSIONS = 6  # fixed: mean of χ² of a pose
-#: Largest squared Mahalanobis distance of a loop from the path alone: a number beyond five sigma is as rare. Drift grows
-#: by errors that neighbouring frames share, of which the path's covariance is a model, so it may be somewhat too small;
-#: and where right loops are refused the path stays wrong.
+#: Largest squared Mahalanobis distance of a loop from the path alone: a number beyond five sigma is as rare. Drift
+#: grows by errors that neighbouring frames share, of which the path's covariance is a model, so it may be somewhat too
+#: small; and where right loops are refused the path stays wrong.
 _FROM_PATH = chi_square_limit(_DIMENSIONS, 1 - 5.7e-7)
 #: The same where loops speak, each a measurement of its own: one right loop in 3,000 is farther off, for which others
 #: of its place stand in, while a lookalike that is let in bends the map.
