@@ -22,13 +22,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
-from experiments.common import script_options
+from experiments.common import path_of, script_options
 from experiments.labelled_cars import Car, Labels, hidden, labelled_speed, nearest_car, read_labels, read_tracklets
 from experiments.object_runs import (
     body_row,
     camera_figures,
     features_where,
-    path_of,
     places_together,
     plain_table,
     scored_run,

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 import slam
+from experiments.common import path_of
 from experiments.tables import markdown
 from slam import registry
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.objects import ObjectScore, labels_in_images, score_for
 from slam.evaluation.summary import evaluate
-from slam.geometry.trajectory import Trajectory
 
 
 @lru_cache(maxsize=2)
@@ -56,12 +56,6 @@ def features_where(features: StereoFeatures, keep: Any) -> StereoFeatures:
     """Those features (M) for which `keep` (N,) is true."""
     names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
     return replace(features, **{name: getattr(features, name)[keep] for name in names})
-
-
-def path_of(results: list[FrameResult]) -> Trajectory:
-    return Trajectory(
-        np.array([r.estimate.stamp for r in results]), np.array([r.estimate.T_world_left for r in results])
-    )
 
 
 def camera_figures(sequence: Any, results: list[FrameResult]) -> dict[str, float]:
