@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 import slam
+from slam.atlas.map_io import SavedMap
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures, StereoFrame
 from slam.errors import SlamError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.map_io import SavedMap
 from slam.system import StereoSlam
 from slam.testing.hostile import assert_definite, assert_sound
 from tests.fuzz.harness import Subject, require_line
