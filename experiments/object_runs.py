@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -48,14 +47,8 @@ def steps(
     for k, (features, labels) in enumerate(seen_in(name, images, frames)):
         if without:
             keep = labels == 0 if images else labels <= 0  # features on its outline move with it
-            features, labels = features_where(features, keep), labels[keep]
+            features, labels = features.select(keep), labels[keep]
         yield k, system.process_features(features), labels
-
-
-def features_where(features: StereoFeatures, keep: Any) -> StereoFeatures:
-    """Those features (M) for which `keep` (N,) is true."""
-    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
-    return replace(features, **{name: getattr(features, name)[keep] for name in names})
 
 
 def camera_figures(sequence: Any, results: list[FrameResult]) -> dict[str, float]:

@@ -245,7 +245,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     chosen = [e for e in EXPERIMENTS if not given.only or e.name in given.only]
     with ThreadPoolExecutor(given.processes) as pool:
-        outcomes = list(pool.map(lambda e: run(e, given.out, given.quick), chosen))
+        last_first = list(
+            pool.map(lambda e: run(e, given.out, given.quick), chosen[::-1])
+        )  # the last ones take longest
+    outcomes = last_first[::-1]
     folder = given.page.with_name("results")
     folder.mkdir(parents=True, exist_ok=True)
     for name in dict.fromkeys(e.page for e in chosen):
