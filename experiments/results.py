@@ -244,11 +244,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--processes", type=int, default=1, help="how many scripts run at once")
     given = parser.parse_args(arguments)
     chosen = [e for e in EXPERIMENTS if not given.only or e.name in given.only]
-    with ThreadPoolExecutor(given.processes) as pool:
-        last_first = list(
-            pool.map(lambda e: run(e, given.out, given.quick), chosen[::-1])
-        )  # the last ones take longest
-    outcomes = last_first[::-1]
+    with ThreadPoolExecutor(given.processes) as pool:  # the last ones take longest
+        outcomes = list(pool.map(lambda e: run(e, given.out, given.quick), chosen[::-1]))[::-1]
     folder = given.page.with_name("results")
     folder.mkdir(parents=True, exist_ok=True)
     for name in dict.fromkeys(e.page for e in chosen):
