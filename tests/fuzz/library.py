@@ -1,9 +1,9 @@
-"""Public classes and functions with hostile values, and hostile frames and features for the whole system."""
+"""Public classes and functions with hostile values, and hostile frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,8 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.system import StereoSlam
-from slam.testing.hostile import assert_definite, assert_sound
 from tests.fuzz.harness import Subject, require_line
 from tests.fuzz.hostile import NUMBERS, VALUES, choose
-from tests.fuzz.settings import scene
 
 CLASSES = (StereoRig, PinholeCamera, Trajectory, Observations, StereoFeatures, SavedMap)
 RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
@@ -29,8 +27,6 @@ RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
 _STAMPS = (
     None, "x", np.nan, np.inf, -np.inf, -1.0, 0.0, 1e9, 1e18, 1e300, 10**400, 1j, True, np.float32(1), [1.0],
 )  # fmt: skip
-_ARRAYS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
-_NUMBERS = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-300, 1e300, 1e30, 1e9, -1e9, 1e-12)
 
 
 def made_of_anything(rng: np.random.Generator, folder: Path) -> None:
@@ -73,47 +69,6 @@ def functions(rng: np.random.Generator, folder: Path) -> None:
     choose(rng, calls)()
 
 
-def hostile_features(rng: np.random.Generator, folder: Path) -> None:
-    """Good frames with hostile ones among them; the good ones after them must still be taken."""
-    rig, frames = scene()
-    system = StereoSlam(rig, None, choose(rng, ("ekf", "smoother")))
-    system.process_features(frames[0])
-    for features in frames[1:4]:
-        try:
-            result = system.process_features(_spoilt(rng, features))
-        except SlamError as error:
-            require_line(error)
-        else:
-            assert_definite(result.estimate.covariance[None], "a frame's pose")
-    assert_sound(system.estimate(), "the estimate")
-
-
-def _spoilt(rng: np.random.Generator, features: StereoFeatures) -> StereoFeatures:
-    """Features with one array, the stamp, or everything replaced."""
-    kind = int(rng.integers(7))
-    if kind == 0:
-        return replace(features, stamp=choose(rng, _STAMPS))
-    if kind == 1:
-        return choose(rng, (None, 1, "features", [], {}, np.zeros((3, 2))))
-    name = choose(rng, _ARRAYS)
-    array = np.array(getattr(features, name))
-    if kind == 2:
-        return replace(features, **{name: choose(rng, VALUES)})
-    if kind == 3:
-        other = (
-            array[..., None], array.astype(object), array.astype("U8"), array.astype(complex), list(array), array.T,
-            array[:, :1] if array.ndim > 1 else array[:, None], array.astype(np.float16),
-        )  # fmt: skip
-        return replace(features, **{name: choose(rng, other)})
-    if kind == 4:
-        return features if rng.random() < 0.5 else StereoFeatures.empty(features.stamp, choose(rng, (0, 1, 16, 64)))
-    if array.dtype.kind == "f" and len(array):
-        chosen = rng.random(array.shape) < choose(rng, (0.02, 0.5, 1.0))
-        with np.errstate(all="ignore"):
-            array[chosen] = choose(rng, _NUMBERS)
-    return replace(features, **{name: array})
-
-
 def hostile_images(rng: np.random.Generator, folder: Path) -> None:
     """A frame whose images are none, or not of the rig's size or type, between two good ones."""
     system = StereoSlam(RIG, "surf", choose(rng, ("ekf", "smoother")))
@@ -141,6 +96,5 @@ def hostile_images(rng: np.random.Generator, folder: Path) -> None:
 SUBJECTS = (
     Subject("public classes", made_of_anything, quiet=False, short=60),
     Subject("public functions", functions, quiet=False, short=40),
-    Subject("features", hostile_features, quiet=False, short=40),
     Subject("images", hostile_images, quiet=False, short=8),
 )
