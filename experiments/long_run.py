@@ -44,15 +44,10 @@ _POSE_BYTES = 8 + 128  # of a stamp and a pose of the trajectory
 
 @dataclass(frozen=True)
 class Corridor:
-    """A camera that walks along a corridor for ever, swaying; landmarks on both walls, drawn as it comes along.
+    """A camera that walks along a corridor for ever, swaying; landmarks on both walls, drawn as it comes along."""
 
-    Attributes:
-        density: landmarks per metre.
-        speed: [m/s].
-    """
-
-    density: int = 10
-    speed: float = 1.0
+    density: int = 10  # landmarks per metre
+    speed: float = 1.0  # [m/s]
 
     def pose(self, stamp: float) -> Array:
         """True ``T_world_left`` (4, 4)."""
