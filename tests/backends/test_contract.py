@@ -25,8 +25,12 @@ def by_name(check):
     return check.__name__
 
 
+#: The one that solves for everything in every frame takes ten times as long as the others.
+NAMES = [pytest.param(n, marks=pytest.mark.slow) if n == "batch" else n for n in backends.names()]
+
+
 @pytest.mark.parametrize("check", BACKEND_CHECKS, ids=by_name)
-@pytest.mark.parametrize("name", backends.names())
+@pytest.mark.parametrize("name", NAMES)
 def test_contract(name, check):
     check(registry.resolve("backends", name))
 
