@@ -77,14 +77,7 @@ def points_of(image: NDArray) -> Points:
 
 
 def pair_geometry(rig: StereoRig, left: Points, right: Points, rows: float) -> PairGeometry:
-    """How the matches of two images fit the rig.
-
-    Args:
-        rig: the cameras.
-        left: points of the left image.
-        right: those of the right one.
-        rows: largest row difference that the front end allows [px].
-    """
+    """How the matches of two images fit the rig; `rows` is the largest row difference that it may have [px]."""
     import cv2
 
     pixels = _matches(left, right)
