@@ -16,6 +16,7 @@ from slam.geometry.se3 import Array
 #: 1000 px. Rows tell which it is, so the range matters only where it is too narrow.
 RESIDUAL_SCALES = np.geomspace(0.05, 5.0, 10)
 
+_MEDIAN = chi_square_limit(1, 0.5)  # derived: of χ² with one degree of freedom
 _PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts for
 
 
@@ -175,7 +176,7 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
     squared = np.square(vertical + A @ parameters)
     # Weights by Student's t distribution of four degrees of freedom, with tails like those of matches.
     # 0.03: standard deviation of a row [px], the least that is believed
-    scale = max(median(squared) / chi_square_limit(1, 0.5), 0.03**2)
+    scale = max(median(squared) / _MEDIAN, 0.03**2)
     weights = (5.0 / (4.0 + squared / scale) / scale)[:, None]
     both = np.column_stack([A, fields[:, -len(RESIDUAL) :]])
     weighted, n = both * weights, A.shape[1]

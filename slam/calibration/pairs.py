@@ -22,6 +22,7 @@ from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import Matches, match_everywhere
 
 _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
+_MEDIAN_1, _MEDIAN_3 = chi_square_limit(1, 0.5), chi_square_limit(3, 0.5)  # derived: medians of χ²
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
 _EACH = _AGREES / np.sqrt(2)  # the same of each coordinate in each of the two views, all equally exact
 
@@ -95,7 +96,7 @@ def pair_of(
         R, t = fitted.R, fitted.t
         distance = linearised(one, two, one, R, t, model.focal, noise).squared
         # 16.3: χ²(3) at 99.9 %, largest squared distance of a match that agrees
-        agree = distance <= 16.3 * median(distance[agree]) / chi_square_limit(3, 0.5)
+        agree = distance <= 16.3 * median(distance[agree]) / _MEDIAN_3
     return Pair(one[agree], two[agree], R, t)
 
 
@@ -137,7 +138,7 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
     from slam.calibration.kernels import fit
 
     arrays = (np.ascontiguousarray(a, float) for a in (first, second, R, t))
-    R, t, points, at, weights, last = fit(*arrays, focal, noise, chi_square_limit(3, 0.5))
+    R, t, points, at, weights, last = fit(*arrays, focal, noise, _MEDIAN_3)
     # 3e-3: change of a predicted point [px] in the last iteration: in some pairs single points oscillate
     return Fit(R, t, points, Linear(*at), weights) if last < 3e-3 else None
 
@@ -177,7 +178,7 @@ def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
     growth = 1 + np.square(J) @ np.diag(noise) / np.diag(noise)
     squares = np.square(pair.second - moved) / growth
     squares = squares[np.isfinite(squares).all(axis=1)]
-    found = np.array([median(squares[:, :2]), median(squares[:, 2])]) / chi_square_limit(1, 0.5)
+    found = np.array([median(squares[:, :2]), median(squares[:, 2])]) / _MEDIAN_1
     return np.maximum(found, 1e-3**2)  # 1e-3: least noise of pixels and disparities [px]
 
 

@@ -38,22 +38,13 @@ _ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding
 
 
 def consistency_figures(
-    own: Trajectory,
-    true: Trajectory,
-    covariances: Array,
-    noise: TruthNoise,
+    own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise,
     common: Sequence[CommonError] | None = None,
-) -> dict[str, float]:
+) -> dict[str, float]:  # fmt: skip
     """The figures of a run's summary; those that the path is too short for are left out.
 
-    The first pose defines the world and is left out; the start is the first pose whose truth was measured.
-
-    Args:
-        own: the online path (N poses).
-        true: the truth at the same stamps.
-        covariances: of the path's poses (N, 6, 6).
-        noise: of the truth.
-        common: the part of the covariances that the poses share (N); None for none.
+    The first pose defines the world and is left out; the start is the first pose whose truth was measured. The online
+    path has covariances (N, 6, 6), of which the poses share `common` (N), and the truth the same stamps.
 
     Returns:
         "mean NEES" from the start, "NEES over L m" for each of `STRETCHES`; six is right for all of these, and "band
@@ -95,14 +86,9 @@ def _closings(covariances: Array) -> RowArray:
 
 
 def stretch_nees(
-    own: Trajectory,
-    true: Trajectory,
-    covariances: Array,
-    noise: TruthNoise,
-    first: RowArray,
-    last: RowArray,
+    own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise, first: RowArray, last: RowArray,
     common: Sequence[CommonError] | None = None,
-) -> Array:
+) -> Array:  # fmt: skip
     """NEES (M,) of the relative poses between rows `first` and `last` (M,).
 
     NaN where the covariance is none, or the truth is doubtful.

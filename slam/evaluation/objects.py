@@ -23,11 +23,8 @@ def motion_errors(estimated: Array, true: Array) -> PathErrors:
     """Errors of the motions from row to row, in the true body's frame before the motion.
 
     ``E = T⁻¹ (H_est⁻¹ H_true) T`` with ``H = T_k T_{k−1}⁻¹`` in world coordinates and T the true pose at k − 1. It
-    does not depend on where in the body its frame was put, and the translation is that of the body's own place.
-
-    Args:
-        estimated: poses T_world_object (N, 4, 4).
-        true: the true ones in the same world frame; the body frames may differ.
+    does not depend on where in the body its frame was put, and the translation is that of the body's own place. The
+    poses T_world_object (N, 4, 4) are in one world; the body frames may differ.
     """
     H, G, before = estimated[1:] @ inverse(estimated[:-1]), true[1:] @ inverse(true[:-1]), true[:-1]
     return error_sizes(inverse(before) @ inverse(H) @ G @ before)
@@ -63,14 +60,10 @@ def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
 
     A body's frame is put somewhere before the camera at its first sight, by definition. With the true motion
     ``H = T_k T_0⁻¹`` and where the frame truly was then, from the true camera, the error is ``log(T_est,k⁻¹ H T_0)``.
+    So the first estimated pose (N, 4, 4) is that of the frame as seen from the true camera; covariances (N, 6, 6) are
+    right perturbations.
 
-    Args:
-        estimated: poses T_world_object (N, 4, 4); the first is that of the frame as seen from the true camera.
-        covariances: theirs (N, 6, 6), right perturbations.
-        true: the true ones in the same world frame; the body frames may differ.
-
-    Returns:
-        a value for each row but the first; rows whose covariance is numerically singular are left out.
+    A value for each row but the first; rows whose covariance is numerically singular are left out.
     """
     e = log(inverse(estimated[1:]) @ true[1:] @ inverse(true[0]) @ estimated[0])
     P = covariances[1:]
@@ -128,13 +121,7 @@ class ObjectScore:
         self._seen_from: dict[int, Array] = {}  # the camera's pose by frame, as it was estimated
 
     def add(self, frame: int, result: FrameResult, labels: NDArray) -> None:
-        """Take in one frame.
-
-        Args:
-            frame: its number.
-            result: of the step.
-            labels: the body of each feature (N,), 0 for the still world, −1 for features that are nothing.
-        """
+        """Take in a frame, with the body of each feature (N,): 0 for the still world, −1 for what is nothing."""
         if self._world is None:
             self._world = result.estimate.T_world_left @ inverse(self.cameras[frame])
         self._seen_from[frame] = result.estimate.T_world_left
@@ -196,11 +183,7 @@ class ObjectScore:
         return figures
 
     def poses_of(self, body: int) -> tuple[NDArray[np.intp], Array, Array] | None:
-        """Where the longest-lived object of a body was measured.
-
-        Returns:
-            frames (M,), its poses and the true ones (M, 4, 4) in the same world frame; None where there is no object.
-        """
+        """Frames (M,) in which a body's longest-lived object was measured, its poses and the true ones (M, 4, 4)."""
         life = self._longest(body)
         if life is None:
             return None

@@ -70,12 +70,7 @@ def _at(mask: BoolArray, uv: Array) -> BoolArray:
 
 
 def following(features: StereoFeatures, dimensions: int | None, after: float) -> StereoFeatures:
-    """The features; a frame without any gets descriptors (0, `dimensions`).
-
-    Args:
-        features: as documented.
-        dimensions: length of the descriptors so far; None if there were none.
-        after: stamp of the frame before [s].
+    """The features of a frame after the stamp [s] of the last one; without any, descriptors are (0, `dimensions`).
 
     Raises:
         MeasurementError: the stamp is not later, or the descriptors are of another length.

@@ -25,8 +25,6 @@ _SHOWN_PLAIN = 0.9  # guard: the same of cameras that are rectified but for lens
 #: Disparities below this count as zero [px].
 NO_DISPARITY = _TOLERANCE
 
-_LENS_IS_RIGHT = 0.1  # guard: a lens is calibrated to a tenth of its distortion, and mostly far better
-
 _SAMPLE = 8  # fixed: matches that any fundamental matrix can be made to fit
 _SIGMAS = 5.0  # guard: a chance of 3e-7 to be wrong
 
@@ -79,14 +77,7 @@ def points_of(image: NDArray) -> Points:
 
 
 def pair_geometry(rig: StereoRig, left: Points, right: Points, rows: float) -> PairGeometry:
-    """How the matches of two images fit the rig.
-
-    Args:
-        rig: the cameras.
-        left: points of the left image.
-        right: those of the right one.
-        rows: largest row difference that the front end allows [px].
-    """
+    """How the matches of two images fit the rig; `rows` is the largest row difference that it may have [px]."""
     import cv2
 
     pixels = _matches(left, right)

@@ -60,16 +60,16 @@ class InputWarnings:
         self._farthest = farthest_apart(rig, models)
         self._stamps: list[float] = []
         self._count = self._poor = self._unpaired = 0
-        self._pair_is_named = self._pair_is_known = self._moment_is_known = False  # as wrong; as right
-        self._texture_is_known = self._partners_are_known = False
-        self._two_images = self._copied = False  # a pair of different images was seen, a copy was named
+        self._pair_warned = self._pair_is_right = self._moment_is_right = False
+        self._texture_warned = self._partners_explained = False
+        self._two_images = self._copy_warned = False  # a pair of different images was seen, a copy was named
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
         self._before: _Images | None = None
         self._fits = np.zeros(3, int)  # matches with the right image of this frame, the next one and the one before
         for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig.left, rig.right))):
             self._warn(unlikely)
-            self._pair_is_named = self._partners_are_known = True  # and what follows from it is not
+            self._pair_warned = self._partners_explained = True  # and what follows from it is not
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
         """Check a frame and the features found in it, which are as documented.
@@ -79,22 +79,20 @@ class InputWarnings:
                 the other way round, and hardly any has a right match as it is. Nothing is changed then.
         """
         own, images = None, _Images(frame, self._rig)
-        if (
-            self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK and not self._pair_is_named
-        ):  # 0, 1, 2, 4 …
+        if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK and not self._pair_warned:  # 0, 1, 2, 4 …
             own = self._geometry(images, images)
             unpaired = 10 * int(features.has_stereo.sum()) < len(features)
-            if own is not None and not self._pair_is_known and own.swapped and unpaired:
+            if own is not None and not self._pair_is_right and own.swapped and unpaired:
                 raise SequenceError(_swapped(own))
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
                 self._check_intervals(float(np.median(np.diff(self._stamps))))
-        if not self._texture_is_known:
+        if not self._texture_warned:
             self._check_texture(frame.left, len(features))
         if own is not None:
             self._check_pair(images, own)
-        if not self._partners_are_known and frame.right is not None:
+        if not self._partners_explained and frame.right is not None:
             self._check_partners(features)
         self._before = images
         self._count += 1
@@ -117,7 +115,7 @@ class InputWarnings:
         """Warn if images show nothing for several frames."""
         self._poor = self._poor + 1 if features < ENOUGH_FEATURES else 0
         if self._poor >= _POOR:
-            self._texture_is_known = True
+            self._texture_warned = True
             low, high = grey_range(image)
             self._warn(
                 f"the images show hardly anything to follow ({features} features in frame {self._count}, grey values "
@@ -131,7 +129,7 @@ class InputWarnings:
         self._unpaired = self._unpaired + 1 if len(features) >= 2 * ENOUGH_FEATURES and stereo < ENOUGH_FEATURES else 0
         if self._unpaired < _POOR:
             return
-        self._partners_are_known = True
+        self._partners_explained = True
         alike = features.descriptors @ features.descriptors.T > 1 - 0.5 * _ALIKE**2
         apart = np.abs(features.uv_left[:, None] - features.uv_left[None]).max(axis=2) > features.scale[:, None]
         doubles = int((alike & apart).any(axis=1).sum())
@@ -150,20 +148,20 @@ class InputWarnings:
 
     def _check_pair(self, images: _Images, own: PairGeometry) -> None:
         """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
-        if not self._pair_is_known and (own.swapped or own.same):
-            self._pair_is_named = True
+        if not self._pair_is_right and (own.swapped or own.same):
+            self._pair_warned = True
             horizon = self._rig.rectified.rig.left.fu * self._rig.baseline / NO_DISPARITY
             same = (
                 f"left and right image show the same: {own.at_same_place} of {own.matches} features have no "
                 f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
             )
             self._warn(_swapped(own) if own.swapped else same)
-        elif not self._pair_is_known and self._before is not None and own.shown < 1:
-            self._pair_is_named = True  # hardly a feature fits then, and of another moment's some may by chance
+        elif not self._pair_is_right and self._before is not None and own.shown < 1:
+            self._pair_warned = True  # hardly a feature fits then, and of another moment's some may by chance
             self._warn(_rows_differ(own, self._rig))
-        elif self._before is not None and (not self._moment_is_known or own.as_given < _FITS * own.matches):
+        elif self._before is not None and (not self._moment_is_right or own.as_given < _FITS * own.matches):
             self._check_moment(images, own)
-        self._partners_are_known |= self._pair_is_named  # the reason is known then
+        self._partners_explained |= self._pair_warned  # the reason is known then
 
     def _check_moment(self, images: _Images, own: PairGeometry) -> None:
         """Warn if left images fit the right ones of other frames, or else if rows do not match."""
@@ -171,24 +169,24 @@ class InputWarnings:
         neighbours = self._geometry(self._before, images), self._geometry(images, self._before)
         if neighbours[0] is not None and neighbours[1] is not None:
             self._fits += [own.as_given, neighbours[0].as_given, neighbours[1].as_given]
-        fit, *others = self._fits.tolist()
-        if most(max(others), fit):
-            self._pair_is_named = True
-            which, wrong = ("before", "late") if others[0] >= others[1] else ("after", "early")
-            since = "left and right image are not of one moment" + ", though they were" * self._moment_is_known
+        fit, *shifted = self._fits.tolist()
+        if most(max(shifted), fit):
+            self._pair_warned = True
+            which, wrong = ("before", "late") if shifted[0] >= shifted[1] else ("after", "early")
+            since = "left and right image are not of one moment" + ", though they were" * self._moment_is_right
             self._warn(
-                f"{since}: {max(others)} features fit the rig with the left image of the frame {which}, {fit} with "
+                f"{since}: {max(shifted)} features fit the rig with the left image of the frame {which}, {fit} with "
                 f"that of the same frame, {self._count}; the right images are a frame too {wrong}: pair them by their "
                 "times, or shift their numbers by one"
             )
             return
-        if all(most(fit, other) for other in others):
-            self._moment_is_known = True
+        if all(most(fit, other) for other in shifted):
+            self._moment_is_right = True
             self._fits[:] = 0  # what comes later is counted anew
-        if own.conclusive and not self._pair_is_known:
-            self._pair_is_known = True
+        if own.conclusive and not self._pair_is_right:
+            self._pair_is_right = True
             if own.rows_differ:
-                self._pair_is_named = True
+                self._pair_warned = True
                 self._warn(_rows_differ(own, self._rig))
 
     def _geometry(self, left: _Images, right: _Images) -> PairGeometry | None:
@@ -198,7 +196,7 @@ class InputWarnings:
         try:
             return pair_geometry(self._rig, left.left, right.right, self._rows)
         except CalibrationError:  # the rig cannot be rectified: a front end may not need that
-            self._pair_is_named = True
+            self._pair_warned = True
             return None
 
     def copied(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[Checksum | None, str]:
@@ -231,8 +229,8 @@ class InputWarnings:
         self._two_images |= checksum is not None and shows_something(frame.right)
         if checksum != self._last:
             self._last, self._last_copy = checksum, copy
-        if copy and not self._copied:
-            self._copied = True
+        if copy and not self._copy_warned:
+            self._copy_warned = True
             self._warn(f"frame {frame.index}: {copy}; it and others like it are used without the right image")
 
     def note_repeated(self, number: int) -> None:

@@ -91,18 +91,10 @@ class LandmarkTable(Table):
         self.returning[rows] = successive
 
     def count_frame(
-        self,
-        frame: int,
-        in_view: IndexArray,
-        measured: IndexArray,
-        features: StereoFeatures,
-        feature_rows: IndexArray,
-        descriptor_update: float = 1.0,
-        camera: Array | None = None,
-        outside: IndexArray | slice = slice(0),
-        rematch_after: int = 0,
-        withheld: IndexArray | slice = slice(0),
-    ) -> None:
+        self, frame: int, in_view: IndexArray, measured: IndexArray, features: StereoFeatures,
+        feature_rows: IndexArray, descriptor_update: float = 1.0, camera: Array | None = None,
+        outside: IndexArray | slice = slice(0), rematch_after: int = 0, withheld: IndexArray | slice = slice(0),
+    ) -> None:  # fmt: skip
         """Count a frame, in place, given which rows were in view, which were measured, and by which features.
 
         `descriptor_update` is the weight of the new descriptors in the landmarks' own: 1 keeps the newest, 0 the first.
