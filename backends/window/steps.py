@@ -13,6 +13,7 @@ from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.kernels import seen
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window import chart_kernels, motion, pose_only
+from slam.window.consensus import landmarks_pose
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.problem import Motion, Places, RelativePrior, Rows
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
@@ -133,8 +134,7 @@ class Steps(RectifiedMeasurement):
 
     def _rows(self, s: WindowState, points: IndexArray, z: Array) -> Rows:
         """Measurements from the newest pose."""
-        n = len(points)
-        return Rows(np.full(n, len(s.frames) - 1), points, z, np.full(n, 1 / self.models.pixel_sigma))
+        return Rows.of(len(s.frames) - 1, points, z, self.models.pixel_sigma)
 
     def _agreement(self, s: WindowState, points: IndexArray, z: Array, guess: Array | None) -> Agreement:
         """Initial value of the newest pose, and which measurements agree with it."""
@@ -146,7 +146,7 @@ class Steps(RectifiedMeasurement):
         one = pose_only.PoseProblem(self.stereo, position, z, noise, T, information, self.models.gate_probability)
 
         def search() -> Array | None:
-            return self.landmarks_pose(position, z, T, int(s.frames[-1]))
+            return landmarks_pose(self, position, z, T, int(s.frames[-1]))
 
         return agreement(one, T if guess is None else guess, search, s.contradicted, _lost(s))
 

@@ -13,11 +13,12 @@ from slam.bodies.frame import Frame
 from slam.bodies.points import MIN_POINTS
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.arrays import among
-from slam.geometry.pnp import find_consensus, measurement_rows
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import ObjectObservations
 from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
+from slam.window.consensus import find_consensus
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # cost: poses tried for a body that is found again

@@ -18,8 +18,8 @@ from slam.calibration.model import RigModel
 from slam.chi_square import chi_square_limit
 from slam.data import StereoFeatures
 from slam.geometry.arrays import median
-from slam.geometry.pnp import find_consensus
 from slam.geometry.se3 import Array, inverse
+from slam.window.consensus import find_consensus
 
 _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
-from slam.geometry.pnp import CLEAR_MAJORITY, MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
+from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.models import EstimatorModels
@@ -23,6 +23,7 @@ from slam.tracks.standing import Standing
 from slam.tracks.state import NO_POSE, PoseHypotheses, TrackingState
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import similar_view
+from slam.window.consensus import CLEAR_MAJORITY, PoseConsensus, find_consensus
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,9 @@ import numpy as np
 
 from slam.kernels.linear import assign, row_times, turn
 from slam.kernels.se3 import transform_back
-from slam.kernels.stereo import by_pose, residual
+from slam.kernels.stereo import by_pose
 from slam.runtime.compilation import helper, kernel
-from slam.window.kernels import ELIMINATED, KNOWN
+from slam.window.terms import ELIMINATED, KNOWN, whitened_residual
 
 
 @kernel
@@ -108,7 +108,7 @@ def rig_columns(
     `prior` are the derivatives of the prior's η, `by_first` those of its numbers by the first pose; `members` of the
     `unknown` points are the prior's. Second, ``inverse gradient`` (N, 3, m) of the points that are eliminated.
     """
-    pose, point, z, weight = rows
+    pose, point, z, root = rows
     m, mine, shift = field.shape[2], 3 * members, 3 * (unknown - members)
     B = np.zeros((n, m))
     for i in range(len(prior)):
@@ -123,12 +123,13 @@ def rig_columns(
     for row in range(len(pose)):
         T, p, at = poses[pose[row]], point[row], column[pose[row]]
         transform_back(T, points[p], q)
-        if weight[row] == 0.0 or not residual(camera, q, z[row], r, D):
+        if root[row, 0, 0] == 0.0 or not whitened_residual(camera, q, z[row], root[row], r, D):
             continue
         for i in range(3):
-            w = 0.0 if np.isnan(r[i]) else weight[row] * weight[row]
             for k in range(m):
-                F[i, k] = w * field[row, i, k] if w > 0.0 else 0.0
+                F[i, k] = 0.0
+                for j in range(i + 1 if D[i, i % 2] != 0.0 else 0):  # none of what is not measured
+                    F[i, k] += root[row, i, j] * field[row, j, k]
             by_pose(D[i], q, J[i])
             x, y, h = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
             for a in range(3):

@@ -8,31 +8,31 @@ from functools import cached_property
 import numpy as np
 
 from slam.geometry.arrays import Array, IndexArray, Table
-from slam.window import chart_kernels, kernels
+from slam.window import chart_kernels, kernels, terms
 from slam.window.stereo import RectifiedStereo
 
-KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
+KNOWN, ELIMINATED = terms.KNOWN, terms.ELIMINATED
 
 
 @dataclass(frozen=True, eq=False)
 class Rows(Table):
-    """Measurements of points from poses, a row each.
+    """Measurements of points from poses, a row each."""
 
-    Attributes:
-        pose, point: indices of the pose and the point (M,).
-        z: as `RectifiedStereo.measure` gives them (M, 3) = (uL, vL, uR); uR is NaN where there is no right pixel.
-        weight: 1 / σ (M,) [1/px]; 0 for a row that does not count.
-    """
+    pose: IndexArray  # indices of the pose (M,)
+    point: IndexArray  # and of the point (M,)
+    z: Array  # as `RectifiedStereo.measure` gives them (M, 3) = (uL, vL, uR) [px]; uR NaN: there is no right pixel
+    root: Array  # inverse Cholesky factors of the noise's covariances (M, 3, 3) [1/px]; 0 for a row that does not count
 
-    pose: IndexArray
-    point: IndexArray
-    z: Array
-    weight: Array
+    @classmethod
+    def of(cls, pose: IndexArray | int, point: IndexArray, z: Array, sigma: float) -> Rows:
+        """Measurements with independent noise of each pixel, `sigma` [px], from one pose or from poses (M,)."""
+        n = len(point)
+        return cls(np.full(n, pose), point, z, np.tile(np.eye(3) / sigma, (n, 1, 1)))
 
     @classmethod
     def none(cls) -> Rows:
         """No measurement."""
-        return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros(0))
+        return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,10 @@ import numpy as np
 from slam.data import Estimate, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
-from slam.geometry.pnp import find_consensus
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
+from slam.window.consensus import find_consensus
 from slam.window.gating import chi_square_gate
 
 MODELS = EstimatorModels()
