@@ -28,8 +28,8 @@ MAY_IMPORT = {
     "input": {"tracks", "data", "geometry", "runtime"},
     "system": {"papers", "bodies", "mapping", "tracks", "calibration", "input", "data", "geometry", "runtime"},
     "run": {
-        "system", "calibration", "bodies", "mapping", "tracks", "window", "input", "sequences", "worlds", "evaluation", "data",
-        "geometry", "runtime",
+        "system", "calibration", "bodies", "mapping", "tracks", "window", "input", "sequences", "worlds", "evaluation",
+        "data", "geometry", "runtime",
     },
     "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "bodies"},
     "testing": {"system", "worlds", "data", "geometry"},
