@@ -23,11 +23,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
 from experiments.tables import markdown, picture, write_json
+from slam.atlas.atlas import Atlas
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.geometry.se3 import inverse, log
 from slam.geometry.trajectory import Trajectory, align_positions
-from slam.mapping.atlas.atlas import Atlas
 from slam.registry import ONLINE
 from slam.sequences import open_sequence
 from slam.system import StereoSlam

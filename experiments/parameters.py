@@ -23,7 +23,7 @@ sys.path.insert(0, str(ROOT))
 
 #: Where constants that shape an estimate are; worlds, readers, reports and commands have none.
 ROOMS = (
-    "slam/kernels", "slam/geometry", "slam/tracks", "slam/mapping", "slam/calibration", "slam/bodies", "slam/papers",
+    "slam/kernels", "slam/geometry", "slam/tracks", "slam/tracks", "slam/calibration", "slam/bodies", "slam/papers",
     "backends", "frontends",
 )  # fmt: skip
 

@@ -39,7 +39,7 @@ from slam.geometry.trajectory import Trajectory
 
 BACKENDS = ("ekf", "smoother")
 FACTORS = (0.5, 2.0)
-_ORDER = ("backends", "slam/bodies", "slam/tracks", "slam/mapping", "slam/geometry", "slam/calibration")
+_ORDER = ("backends", "slam/bodies", "slam/tracks", "slam/tracks", "slam/geometry", "slam/calibration")
 _PERTURBATIONS = 6  # runs of the default with noise, for the scatter
 _PIXEL_NOISE = 0.05  # [px]
 _LOST = 20.0  # times the error of the default: the run has lost its way

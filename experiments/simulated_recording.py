@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from slam.data import IdArray, Observations
-from slam.mapping.config import MapConfig
-from slam.mapping.management import new_landmarks
 from slam.models import EstimatorModels, models_for
 from slam.run.recording import RecordedFrame, Recording
+from slam.tracks.config import MapConfig
+from slam.tracks.management import new_landmarks
 from slam.worlds.observe import SimulatedFeatures
 from slam.worlds.sequence import WorldSequence
 

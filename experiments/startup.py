@@ -24,10 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from backends import create
 from experiments.common import script_options
 from experiments.tables import picture, show
+from slam.atlas.map_io import SavedMap
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures
 from slam.geometry import se3
-from slam.mapping.map_io import SavedMap
 from slam.models import MotionModel
 from slam.registry import ONLINE
 from slam.sequences import open_sequence

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 from slam.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from slam.atlas.map_io import SavedMap as SavedMap
+    from slam.atlas.map_io import load_map as load_map
+    from slam.atlas.map_io import save_map as save_map
     from slam.calibration.saved import SavedCalibration as SavedCalibration
     from slam.calibration.saved import load_calibration as load_calibration
     from slam.calibration.saved import save_calibration as save_calibration
     from slam.config import SystemConfig as SystemConfig
     from slam.geometry.rig import StereoRig as StereoRig
     from slam.geometry.trajectory import Trajectory as Trajectory
-    from slam.mapping.map_io import SavedMap as SavedMap
-    from slam.mapping.map_io import load_map as load_map
-    from slam.mapping.map_io import save_map as save_map
     from slam.run.warm_up import warm_up as warm_up
     from slam.sequences import open_sequence as open_sequence
     from slam.sequences.live import LiveFrames as LiveFrames
@@ -37,7 +37,7 @@ _PUBLIC = {
     "LiveFrames": "slam.sequences.live",
     "Observations": "slam.data",
     "PinholeCamera": "slam.geometry.camera",
-    "SavedMap": "slam.mapping.map_io",
+    "SavedMap": "slam.atlas.map_io",
     "SlamError": "slam.errors",
     "StereoFeatures": "slam.data",
     "StereoFrame": "slam.data",
@@ -46,11 +46,11 @@ _PUBLIC = {
     "SystemConfig": "slam.config",
     "Trajectory": "slam.geometry.trajectory",
     "load_calibration": "slam.calibration.saved",
-    "load_map": "slam.mapping.map_io",
+    "load_map": "slam.atlas.map_io",
     "load_rig": "slam.sequences.rigs",
     "open_sequence": "slam.sequences",
     "save_calibration": "slam.calibration.saved",
-    "save_map": "slam.mapping.map_io",
+    "save_map": "slam.atlas.map_io",
     "warm_up": "slam.run.warm_up",
 }
 

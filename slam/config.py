@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from slam.atlas.config import AtlasConfig
 from slam.bodies.config import ObjectsConfig
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
-from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.config import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for, require_not_negative
 from slam.settings import apply_settings
-from slam.tracks.config import AssociationConfig
+from slam.tracks.config import AssociationConfig, MapConfig
 
 #: Map management by kind of motion: a car does not soon return to what it has passed, and gets so much nearer to what
 #: lies ahead that descriptors change. With more landmarks errors on drives are no smaller (`experiments/knee.py`).

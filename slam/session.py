@@ -13,7 +13,11 @@ from typing import Any
 import numpy as np
 
 from slam import registry
+from slam.atlas.atlas import Atlas, TrackingGap
+from slam.atlas.loop_closer import Found, LoopCloser
+from slam.atlas.map_io import SavedMap
 from slam.calibration import RemainingRigError, SelfCalibration
+from slam.checks import definite
 from slam.config import SystemConfig
 from slam.data import (
     Estimate,
@@ -29,17 +33,13 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, MapBackend
-from slam.mapping.atlas.atlas import Atlas, TrackingGap
-from slam.mapping.atlas.loop_closer import Found, LoopCloser
-from slam.mapping.known_landmarks import definite
-from slam.mapping.map_io import SavedMap
-from slam.mapping.mapper import Mapper
-from slam.mapping.monocular import FirstViews
-from slam.mapping.step import Step
 from slam.rig_error import CommonError
 from slam.tracks.localizer import Localizer, nowhere
+from slam.tracks.mapper import Mapper
+from slam.tracks.monocular import FirstViews
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
+from slam.tracks.step import Step
 from slam.tracks.table import Tracks
 
 #: Standard deviations of the initial pose [m], [rad] of a back end that starts in a map. They are wide, because the
@@ -75,11 +75,11 @@ class State:
         """Whether the back end takes over in this frame."""
         return index in self.restarted[-1:]
 
-    def after(self, step: Step, checksum: tuple[int, int] | None) -> State:
+    def after(self, step: Step, atlas: Atlas, checksum: tuple[int, int] | None) -> State:
         """The state after one more frame."""
         located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
         return replace(
-            self, tracks=step.tracks, views=step.views, atlas=step.atlas, index=step.index,
+            self, tracks=step.tracks, views=step.views, atlas=atlas, index=step.index,
             stamp=step.features.stamp, tracking=step.tracking,
             standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, mapped=self.mapped or len(step.added) > 0,
@@ -184,7 +184,7 @@ class Session:
         self.mapper.next_id = saved.next_id
         if place is not None:
             assert tracks is not None
-            tracks = self.mapper.insert(new, tracks, place)
+            tracks = self.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
         return replace(state, backend=new, tracks=tracks, prior_map=None)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
@@ -233,8 +233,9 @@ class Session:
             new.insert(whole.ids, whole.positions, definite(whole.covariances))  # type: ignore[attr-defined]
             if elsewhere.place is not None:
                 assert tracks is not None
-                tracks = self.mapper.insert(new, tracks, elsewhere.place)
-                seen_at = elsewhere.place.stamp
+                place = elsewhere.place
+                tracks = self.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
+                seen_at = place.stamp
             prediction = new.predict(stamp)
             standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
             atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), seen_at)

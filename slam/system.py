@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from slam import registry
+from slam.atlas.atlas import Atlas
+from slam.atlas.map_io import FIRST_FRAME, SavedMap
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector, ObjectDetector
 from slam.calibration import SavedCalibration, SelfCalibration
@@ -22,9 +24,6 @@ from slam.input.features import documented, following
 from slam.input.rectification import Rectification
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
-from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.map_io import FIRST_FRAME, SavedMap
-from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.naming import count
 from slam.papers.procedure1 import Procedure1Detector
@@ -34,6 +33,7 @@ from slam.runtime.threads import OneThread, one_blas_thread, prefetch
 from slam.session import Elsewhere, Session, State
 from slam.third_party import named_failures
 from slam.tracker import Tracker, frame_result
+from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
 
 #: Types of a system's arguments.
@@ -229,7 +229,9 @@ class StereoSlam:
         """Make exceptions of third-party parts say what failed, and where."""
         return named_failures(place, self.backend, self.frontend)
 
-    def _step(self, state: State, features: StereoFeatures, begun: Prediction | None = None) -> Step | Elsewhere:
+    def _step(
+        self, state: State, features: StereoFeatures, begun: Prediction | None = None
+    ) -> tuple[Step, Atlas] | Elsewhere:
         """The way of a frame from its features, as measured, to the map, beside the state before the frame.
 
         `begun` is the prediction of a back end that takes over in this frame, at a pose that is believed.
@@ -249,9 +251,9 @@ class StereoSlam:
             step = t.estimate(state, step)
         with stage("objects"):  # still, moving or undecided; moving bodies (paper B, 3): `slam.bodies.detector`
             step = t.sort(state, step)
-        with stage("manage"):  # count, erase and add landmarks (paper A, IV): `slam.mapping.mapper`
+        with stage("manage"):  # count, erase and add landmarks (paper A, IV): `slam.tracks.mapper`
             step = t.manage(state, step)
-        with stage("atlas"):  # the frame may become a keyframe, a loop corrects the path: `slam.mapping.atlas`
+        with stage("atlas"):  # the frame may become a keyframe, a loop corrects the path: `slam.atlas`
             return t.close_loops(state, step)
 
     @one_blas_thread
@@ -274,16 +276,17 @@ class StereoSlam:
             features = StereoFeatures.empty(features.stamp, features.descriptors.shape[1], features.threshold)
         with self._stages.stage("predict"):
             revision = tracker.revise(state)
-        step = self._step(state, features)
-        if isinstance(step, Elsewhere):  # another back end begins there, in the map or in a new one
-            state, begun = session.taken_over(state, step, features)
+        done = self._step(state, features)
+        if isinstance(done, Elsewhere):  # another back end begins there, in the map or in a new one
+            state, begun = session.taken_over(state, done, features)
             self.objects.restart()
-            step = self._step(state, features, begun)
-            assert not isinstance(step, Elsewhere)  # a back end that takes over is believed
+            done = self._step(state, features, begun)
+            assert not isinstance(done, Elsewhere)  # a back end that takes over is believed
+        step, atlas = done
         step = replace(session.with_takeover(self._state, state, step), repeated=repeated)
         common = session.rig_error.common(state.backend, as_reported=True)
-        result = frame_result(step, state.mapped, revision, self._stages.milliseconds, common)
-        self._state, self._stages = state.after(step, checksum), Stages()
+        result = frame_result(step, atlas, state.mapped, revision, self._stages.milliseconds, common)
+        self._state, self._stages = state.after(step, atlas, checksum), Stages()
         return out(result)
 
     def _roll_back(self) -> None:

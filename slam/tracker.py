@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam.atlas.atlas import Atlas
 from slam.bodies.detector import ObjectDetector
 from slam.data import (
     Estimate,
@@ -22,7 +23,6 @@ from slam.geometry.arrays import Array, isin
 from slam.geometry.se3 import inverse
 from slam.input.warnings import REPEATED
 from slam.interfaces import AligningFrontend, Frontend, RestingBackend
-from slam.mapping.step import Step
 from slam.object_data import MovingObject
 from slam.rig_error import CommonError, Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
@@ -31,6 +31,7 @@ from slam.tracks.alignment import align, take_patches
 from slam.tracks.localizer import LandmarkMatches, Search
 from slam.tracks.standing import Standing
 from slam.tracks.state import HIDDEN
+from slam.tracks.step import Step
 from slam.tracks.table import Tracks
 
 
@@ -104,7 +105,7 @@ class Tracker:
             corrected = _shifted_as(corrected, features, aligned)
         step = Step(
             index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking,
-            state.atlas, state.views,
+            state.views,
         )  # fmt: skip
         suspects = self._suspects(step)
         moving = isin(matches.ids, suspects)
@@ -156,15 +157,15 @@ class Tracker:
             take_patches(self._aligning, step.measured, seen, step.tracks, T)
         return step
 
-    def close_loops(self, state: State, step: Step) -> Step:
-        """Make the frame a keyframe where it differs; a loop corrects the path.
+    def close_loops(self, state: State, step: Step) -> tuple[Step, Atlas]:
+        """The step, its pose with the rig's uncertainty, and the atlas after it.
 
-        The rig's uncertainty is added to the pose.
+        The frame becomes a keyframe where its view differs; a loop corrects the path.
         """
         session, rig_error, backend = self._session, self._session.rig_error, state.backend
         estimate, common = rig_error.added_to(backend, step.estimate), rig_error.common(backend, as_reported=False)
         step = replace(step, estimate=estimate, common=common, correction=session.calibration.applied)
-        return replace(step, atlas=session.loop_closer.update(state.atlas, step, state.path))
+        return step, session.loop_closer.update(state.atlas, step, state.path)
 
     def roll_back(self, state: State) -> State:
         """The state after an interrupted step: what that did to the back end's map is undone, bodies are forgotten."""
@@ -188,7 +189,8 @@ def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFe
 
 
 def frame_result(
-    step: Step, mapped_before: bool, revision: Revision | None, milliseconds: Mapping[str, float], common: CommonError
+    step: Step, atlas: Atlas, mapped_before: bool, revision: Revision | None, milliseconds: Mapping[str, float],
+    common: CommonError,
 ) -> FrameResult:  # fmt: skip
     """The result of a step.
 
@@ -196,7 +198,7 @@ def frame_result(
     correction before the step, `common` the part of the pose's error that it shares with the poses reported in other
     frames.
     """
-    atlas, objects = step.atlas, step.objects
+    objects = step.objects
     if atlas.loops:
         objects = tuple(_in_map(thing, atlas.T_map_odom) for thing in objects)
     status, reason = _status(step, mapped_before)

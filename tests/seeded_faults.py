@@ -140,12 +140,12 @@ FAULTS = (
     Fault(
         "withheld landmarks count as missed", "slam/tracks/table.py",
         "view = in_view[counts[in_view]]", "view = in_view[:]",
-        "tests/slam/tracks tests/slam/mapping",
+        "tests/slam/tracks tests/slam/tracks",
     ),
     Fault(
         "a hidden landmark counts as missed", "slam/tracks/visibility.py",
         "out[rows] = ~hidden_landmarks(view, rows, features, radius)", "out[rows] = True",
-        "tests/slam/tracks tests/slam/mapping",
+        "tests/slam/tracks tests/slam/tracks",
     ),
     # moving bodies
     Fault(
@@ -173,20 +173,20 @@ FAULTS = (
     ),
     # keyframes and loops
     Fault(
-        "a relative pose's covariance forgets the turn between its frames", "slam/mapping/atlas/pose_graph.py",
+        "a relative pose's covariance forgets the turn between its frames", "slam/atlas/pose_graph.py",
         "J = np.concatenate([-adjoint(inverse(T)), np.eye(6)], axis=1)",
         "J = np.concatenate([-np.eye(6), np.eye(6)], axis=1)",
-        "tests/slam/mapping",
+        "tests/slam/tracks",
     ),
     Fault(
-        "a loop is tested without its own covariance", "slam/mapping/atlas/closing.py",
+        "a loop is tested without its own covariance", "slam/atlas/closing.py",
         "return distance(T, loop.T_first_second, P + loop.covariance)", "return distance(T, loop.T_first_second, P)",
-        "tests/slam/mapping/atlas/test_pose_graph.py tests/slam/mapping",
+        "tests/slam/atlas/test_pose_graph.py tests/slam/tracks",
     ),
     Fault(
-        "errors of earlier stretches are counted again", "slam/mapping/atlas/pose_graph.py",
+        "errors of earlier stretches are counted again", "slam/atlas/pose_graph.py",
         "total -= total[begin]", "total -= 0 * total[begin]",
-        "tests/slam/mapping",
+        "tests/slam/tracks",
     ),
     # calibration
     Fault(

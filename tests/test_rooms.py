@@ -19,16 +19,16 @@ MAY_IMPORT = {
     "window": {"data", "geometry", "kernels", "runtime"},
     "tracks": {"window", "data", "geometry", "kernels", "runtime"},
     "calibration": {"window", "data", "geometry", "kernels", "runtime"},
-    "mapping": {"tracks", "window", "data", "geometry", "runtime"},
+    "atlas": {"tracks", "window", "data", "geometry", "runtime"},
     "bodies": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
     "papers": {"bodies", "tracks", "data", "geometry", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},
     "evaluation": {"data", "geometry"},
     "input": {"tracks", "data", "geometry", "runtime"},
-    "system": {"papers", "bodies", "mapping", "tracks", "calibration", "input", "data", "geometry", "runtime"},
+    "system": {"papers", "bodies", "atlas", "tracks", "calibration", "input", "data", "geometry", "runtime"},
     "run": {
-        "system", "calibration", "bodies", "mapping", "tracks", "window", "input", "sequences", "worlds", "evaluation",
+        "system", "calibration", "bodies", "atlas", "tracks", "window", "input", "sequences", "worlds", "evaluation",
         "data", "geometry", "runtime",
     },
     "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "bodies"},
@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "commands": {
         "compare", "run", "bodies", "system", "sequences", "worlds", "evaluation", "data", "geometry", "runtime",
     },
-    "outside": {"run", "system", "mapping", "calibration", "sequences", "data", "geometry", "runtime"},
+    "outside": {"run", "system", "atlas", "calibration", "sequences", "data", "geometry", "runtime"},
 }  # fmt: skip
 
 #: The root's modules by room; all others are "base".

@@ -15,14 +15,13 @@ from backends.ekf.recovery import agreement
 from backends.ekf.solve import UnsolvableError, Update
 from backends.ekf.state import FilterState
 from slam.bounds import from_options, require_positive
-from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
+from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.window.consensus import landmarks_pose

@@ -12,13 +12,12 @@ from backends.window.history import History, state_corrected
 from backends.window.state import WindowConfig, WindowState, settle
 from backends.window.steps import Steps
 from slam.bounds import from_options
-from slam.checks import require_guess, require_not_measured, require_recent, require_stamp
+from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import known_landmarks
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.window.stereo import TOO_LATE, Field

@@ -26,7 +26,7 @@ class RunOptions:
     start: int = 0
     stop: int | None = None  # range of frames; None for all
     record: Path | None = None  # file for a recording of what the back end is given, see `slam.run.replay`
-    prior_map: Path | None = None  # file of a map to start in, see `slam.mapping.map_io`; None to begin a new one
+    prior_map: Path | None = None  # file of a map to start in, see `slam.atlas.map_io`; None to begin a new one
     save_map: Path | None = None  # file for the map at the end
     calibration: Path | None = None  # file with what is known of the rig's error, see `slam.calibration.saved`
     mono: bool = False  # use the left images alone

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from slam.atlas.atlas import Atlas
 from slam.data import Estimate, FrameResult, IdArray
 from slam.errors import SlamError
 from slam.files import RowFile, lock_folder, reason, remove_file, write_text
 from slam.geometry.se3 import Array, angles, transform
 from slam.geometry.trajectory import Trajectory, tum_line
-from slam.mapping.atlas.atlas import Atlas
 from slam.object_data import MovingObject
 from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
 from slam.tracks.table import LandmarkTable

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from slam import registry
+from slam.atlas.map_io import load_map, save_map
 from slam.calibration import load_calibration
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
@@ -19,7 +20,6 @@ from slam.evaluation.summary import with_truth
 from slam.geometry.trajectory import Trajectory
 from slam.input.rectification import Rectification
 from slam.interfaces import Frontend
-from slam.mapping.map_io import load_map, save_map
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt

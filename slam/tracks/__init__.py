@@ -2,5 +2,7 @@
 
 `table` is that table, `follow` finds the features that continue its rows, `localizer` keeps the matches that agree on
 one camera pose, `state` says whether the camera is tracked, `standing` whether it stands; `alignment` moves features to
-the points first seen. May import `slam.geometry`, `slam.runtime` and the data.
+the points first seen. `mapper` counts, adds and erases landmarks after a frame: `management` chooses them, `monocular`
+triangulates features without a right image. `step` is the frame in work. May import `slam.geometry`, `slam.runtime` and
+the data.
 """

@@ -16,10 +16,10 @@ from experiments.simulated_recording import true_recording
 from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
-from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.run.replay import replay
 from slam.system import StereoSlam
+from slam.tracks.config import MapConfig
 from slam.worlds import open_world
 from tests.backends.scenes import RIG, path, run, scene, step
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 import slam
+from slam.atlas.config import AtlasConfig
 from slam.config import SystemConfig
 from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateStatus
 from slam.errors import SlamError
-from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.config import MapConfig
 from slam.system import StereoSlam
+from slam.tracks.config import MapConfig
 from tests.fuzz.harness import Broken, Subject, require_line
 from tests.fuzz.hostile import choose
 from tests.slam.test_interrupted import Lines

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from slam.atlas.map_io import load_map
 from slam.config import SystemConfig
 from slam.data import StereoFrame
 from slam.errors import SequenceError, SlamError
 from slam.files import lock_folder
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.map_io import load_map
 from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS
 from slam.run.recording import load_recording

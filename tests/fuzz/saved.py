@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from slam.atlas.map_io import SavedMap, decode, encode
 from slam.bodies.config import ObjectsConfig
 from slam.calibration.saved import SavedCalibration, load_calibration
 from slam.config import SystemConfig
 from slam.geometry.rig_numbers import rig_numbers
-from slam.mapping.map_io import SavedMap, decode, encode
 from slam.papers.procedure1 import ObjectDatabase
 from slam.run.options import RunOptions
 from slam.run.recording import load_recording, record, save_recording

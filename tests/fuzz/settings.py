@@ -18,10 +18,9 @@ from slam.calibration.config import SelfCalibrationConfig
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.system import StereoSlam
-from slam.tracks.config import AssociationConfig
+from slam.tracks.config import AssociationConfig, MapConfig
 from tests.fuzz.harness import Subject
 from tests.fuzz.hostile import NUMBERS, VALUES, choose
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 import slam
+from slam.atlas.map_io import SavedMap
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.map_io import SavedMap
 from slam.system import StereoSlam
 from tests.fuzz.harness import Subject
 from tests.fuzz.hostile import NUMBERS, VALUES, choose

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from experiments.simulated_recording import true_recording
+from slam.atlas.map_io import SavedMap
 from slam.errors import SequenceError, SlamError
-from slam.mapping.map_io import SavedMap
 from slam.run.recording import load_recording, save_recording
 from slam.sequences import open_sequence
 from slam.system import StereoSlam

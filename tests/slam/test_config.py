@@ -11,7 +11,7 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, one_line
-from slam.mapping.config import MapConfig
+from slam.tracks.config import MapConfig
 from tests.fuzz.settings import CLASSES
 
 

@@ -18,10 +18,10 @@ import slam
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError, PartError
-from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.system import StereoSlam
+from slam.tracks.config import MapConfig
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother", "window")

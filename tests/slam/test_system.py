@@ -10,9 +10,9 @@ from slam.bodies.detector import ObjectDetector
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
-from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
+from slam.tracks.config import MapConfig
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "iekf", "smoother", "window")

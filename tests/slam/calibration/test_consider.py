@@ -12,9 +12,9 @@ from slam.calibration.consider import BASELINE, FollowedErrors
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import inverse, log
-from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
+from slam.tracks.config import MapConfig
 from tests.slam.scene import RIG, Cloud, path
 
 #: By which share of an error's effect each may be off: the smoother's pose and landmarks are followed one by one, by

@@ -10,10 +10,10 @@ import sys
 
 import pytest
 
+from slam.atlas.map_io import load_map
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.files import RowFile, read_bytes, whole_file
-from slam.mapping.map_io import load_map
 from slam.run import runner
 from slam.run.options import RunOptions
 from slam.run.outputs import RunFiles

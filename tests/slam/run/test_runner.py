@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from slam.atlas.config import AtlasConfig
+from slam.atlas.map_io import load_map
 from slam.config import SystemConfig
 from slam.errors import MeasurementError, SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.map_io import load_map
 from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.run.recording import RecordedFrame, load_recording

@@ -10,9 +10,9 @@ import pytest
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.geometry import se3
-from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
+from slam.tracks.config import MapConfig
 from slam.tracks.state import TrackingState
 from tests.slam.scene import RIG, Cloud, path
 

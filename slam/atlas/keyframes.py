@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.atlas.config import AtlasConfig
 from slam.data import IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, transform
-from slam.mapping.atlas.config import AtlasConfig
 from slam.rig_error import Correction
 
 _ROUNDING = 1e-14  # numerics: variances below this share of the largest are rounding

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import eigvalsh
 
+from slam.atlas.atlas import Atlas
+from slam.atlas.config import AtlasConfig
+from slam.atlas.keyframes import Loop, distance
+from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Loop, distance
-from slam.mapping.atlas.pose_graph import Chain, PoseGraph
 from slam.rig_error import CommonError
 
 _DIMENSIONS = 6  # fixed: mean of χ² of a pose

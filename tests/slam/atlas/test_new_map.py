@@ -10,12 +10,12 @@ import pytest
 from scipy.stats import chi2
 
 import slam
+from slam.atlas.atlas import covariance_after_unseen_motion
 from slam.data import FrameResult, StereoFeatures
 from slam.geometry.se3 import inverse, log
-from slam.mapping.atlas.atlas import covariance_after_unseen_motion
 from slam.models import KINDS
 from slam.system import StereoSlam
-from tests.slam.mapping.atlas.test_atlas import sequence, system_for  # noqa: F401 (a fixture)
+from tests.slam.atlas.test_atlas import sequence, system_for  # noqa: F401 (a fixture)
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother", "window")

@@ -13,7 +13,7 @@ from slam.chi_square import SIGMAS
 from slam.data import StereoFeatures
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.rig import StereoRig
-from slam.mapping.config import MapConfig
+from slam.tracks.config import MapConfig
 from slam.tracks.follow import crowded, pairs_in_boxes
 from slam.tracks.table import LandmarkTable
 from slam.tracks.visibility import MapView

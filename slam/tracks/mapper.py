@@ -6,16 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam.checks import in_front
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.errors import ConfigurationError
-from slam.geometry.arrays import isin
+from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend, MapBackend
-from slam.mapping.atlas.loop_closer import Found
-from slam.mapping.config import MapConfig
-from slam.mapping.known_landmarks import in_front
-from slam.mapping.management import (
+from slam.third_party import checked
+from slam.tracks.config import MapConfig
+from slam.tracks.localizer import LandmarkMatches, Localizer
+from slam.tracks.management import (
     bad_landmarks,
     crowded_landmarks,
     doubled_landmarks,
@@ -23,11 +24,9 @@ from slam.mapping.management import (
     new_landmarks,
     surplus_landmarks,
 )
-from slam.mapping.monocular import depths_by_motion, frame_covariance, unclaimed
-from slam.mapping.step import Step
-from slam.third_party import checked
-from slam.tracks.localizer import LandmarkMatches, Localizer
-from slam.tracks.table import Tracks
+from slam.tracks.monocular import depths_by_motion, frame_covariance, unclaimed
+from slam.tracks.step import Step
+from slam.tracks.table import LandmarkTable, Tracks
 from slam.tracks.visibility import MapView, expected_landmarks
 
 
@@ -75,15 +74,21 @@ class Mapper:
             backend.remove(erased)
         return replace(step, erased=erased)
 
-    def insert(self, backend: Backend, tracks: Tracks, place: Found) -> Tracks:
-        """Add landmarks of an old place to the map, as from a saved map; those already in it are unchanged."""
+    def insert(
+        self, backend: Backend, tracks: Tracks, landmarks: LandmarkTable, positions: Array, covariances: Array
+    ) -> Tracks:
+        """Add the landmarks of an old place (M,) to the map, as from a saved map; those already in it are unchanged.
+
+        Their positions (M, 3) [m] and covariances (M, 3, 3) [m²] are in the back end's world; ids are −1 where a
+        landmark needs a new one.
+        """
         assert isinstance(backend, MapBackend)  # only such back ends start in a map
-        old = place.landmarks.ids
+        old = landmarks.ids
         new = np.flatnonzero(~np.isin(old, tracks.ids) | (old < 0))
         ids, without = old[new], old[new] < 0
         ids[without] = self._new_ids(int(without.sum()))
-        backend.insert(ids, place.positions[new], place.covariances[new])
-        return tracks.with_landmarks(replace(place.landmarks.select(new), ids=ids))
+        backend.insert(ids, positions[new], covariances[new])
+        return tracks.with_landmarks(replace(landmarks.select(new), ids=ids))
 
     def reconcile(self, backend: Backend, tracks: Tracks | None) -> Tracks | None:
         """Make table and back end agree after an interrupted step: landmarks that only one of them has are erased.

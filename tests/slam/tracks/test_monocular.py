@@ -7,12 +7,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from slam.atlas.map_io import SavedMap
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.geometry import se3
-from slam.mapping.map_io import SavedMap
-from slam.mapping.monocular import frame_covariance, two_view_depth
 from slam.system import StereoSlam
+from slam.tracks.monocular import frame_covariance, two_view_depth
 from tests.slam.scene import RIG, Cloud
 
 BACKENDS = ("ekf", "smoother", "window")

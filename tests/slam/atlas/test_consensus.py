@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slam.atlas.atlas import Atlas
+from slam.atlas.closing import close
+from slam.atlas.keyframes import Keyframe, Loop
+from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.geometry.se3 import Array, exp, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.atlas.closing import close
-from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.atlas.pose_graph import Chain, PoseGraph
 from slam.rig_error import CommonError
 
 LAP, DEPTH = 60, 2.0
@@ -73,7 +73,7 @@ def error(atlas: Atlas) -> float:
 @pytest.fixture(autouse=True)
 def _one_witness(monkeypatch):
     """A loop needs no other keyframe that sees it."""
-    monkeypatch.setattr("slam.mapping.atlas.closing._agree", lambda *_: True)
+    monkeypatch.setattr("slam.atlas.closing._agree", lambda *_: True)
 
 
 def test_true_loops_take_the_place_of_a_false_one_before_them():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.mapping.atlas.places import PlaceIndex
+from slam.atlas.places import PlaceIndex
 
 
 def places(count: int, seed: int = 0) -> np.ndarray:

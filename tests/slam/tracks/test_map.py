@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from slam.data import StereoFeatures
-from slam.mapping.config import MapConfig
-from slam.mapping.management import (
+from slam.tracks.config import MapConfig
+from slam.tracks.management import (
     bad_landmarks,
     crowded_landmarks,
     doubled_landmarks,

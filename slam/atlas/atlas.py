@@ -15,12 +15,12 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
+from slam.atlas.keyframes import Keyframe, Loop, covariance_growth
+from slam.atlas.places import PlaceIndex
+from slam.atlas.pose_graph import Chain, PoseGraph, between_keyframes
 from slam.data import Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
-from slam.mapping.atlas.places import PlaceIndex
-from slam.mapping.atlas.pose_graph import Chain, PoseGraph, between_keyframes
 from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
 

@@ -10,9 +10,9 @@ import pytest
 
 from slam.bodies.config import ObjectsConfig
 from slam.config import SystemConfig
-from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
+from slam.tracks.config import MapConfig
 from tests.slam.scene import RIG, Cloud, path
 
 CONFIG = SystemConfig(

@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 import pytest
 
+from slam.atlas.closing import disagreement, is_informative
+from slam.atlas.keyframes import Loop
+from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.geometry.se3 import exp, inverse, log
-from slam.mapping.atlas.closing import disagreement, is_informative
-from slam.mapping.atlas.keyframes import Loop
-from slam.mapping.atlas.pose_graph import Chain, PoseGraph
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
 

@@ -20,16 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.archives import array, json_text, unpack
-from slam.checks import FARTHEST_POSITION, MOST_ID
+from slam.atlas.atlas import Atlas
+from slam.atlas.keyframes import Keyframe, Loop
+from slam.checks import FARTHEST_POSITION, MOST_ID, definite, require_known
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
 from slam.files import read_bytes, whole_file
 from slam.geometry.rig import StereoRig
 from slam.geometry.rig_numbers import rig_difference, rig_numbers
 from slam.geometry.se3 import Array, nearest_rotation
-from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.known_landmarks import definite, require_known
 from slam.naming import count
 from slam.tracks.table import LandmarkTable
 from slam.version import __version__

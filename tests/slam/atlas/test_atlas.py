@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import slam
+from slam.atlas.atlas import Loop, landmarks_by_pose
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Observations, Prediction, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import adjoint, exp, inverse, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.atlas import Loop, landmarks_by_pose
 
 LAP = 100  # frames
 BIAS, SIGMAS = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, 5e-3]), np.array([1e-3, 2e-3, 1e-3, 5e-3, 5e-3, 1e-2])
@@ -181,7 +181,7 @@ def test_a_run_in_a_saved_map_keeps_its_keyframes_and_loops(closed, sequence, tm
 
 
 def test_loops_stay_bounded_and_spread_along_the_path(closed, monkeypatch):
-    monkeypatch.setattr("slam.mapping.atlas.atlas._ACTIVE", 6)
+    monkeypatch.setattr("slam.atlas.atlas._ACTIVE", 6)
     atlas = replace(closed[0].atlas, loops=(), dropped=0)
     seconds = range(10, len(atlas))
     for second in seconds:

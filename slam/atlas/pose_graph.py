@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.atlas.keyframes import Loop
 from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, hat, inverse, log
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.keyframes import Loop
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -350,7 +350,7 @@ _SYMMETRIC = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
 def _root_of_information(covariances: Array) -> Array:
     """Matrices R (E, 6, 6) with ``Rᵀ R`` the inverse of covariances (E, 6, 6), some of which may be singular.
 
-    The noise of single steps can be zero in some directions (see `slam.mapping.atlas.keyframes`). Such directions get a
+    The noise of single steps can be zero in some directions (see `slam.atlas.keyframes`). Such directions get a
     least variance, because exact steps would make the normal equations numerically singular.
     """
     covariances = covariances + LEAST_VARIANCE * np.eye(6)

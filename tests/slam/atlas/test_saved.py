@@ -7,10 +7,10 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from slam.atlas.keyframes import Keyframe, Loop
+from slam.atlas.map_io import SavedMap, decode, encode, map_arrays, map_of
 from slam.errors import SlamError
 from slam.geometry.se3 import exp
-from slam.mapping.atlas.keyframes import Keyframe, Loop
-from slam.mapping.map_io import SavedMap, decode, encode, map_arrays, map_of
 
 
 def keyframe(seed: int) -> Keyframe:

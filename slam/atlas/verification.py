@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam.atlas.config import AtlasConfig
+from slam.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.data import StereoFeatures
 from slam.geometry.kernels import residuals
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
 from slam.window.problem import Rows, Window

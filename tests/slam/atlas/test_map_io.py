@@ -10,13 +10,13 @@ from io import BytesIO
 import numpy as np
 import pytest
 
+from slam.atlas.map_io import SavedMap, decode, encode, load_map, save_map
+from slam.checks import definite, require_known
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.mapping.known_landmarks import definite, require_known
-from slam.mapping.map_io import SavedMap, decode, encode, load_map, save_map
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path

@@ -8,11 +8,10 @@ import numpy as np
 
 from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array
-from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.monocular import FirstViews
 from slam.object_data import MotionLabels, MovingObject
 from slam.rig_error import CommonError, Correction
 from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.monocular import FirstViews
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
 from slam.tracks.table import Tracks
@@ -33,7 +32,6 @@ class Step:
     matches: LandmarkMatches  # landmarks and the features that show them, without the withheld ones
     standing: Standing  # whether the camera stands
     tracking: TrackingState  # whether the pose is known
-    atlas: Atlas  # keyframes and loops
     views: FirstViews | None = None  # features without depth that are followed; None for none
     suspects: IdArray = field(default_factory=_NONE.copy)  # ids of landmarks that may move
     # those of them that were matched; they are withheld from the back end's update

@@ -8,24 +8,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.atlas.atlas import Atlas
+from slam.atlas.closing import close
+from slam.atlas.config import AtlasConfig
+from slam.atlas.keyframes import Keyframe, Loop, step_covariance, view_has_changed
+from slam.atlas.verification import keyframe_landmarks, verify
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.atlas.closing import close
-from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, Loop, step_covariance, view_has_changed
-from slam.mapping.atlas.verification import keyframe_landmarks, verify
-from slam.mapping.management import depth_is_known
-from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.rig_error import Correction
 from slam.runtime.threads import one_blas_thread
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
 from slam.tracks.localizer import Localizer
+from slam.tracks.management import depth_is_known
+from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
 
 _NEARBY = 4  # cost: keyframes compared because they are near the path, besides those that look alike
