@@ -62,7 +62,7 @@ class Steps(RectifiedMeasurement):
         if begins or rests or s.frames[-1] == s.frames[-2] + 1:  # else the velocity before has left the window
             one = np.array([[-1 if unknown else K - 2, K - 1, K]])
             sigma = np.full(6, motion.STANDS / dt) if rests else motion.velocity_sigmas(self.models, dt, unknown)
-            moves = moves.joined(Motion(one, np.array([[before or 1.0, dt]]), 1 / sigma[None]))
+            moves = moves.joined(Motion(one, np.array([[before or 1.0, dt]]), np.zeros((1, 6)), sigma[None] ** 2))
         return replace(
             s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp), motion=moves,
             poses=np.concatenate([s.poses, T[None]]), covariance=P, measured=False,

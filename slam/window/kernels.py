@@ -9,7 +9,7 @@ Arrays that many loops take: `poses` (K, 4, 4) and `column`, their first unknown
 (N, 3, 3); `pose_of`, the poses of all rows, then of all places; `first` and `order`, these by point, see `by_point`;
 `H` (n, n), lower triangle, and `b` (n,), which are added to; `information` (N, 3, 3) and `gradient` (N, 3) of each
 point by its rows; `cross`, what each row or place tells of pose and point together (M + Q, 6, 3). `rows`, `places`,
-`motion`, `carried` and `prior` are tuples of the arrays of the classes of that name in `slam.window.problem`.
+`motion` and `prior` are tuples of the arrays of the classes of that name in `slam.window.problem`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from slam.kernels.linear import invert_symmetric, row_times, square, turn
 from slam.kernels.se3 import move, transform_back
 from slam.kernels.stereo import residual
 from slam.runtime.compilation import helper, kernel
-from slam.window.carried import add_carried, add_motion
 from slam.window.chart_kernels import charts, displace
-from slam.window.terms import ELIMINATED, add_own_priors, add_places, add_prior, add_rows, whitened_residual
+from slam.window.terms import ELIMINATED, add_motion, add_own_priors, add_prior, add_rows, whitened_residual
 
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
 _NEAR = 50.0  # numerics: a step with a factor of its own is the last at this many times `close`: it leaves the square
@@ -30,7 +29,7 @@ _NEAR = 50.0  # numerics: a step with a factor of its own is the last at this ma
 
 @kernel
 def gauss_newton(
-    camera, poses, column, points, place, basis, centre, rows, places, own, motion, carried, prior, pose_of, first,
+    camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first,
     order, n, huber, close, steps,
 ):  # fmt: skip
     """Gauss-Newton with halved steps on a window's normal equations ``H x = b`` (n,), its points eliminated.
@@ -55,16 +54,11 @@ def gauss_newton(
             H[:] = 0.0
         cost, A = add_prior(poses, points, 3 * len(basis), prior, whole, H, b)
         cost += add_rows(
-            camera, poses, column, points, place, E, rows, huber, whole, H, b, information, gradient, cross
-        )  # fmt: skip
-        cost += add_places(
-            poses, column, points, place, E, places, whole, H, b, information, gradient, cross[len(rows[0]) :]
+            camera, poses, column, points, place, E, rows, places, huber, whole, H, b, information, gradient, cross
         )
         if len(own[0]):
             cost += add_own_priors(points, place, E, own[0], own[1], information, gradient)
         cost += add_motion(poses, column, motion, H, b)
-        if len(carried[2]):
-            cost += add_carried(poses, column, carried, H, b)
         inverse = _eliminate(column, place, pose_of, cross, first, order, information, gradient, whole, H, b)
         if whole or cost <= best + 1e-9 * abs(best) + 1e-12:
             start = poses, points, E, inverse, gradient, cross

@@ -148,7 +148,7 @@ def _gauss_newton(w: Window, centre: int, huber: float, close: float, steps: int
     )
     found: tuple[Any, ...] = kernels.gauss_newton(
         w.stereo.intrinsics, w.poses, w.column, w.points, w.place, w.basis, centre, w.rows.arrays, w.places.arrays, own,
-        w.motion.arrays, w.carried.arrays, w.prior.arrays, w.pose_of, *w.by_point, w.unknowns, huber, close, steps,
+        w.motion.arrays, w.prior.arrays, w.pose_of, *w.by_point, w.unknowns, huber, close, steps,
     )  # fmt: skip
     return found
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import row_times
-from slam.kernels.se3 import adjoint, between, log, transform_back
+from slam.kernels.linear import multiply, row_times
+from slam.kernels.se3 import adjoint, between, compose, log, transform_back
 from slam.kernels.stereo import by_pose, residual
+from slam.kernels.velocities import add_velocity_rows, velocity_change
 from slam.runtime.compilation import helper
 from slam.window.chart_kernels import chart
 
@@ -107,31 +108,40 @@ def _prior_rows(poses, points, prior, delta, A):
 
 
 @helper
-def add_rows(camera, poses, column, points, place, E, rows, huber, whole, H, b, information, gradient, cross):
-    """Add measurements. Returns the sum of squares, of what is beyond `huber` as Huber (1964) counts it."""
+def add_rows(camera, poses, column, points, place, E, rows, places, huber, whole, H, b, information, gradient, cross):
+    """Add measurements, then points known relative to a pose: ``root ((α, β, ρ) − origin)`` is unit noise.
+
+    Returns the sum of squares, of what a measurement has beyond `huber` as Huber (1964) counts it.
+    """
     pose, point, z, root = rows
     cost, q, r, D = 0.0, np.empty(3), np.empty(3), np.empty((3, 3))
-    J, Jp = np.empty((3, 6)), np.empty((3, 3))
-    for m in range(len(pose)):
-        if root[m, 0, 0] == 0.0:
+    s, S, J, Jp = np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
+    for m in range(len(cross)):
+        at = m - len(pose)
+        k, p = (pose[m], point[m]) if at < 0 else (places[0][at], places[1][at])
+        if at >= 0:
+            front = chart(poses[k], points[p], places[2][at], places[3][at], q, s, S)
+            for i in range(3):
+                r[i] = -row_times(places[4][at], i, s)
+            multiply(places[4][at], S, D)
+        elif root[m, 0, 0] == 0.0:
             continue
-        transform_back(poses[pose[m]], points[point[m]], q)
-        if not whitened_residual(camera, q, z[m], root[m], r, D):
+        else:
+            transform_back(poses[k], points[p], q)
+            front = whitened_residual(camera, q, z[m], root[m], r, D)
+        if not front:
             cost += _BEHIND
             continue
         square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-        if square > huber * huber:
-            size = np.sqrt(square)
-            scale = np.sqrt(huber / size)
+        if at < 0 and square > huber * huber:
+            scale = np.sqrt(huber / np.sqrt(square))
             for i in range(3):
                 r[i] *= scale
                 for j in range(3):
                     D[i, j] *= scale
-            square = huber * (2.0 * size - huber)
+            square = huber * (2.0 * np.sqrt(square) - huber)
         cost += square
-        _add_row(
-            poses, column, place, E, pose[m], point[m], q, r, D, J, Jp, whole, H, b, information, gradient, cross[m]
-        )  # fmt: skip
+        _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, whole, H, b, information, gradient, cross[m])
     return cost
 
 
@@ -186,28 +196,6 @@ def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, whole, H, b, informa
 
 
 @helper
-def add_places(poses, column, points, place, E, places, whole, H, b, information, gradient, cross):
-    """Add points known relative to a pose: ``root ((α, β, ρ) − origin)`` is unit noise. Returns the sum of squares."""
-    pose, point, basis, origin, root = places
-    cost = 0.0
-    q, s, D, W = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    J, Jp, r = np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
-    for m in range(len(pose)):
-        if not chart(poses[pose[m]], points[point[m]], basis[m], origin[m], q, s, D):
-            cost += _BEHIND
-            continue
-        for i in range(3):
-            r[i] = -row_times(root[m], i, s)
-            cost += r[i] * r[i]
-            for j in range(3):
-                W[i, j] = root[m, i, 0] * D[0, j] + root[m, i, 1] * D[1, j] + root[m, i, 2] * D[2, j]
-        _add_row(
-            poses, column, place, E, pose[m], point[m], q, r, W, J, Jp, whole, H, b, information, gradient, cross[m]
-        )  # fmt: skip
-    return cost
-
-
-@helper
 def add_own_priors(points, place, E, mean, own, information, gradient):
     """Add independent priors of points in world coordinates: mean (N, 3), information (N, 3, 3). Returns their cost."""
     cost, d, v = 0.0, np.empty(3), np.empty(3)
@@ -226,3 +214,77 @@ def add_own_priors(points, place, E, mean, own, information, gradient):
                     for j in range(3):
                         information[p, a, c] += E[p, i, a] * own[p, i, j] * E[p, j, c]
     return cost
+
+
+@helper
+def add_motion(poses, column, motion, H, b):
+    """Add constant velocity, disturbed: successive velocities differ by noise. Returns the sum of squares.
+
+    The velocity is that of the poses or, where there are `cameras`, of a body that these pass: with Y_k of `poses` and
+    X_k of `cameras` (K, 4, 4), T_world_left, the body is at ``B_k = X_k Y_k⁻¹``. The change of its velocity is noise
+    with `variance` (V, 6), besides the error of the cameras, whose joint `covariance` (6 K, 6 K) counts in each row by
+    itself: errors of successive rows hang together, but little of what they are is the camera's.
+    """
+    triple, interval, mean, variance, cameras, covariance = motion
+    carried, Ad, one = len(cameras) > 0, np.empty((len(cameras), 6, 6)), np.zeros((4, 4))
+    frames = np.zeros((len(cameras), 4, 4)) if carried else poses
+    back = np.empty((3, 4))
+    for i in range(4):
+        one[i, i] = 1.0
+    for k in range(len(cameras)):
+        adjoint(poses[k], Ad[k])
+        between(poses[k], one, back)
+        compose(cameras[k], back, frames[k])
+    cost = 0.0
+    r, by_frame, J, S = np.empty(6), np.empty((6, 18)), np.zeros((6, 18)), np.empty((6, 6))
+    for m in range(len(triple)):
+        i0, i1, i2 = triple[m]
+        velocity_change(frames, i0, i1, i2, interval[m, 0], interval[m, 1], r, by_frame)
+        for i in range(6):
+            r[i] -= mean[m, i]
+            for j in range(18):
+                J[i, j] = by_frame[i, j]
+        for p in range(3 if carried else 0):  # a perturbation ξ of Y is −Ad_Y ξ of B, one χ of X is Ad_Y χ
+            k = max(triple[m, p], 0)
+            for i in range(6):
+                for j in range(6):
+                    total = 0.0
+                    for h in range(6):
+                        total -= by_frame[i, 6 * p + h] * Ad[k, h, j]
+                    J[i, 6 * p + j] = total
+        _whiten(J, covariance, triple[m], variance[m], S, r)
+        for i in range(6):
+            cost += r[i] * r[i]
+        add_velocity_rows(J, r, triple[m], column, H, b)
+    return cost
+
+
+@helper
+def _whiten(J, covariance, triple, variance, S, r):
+    """J (6, 18) and r (6,) times the inverse Cholesky factor of their noise ``diag(variance) + J P Jᵀ``, in place."""
+    for i in range(6):
+        for j in range(6):
+            S[i, j] = 0.0
+        for o in range(3):
+            for j in range(6 if triple[o] >= 0 and len(covariance) else 0):
+                product = 0.0  # of row i of J and a column of P
+                for p in range(3):
+                    for h in range(6 if triple[p] >= 0 else 0):
+                        product += J[i, 6 * p + h] * covariance[6 * triple[p] + h, 6 * triple[o] + j]
+                for k in range(6):
+                    S[i, k] += product * J[k, 6 * o + j]
+    for i in range(6):
+        S[i, i] += variance[i]
+    for i in range(6):
+        for j in range(i + 1):
+            total = S[i, j]
+            for k in range(j):
+                total -= S[i, k] * S[j, k]
+            S[i, j] = np.sqrt(total) if i == j else total / S[j, j]
+        for k in range(i):
+            r[i] -= S[i, k] * r[k]
+            for j in range(18):
+                J[i, j] -= S[i, k] * J[k, j]
+        r[i] /= S[i, i]
+        for j in range(18):
+            J[i, j] /= S[i, i]

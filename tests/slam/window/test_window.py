@@ -160,7 +160,7 @@ def with_everything():
     triples = np.array([(-1, 0, 1), *((k - 2, k - 1, k) for k in range(2, POSES))])
     return window(
         places=Places(np.full(3, 1), np.arange(3), basis, origin, root), mean=points + 0.05, information=information,
-        motion=Motion(triples, np.full((POSES - 1, 2), 0.1), 1 / sigma),
+        motion=Motion(triples, np.full((POSES - 1, 2), 0.1), 0 * sigma, sigma**2),
     )  # fmt: skip
 
 
@@ -171,7 +171,7 @@ def test_gradient_is_the_costs_derivative():
     prior = marginalised(replace(part, joining=np.arange(10, 20)), [0], np.zeros(0, bool))[0]
     rest = w.rows.select(w.rows.pose > 0)
     w = replace(w, poses=w.poses[1:], rows=replace(rest, pose=rest.pose - 1), prior=prior, motion=Motion(
-        np.array([(0, 1, 2), (1, 2, 3)]), np.full((2, 2), 0.1), np.full((2, 6), 3.0)))  # fmt: skip
+        np.array([(0, 1, 2), (1, 2, 3)]), np.full((2, 2), 0.1), np.zeros((2, 6)), np.full((2, 6), 1 / 9)))  # fmt: skip
     for _ in range(12):  # only the points move: what is left is the gradient of the poses
         e = linearised(w)
         w = after(e, np.zeros(w.unknowns))
