@@ -164,7 +164,7 @@ class Steps(RectifiedMeasurement):
         w = problem(s, self.stereo)
         for again in range(_SOLVED_AGAIN + 1):
             solution = solve(replace(w, rows=s.rows))
-            covariances = solution.point_covariances(len(poses) - 1)
+            covariances = solution.point_covariances(len(poses) - 1, s.landmarks.ids >= 0)
             its = covariances[0][points[used]]
             distances = solution.left_out_distances(-1, points[used], z[used], its, self.models.pixel_sigma, _TESTED)
             bad = distances > limits[used]
@@ -252,7 +252,7 @@ def _after(
     part = (w.place >= 0) | (first[1:] > first[:-1])
     there = replace(s, poses=w.poses, covariance=solution.pose_covariance, by_rig=by_rig[0])
     known = part & (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
-    others, last = np.flatnonzero(~known), marks.last.copy()
+    others, last = np.flatnonzero(~known & (marks.ids >= 0)), marks.last.copy()
     if len(others):
         local[others] = _seen_from_newest(there, others, there.relative(s.solved))[1]
         world[others] = marks.world[others]

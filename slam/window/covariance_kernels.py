@@ -15,8 +15,10 @@ from slam.window.terms import ELIMINATED, KNOWN, whitened_residual
 
 
 @kernel
-def point_relations(T, points, place, E, pose_of, cross, first, order, column, inverse, X, P_poses, newest, prior):
-    """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each.
+def point_relations(
+    T, points, asked, place, E, pose_of, cross, first, order, column, inverse, X, P_poses, newest, prior
+):  # fmt: skip
+    """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each, of those `asked`.
 
     T's unknowns begin at `newest`, −1 where it is fixed; `X` (n, n) is ``L⁻¹`` of the normal equations' Cholesky
     factor, `P_poses` (6 F, 6 F) the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse`
@@ -30,6 +32,8 @@ def point_relations(T, points, place, E, pose_of, cross, first, order, column, i
     q, D, G, M = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6))
     for p in range(len(points)):
         d = place[p]
+        if not asked[p]:
+            continue
         if d >= 0:
             assign(blocks[d, :, :3], own)
             assign(blocks[d, :, 3:], by)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
-from slam.geometry.arrays import Array, IndexArray
+from slam.geometry.arrays import Array, BoolArray, IndexArray
 from slam.window import covariance_kernels, kernels
 from slam.window.problem import ELIMINATED, Window
 
@@ -91,12 +91,16 @@ class Solution:
         )
         return X[3 * len(w.members) :], points
 
-    def point_covariances(self, pose: int) -> tuple[Array, Array]:
-        """Covariances (N, 3, 3) of the points in the coordinates of a pose, and in the world; zero for known ones."""
+    def point_covariances(self, pose: int, asked: BoolArray | None = None) -> tuple[Array, Array]:
+        """Covariances (N, 3, 3) of the points in the coordinates of a pose, and in the world.
+
+        They are zero for points that are known, and for those that are not `asked` for (N,); None for all.
+        """
         e = self.equations
         w = e.window
+        asked = np.ones(len(w.points), bool) if asked is None else asked
         return covariance_kernels.point_relations(
-            w.poses[pose], w.points, w.place, e.E, w.pose_of, e.cross, *w.by_point, w.column, e.inverse,
+            w.poses[pose], w.points, asked, w.place, e.E, w.pose_of, e.cross, *w.by_point, w.column, e.inverse,
             self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members),
         )  # fmt: skip
 
