@@ -47,19 +47,10 @@ def gauss_newton(
     H, L, x = np.zeros((n, n)), np.zeros((n, n)).T, np.zeros(n)
     whole, minimum, best, halvings, taken = True, False, np.inf, 0, 0
     while True:
-        b, information, gradient = np.zeros(n), np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-        cross = np.zeros((len(pose_of), 6, 3))
-        E = charts(poses, centre, points, place, basis)
-        if whole:
-            H[:] = 0.0
-        cost, A = add_prior(poses, points, 3 * len(basis), prior, whole, H, b)
-        cost += add_rows(
-            camera, poses, column, points, place, E, rows, places, huber, whole, H, b, information, gradient, cross
-        )
-        if len(own[0]):
-            cost += add_own_priors(points, place, E, own[0], own[1], information, gradient)
-        cost += add_motion(poses, column, motion, H, b)
-        inverse = _eliminate(column, place, pose_of, cross, first, order, information, gradient, whole, H, b)
+        b, cost, A, E, inverse, gradient, cross = _equations(
+            camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first,
+            order, huber, whole, H,
+        )  # fmt: skip
         if whole or cost <= best + 1e-9 * abs(best) + 1e-12:
             start = poses, points, E, inverse, gradient, cross
             if whole:
@@ -91,6 +82,29 @@ def gauss_newton(
             break
         whole = False
     return poses, points, cost, minimum, L, H, linearised
+
+
+@helper
+def _equations(
+    camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first, order, huber,
+    whole, H,
+):  # fmt: skip
+    """The equations at some poses and points; H, which is filled in, is undefined unless `whole`."""
+    b, information, gradient = np.zeros(len(H)), np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    cross = np.zeros((len(pose_of), 6, 3))
+    E = charts(poses, centre, points, place, basis)
+    for i in range(len(H)):
+        for j in range(i + 1):
+            H[i, j] = 0.0
+    cost, A = add_prior(poses, points, 3 * len(basis), prior, whole, H, b)
+    cost += add_rows(
+        camera, poses, column, points, place, E, rows, places, huber, whole, H, b, information, gradient, cross
+    )
+    if len(own[0]):
+        cost += add_own_priors(points, place, E, own[0], own[1], information, gradient)
+    cost += add_motion(poses, column, motion, H, b)
+    inverse = _eliminate(column, place, pose_of, cross, first, order, information, gradient, whole, H, b)
+    return b, cost, A, E, inverse, gradient, cross
 
 
 @helper

@@ -73,8 +73,8 @@ def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
     used = row_distances(w) <= limits
     for _ in range(_ROUNDS):
         counts = np.where(used[:, None, None], rows.root, 0.0)
-        w = solver.solve(replace(w, rows=replace(rows, root=counts))).window
-        again = row_distances(replace(w, rows=rows)) <= limits
+        w = solver.solve(w.at(w.poses, w.points, replace(rows, root=counts))).window
+        again = row_distances(w.at(w.poses, w.points, rows)) <= limits
         if (again == used).all():
             break
         used = again

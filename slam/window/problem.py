@@ -211,8 +211,8 @@ class Window:
         """Pose of each row, then of each place."""
         return np.concatenate([self.rows.pose, self.places.pose])
 
-    def at(self, poses: Array, points: Array) -> Window:
-        """With other values of the poses and points."""
-        moved = object.__new__(Window)
-        moved.__dict__.update(self.__dict__, poses=poses, points=points)  # what was derived does not depend on them
+    def at(self, poses: Array, points: Array, rows: Rows | None = None) -> Window:
+        """With other values of the poses and points, and other measurements from the same poses of the same points."""
+        moved = object.__new__(Window)  # what was derived does not depend on these
+        moved.__dict__.update(self.__dict__, poses=poses, points=points, rows=self.rows if rows is None else rows)
         return moved
