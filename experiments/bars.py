@@ -1,16 +1,16 @@
-"""Medians over perturbations of what the tests on recordings measure; the tests allow half as much more.
+"""The back ends beside each other: medians over perturbations. Tests on recordings allow half as much more.
 
     SLAM_DATA=/path/to/data python experiments/bars.py [--quick] [--trials 5] [--sequences NAME …] [--out DIR]
 
-Recordings with the usual settings, each time with another first frame, pixel noise, and number of features
-(`experiments/perturbations.py`): the error of the online and of the final path.
-Writes ``bars.json``, whose place is ``tests/bars.json``, and prints the same.
+Recordings and worlds with the usual settings, each time with another first frame, pixel noise, and number of features
+(`experiments/perturbations.py`), worlds with another seed, too: the error of the online and of the final path.
+Writes ``bars.json``, whose place is ``tests/bars.json``, and prints it as a Markdown table; with ``--trials 0`` what is
+there already.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -18,9 +18,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from experiments.ablation_parts import RECORDED, USUAL, Case, error_of, opened
+from experiments.ablation_parts import CASES, USUAL, Case, error_of, opened
 from experiments.common import path_of, script_options
 from experiments.perturbations import NONE, features_of, frames_of
+from experiments.tables import markdown
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
@@ -61,31 +62,47 @@ def errors(
 def _medians(trials: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
     """Of each back end and figure."""
     first = trials[0]
-    return {b: {f: round(float(np.median([t[b][f] for t in trials])), 4) for f in first[b]} for b in first}
+    return {b: {f: round(float(np.median([t[b][f] for t in trials])), 6) for f in first[b]} for b in first}
+
+
+def table(found: Medians) -> str:
+    """The medians [mm], and those of the window in units of the better of the others."""
+    rows = []
+    for name, medians in found.items():
+        for figure in ("online", "final"):
+            errors_ = [medians[b][figure] for b in BACKENDS]
+            ratio = errors_[2] / min(errors_[:2])
+            rows.append([name if figure == "online" else "", figure, *(f"{1e3 * e:.3g}" for e in errors_), ratio])
+    return markdown(("sequence", "path", *BACKENDS, "window / better"), rows, 2)
 
 
 def main() -> int:
-    parser = script_options(__file__, __doc__, "one trial of one recording")
+    parser = script_options(__file__, __doc__, "one trial of one sequence")
     parser.add_argument("--trials", type=int, default=5)
     parser.add_argument("--sequences", nargs="*", metavar="NAME", help="these alone; a file in DIR keeps its others")
     parser.add_argument("--backends", nargs="*", default=BACKENDS, metavar="NAME", help="these alone, likewise")
     given = parser.parse_args()
     trials, file = 1 if given.quick else given.trials, given.out / "bars.json"
     found: Medians = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
-    for case in RECORDED[: 1 if given.quick else None]:
-        sequence = opened(case, 0)
-        if sequence is not None and (not given.sequences or case.name in given.sequences):
-            seen = (perturbed(case, sequence, t) for t in range(min(trials, case.trials)))
-            runs = [{b: errors(case, sequence, *one, b)[0] for b in given.backends} for one in seen]
+    for case in CASES[: 1 if given.quick else None]:
+        if given.sequences and case.name not in given.sequences:
+            continue
+        runs = []
+        for trial in range(min(trials, case.trials)):
+            sequence = opened(case, trial)
+            if sequence is not None:
+                one = perturbed(case, sequence, trial)
+                runs.append({b: errors(case, sequence, *one, b)[0] for b in given.backends})
+        if runs:
             found[case.name] = found.get(case.name, {}) | _medians(runs)
             print(case.name, found[case.name], file=sys.stderr, flush=True)
-    if not os.environ.get("SLAM_DATA"):
+    if not found:
         print("bars: set SLAM_DATA to the folder that holds the recordings; nothing was run")
         return 0
-    text = json.dumps(found, indent=1)
     given.out.mkdir(parents=True, exist_ok=True)
-    file.write_text(text + "\n", encoding="utf-8")
-    print(text)
+    file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    print("Medians over perturbations, errors in mm: ATE, in the library the closing error, no place recognised.")
+    print("\n" + table(found))
     return 0
 
 

@@ -12,10 +12,11 @@ import pytest
 import backends
 from slam.config import SystemConfig
 from slam.data import Observations
-from slam.geometry.pnp import find_consensus, measurement_rows
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.interfaces import Backend
+from slam.window.consensus import find_consensus
 
 FILE = "kitti_raw_tracks/2011_09_30_drive_0020"
 SIZE = (1226, 370)  # of the rectified images [px]

@@ -24,6 +24,7 @@ from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
+from slam.window.consensus import landmarks_pose
 from slam.window.gating import INFLATION
 from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
@@ -320,7 +321,7 @@ class EkfBackend:
 
         def search() -> Array | None:
             T = s.pose if guess is None else guess
-            return self._measure.landmarks_pose(update.landmarks.points, z, T, s.frame + 1)
+            return landmarks_pose(self._measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
             found = agreement(update, noises, search, self.models)

@@ -15,7 +15,8 @@ from backends.smoother.state import Known, Sight, SmootherState, Tie
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
 from slam.window import motion, pose_only
-from slam.window.gating import MIN_CONSENSUS, squared_distances
+from slam.window.consensus import landmarks_pose
+from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
 
@@ -108,7 +109,7 @@ class Steps(RectifiedMeasurement):
         """Initial value of the newest pose, and which measurements agree with it."""
 
         def search() -> Array | None:
-            return self.landmarks_pose(one.points, z, one.predicted, s.number)
+            return landmarks_pose(self, one.points, z, one.predicted, s.number)
 
         lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(s.spread[-1])
         return agreement(one, one.predicted if guess is None else guess, search, s.contradicted, lost)
@@ -129,7 +130,7 @@ class Steps(RectifiedMeasurement):
         field, before = self.field(one.z), marks.by_rig[seen]
         G, F = by_pose_and_rig(one, found.T, before, field)
         x = log(inverse(one.predicted) @ found.T)
-        nis = float(squared_distances(pose_only.residuals(one, found.T)[0], one.noise).sum() + x @ one.information @ x)
+        nis = float(one.distances(found.T).sum() + x @ one.information @ x)
         by_rig = np.linalg.solve(one.information + G.T @ G, one.information @ s.by_rig[6:] + G.T @ F)
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]

@@ -13,6 +13,7 @@ from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.geometry.kernels import seen
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window import chart_kernels, motion, pose_only
+from slam.window.consensus import landmarks_pose
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.problem import Motion, Places, RelativePrior, Rows
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
@@ -61,7 +62,7 @@ class Steps(RectifiedMeasurement):
         if begins or rests or s.frames[-1] == s.frames[-2] + 1:  # else the velocity before has left the window
             one = np.array([[-1 if unknown else K - 2, K - 1, K]])
             sigma = np.full(6, motion.STANDS / dt) if rests else motion.velocity_sigmas(self.models, dt, unknown)
-            moves = moves.joined(Motion(one, np.array([[before or 1.0, dt]]), 1 / sigma[None]))
+            moves = moves.joined(Motion(one, np.array([[before or 1.0, dt]]), np.zeros((1, 6)), sigma[None] ** 2))
         return replace(
             s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp), motion=moves,
             poses=np.concatenate([s.poses, T[None]]), covariance=P, measured=False,
@@ -133,8 +134,7 @@ class Steps(RectifiedMeasurement):
 
     def _rows(self, s: WindowState, points: IndexArray, z: Array) -> Rows:
         """Measurements from the newest pose."""
-        n = len(points)
-        return Rows(np.full(n, len(s.frames) - 1), points, z, np.full(n, 1 / self.models.pixel_sigma))
+        return Rows.of(len(s.frames) - 1, points, z, self.models.pixel_sigma)
 
     def _agreement(self, s: WindowState, points: IndexArray, z: Array, guess: Array | None) -> Agreement:
         """Initial value of the newest pose, and which measurements agree with it."""
@@ -146,7 +146,7 @@ class Steps(RectifiedMeasurement):
         one = pose_only.PoseProblem(self.stereo, position, z, noise, T, information, self.models.gate_probability)
 
         def search() -> Array | None:
-            return self.landmarks_pose(position, z, T, int(s.frames[-1]))
+            return landmarks_pose(self, position, z, T, int(s.frames[-1]))
 
         return agreement(one, T if guess is None else guess, search, s.contradicted, _lost(s))
 
@@ -164,7 +164,7 @@ class Steps(RectifiedMeasurement):
         w = problem(s, self.stereo)
         for again in range(_SOLVED_AGAIN + 1):
             solution = solve(replace(w, rows=s.rows))
-            covariances = solution.point_covariances(len(poses) - 1)
+            covariances = solution.point_covariances(len(poses) - 1, s.landmarks.ids >= 0)
             its = covariances[0][points[used]]
             distances = solution.left_out_distances(-1, points[used], z[used], its, self.models.pixel_sigma, _TESTED)
             bad = distances > limits[used]
@@ -252,7 +252,7 @@ def _after(
     part = (w.place >= 0) | (first[1:] > first[:-1])
     there = replace(s, poses=w.poses, covariance=solution.pose_covariance, by_rig=by_rig[0])
     known = part & (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
-    others, last = np.flatnonzero(~known), marks.last.copy()
+    others, last = np.flatnonzero(~known & (marks.ids >= 0)), marks.last.copy()
     if len(others):
         local[others] = _seen_from_newest(there, others, there.relative(s.solved))[1]
         world[others] = marks.world[others]

@@ -15,7 +15,7 @@ points = rng.uniform((-2.0, -1.0, 4.0), (2.0, 1.0, 9.0), (30, 3))  # in the worl
 T_true = se3.exp(np.array([0.02, -0.05, 0.01, 0.1, 0.0, 0.3]))
 pixels = stereo.project(se3.transform(se3.inverse(T_true), points))[0] + SIGMA * rng.standard_normal((30, 3))
 
-rows = Rows(pose=np.zeros(30, np.intp), point=np.arange(30), z=pixels, weight=np.full(30, 1 / SIGMA))
+rows = Rows.of(0, np.arange(30), pixels, SIGMA)  # all from the first pose
 solution = solve(Window(stereo, np.eye(4)[None], points, rows, known=np.ones(30, bool)))
 
 print("T_world_left", solution.window.poses[0])

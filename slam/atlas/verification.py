@@ -69,8 +69,8 @@ def refined_pose(
     """
     stereo, n = RectifiedStereo.of(rig), len(points)
     z = np.concatenate([stereo.project(points)[0], measured - [0.0, 0.0, stereo.doffs]])
-    weight = (points[:, 2] > 0) / pixel_sigma  # none for what the earlier camera cannot have seen
-    rows = Rows(np.repeat([0, 1], n), np.tile(np.arange(n), 2), z, np.tile(weight, 2))
+    rows = Rows.of(np.repeat([0, 1], n), np.tile(np.arange(n), 2), z, pixel_sigma)
+    rows.root[np.tile(points[:, 2] <= 0, 2)] = 0.0  # what the earlier camera cannot have seen
     poses = np.stack([np.eye(4), T_world_left])
     solution = solve(Window(stereo, poses, points, rows, free=np.array([False, True])))
     P = solution.pose_covariance
@@ -82,7 +82,7 @@ def _jackknife(w: Window, P: Array) -> Array:
     e, n, T = linearised(w), len(w.points), w.poses[1]
     r, J = residuals(w.stereo.intrinsics, w.points, w.rows.z[n:], T)
     J[np.isnan(r)] = 0  # what is not measured
-    r, G = w.rows.weight[n:, None] * np.nan_to_num(r), w.rows.weight[n:, None, None] * J
+    r, G = (w.rows.root[n:] @ np.nan_to_num(r)[:, :, None])[:, :, 0], w.rows.root[n:] @ J
     by_pose, gain = np.swapaxes(G, 1, 2), e.cross[n:] @ e.inverse  # of a point, which is eliminated
     own = by_pose @ G - gain @ np.swapaxes(e.cross[n:], 1, 2)
     pull = by_pose @ r[:, :, None] - gain @ e.gradient[:, :, None]

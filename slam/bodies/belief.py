@@ -21,7 +21,7 @@ from slam.geometry.se3 import Array, transform
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
 from slam.window.marginal import marginalised
-from slam.window.problem import Carried, Places, RelativePrior, Rows, Window
+from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.stereo import RectifiedStereo
 
 Projection = Callable[[Array], tuple[Array, Array]]
@@ -213,7 +213,7 @@ def begun(stamp: float, T_body_left: Array, velocity: Array, sigmas: Array, esti
     )  # fmt: skip
 
 
-def carried(b: BodyBelief, cameras: RecentPoses, models: ObjectModels) -> Carried:
+def carried(b: BodyBelief, cameras: RecentPoses, models: ObjectModels) -> Motion:
     """The motion between the frames, for the camera's poses in them (K)."""
     triples, intervals, means, variances = [], [], [], []
     for i in range(1, len(b)):
@@ -232,18 +232,17 @@ def carried(b: BodyBelief, cameras: RecentPoses, models: ObjectModels) -> Carrie
         means.append(mean)
         variances.append(variance)
     if not triples:
-        return Carried.none()
-    return Carried(
-        cameras.poses, cameras.covariance, np.array(triples), np.array(intervals), np.array(means), np.array(variances)
-    )
+        return Motion.none()
+    rows = (np.array(triples), np.array(intervals), np.array(means), np.array(variances))
+    return Motion(*rows, cameras.poses, cameras.covariance)
 
 
-def window(b: BodyBelief, stereo: RectifiedStereo, motion: Carried) -> Window:
+def window(b: BodyBelief, stereo: RectifiedStereo, motion: Motion) -> Window:
     """The belief as a problem for the solver."""
-    return Window(stereo, b.poses, b.points.position, b.rows, places=b.places, carried=motion, prior=b.prior)
+    return Window(stereo, b.poses, b.points.position, b.rows, places=b.places, motion=motion, prior=b.prior)
 
 
-def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Carried, drift: float) -> BodyBelief:
+def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Motion, drift: float) -> BodyBelief:
     """The belief without its oldest frame, which becomes part of the prior with the points that it has measured.
 
     `drift` is the density of the random walk of a point's direction with the angle of view [rad / √rad]. Raises
@@ -258,7 +257,7 @@ def slid(b: BodyBelief, stereo: RectifiedStereo, motion: Carried, drift: float) 
     there = (places.pose == 0) & (member | joins)[places.point] | ends[places.point]
     w = window(b, stereo, motion.select(np.flatnonzero((motion.poses <= 0).any(axis=1))))
     w = Window(
-        stereo, w.poses, w.points, rows.select(taken), places=places.select(there), carried=w.carried, prior=b.prior,
+        stereo, w.poses, w.points, rows.select(taken), places=places.select(there), motion=w.motion, prior=b.prior,
         joining=np.flatnonzero(joins),
     )  # fmt: skip
     prior, _, _ = marginalised(w, [0], ends[b.prior.points])

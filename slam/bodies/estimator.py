@@ -179,7 +179,7 @@ class BodyEstimator:
     def _predicted(self, b: BodyBelief, cameras: RecentPoses) -> BodyBelief:
         """With the covariances of a frame in which nothing was measured."""
         e = linearised(window(b, self.stereo, carried(b, cameras, self.models)))
-        solution = Solution(e.window, e, e.cost)
+        solution = Solution(e.window, e, np.linalg.cholesky(e.H), e.cost)
         local, _ = solution.point_covariances(len(b) - 1)
         return replace(b, covariance=solution.pose_covariance, points=replace(b.points, local=local))
 
@@ -284,7 +284,7 @@ class BodyEstimator:
         return shape_of(h, back @ np.swapaxes(back, 1, 2)).seen_from(Y)
 
     def _rows(self, frame: int, points: IndexArray, z: Array) -> Rows:
-        return Rows(np.full(len(points), frame), points, z, np.full(len(points), 1 / self.sigma))
+        return Rows.of(frame, points, z, self.sigma)
 
     def _reported(
         self, b: BodyBelief, id: int, cameras: RecentPoses, measured: bool, used: IdArray, rejected: IdArray

@@ -17,12 +17,13 @@ from slam.bodies.track_kernels import inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
-from slam.geometry.pnp import find_consensus, measurement_rows
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks
 from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
+from slam.window.consensus import find_consensus
 
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame

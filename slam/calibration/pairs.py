@@ -16,10 +16,10 @@ from slam.calibration.model import RigModel
 from slam.chi_square import chi_square_limit
 from slam.data import StereoFeatures
 from slam.geometry.arrays import median
-from slam.geometry.pnp import find_consensus
 from slam.geometry.se3 import Array, inverse
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import Matches, match_everywhere
+from slam.window.consensus import find_consensus
 
 _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
 _MEDIAN_1, _MEDIAN_3 = chi_square_limit(1, 0.5), chi_square_limit(3, 0.5)  # derived: medians of χ²

@@ -11,12 +11,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
-from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
+from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
 from slam.input.features import Rectification
 from slam.interfaces import Backend, RevisingBackend
 from slam.run.recording import RecordedFrame, Recording
 from slam.third_party import checked, named_failures
 from slam.tracks.config import AssociationConfig
+from slam.window.consensus import find_consensus
 
 _STAGES = ("predict", "associate", "update", "manage", "estimate")
 

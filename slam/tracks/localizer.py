@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
-from slam.geometry.pnp import CLEAR_MAJORITY, MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
+from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.models import EstimatorModels
@@ -22,6 +22,7 @@ from slam.tracks.follow import Matches, Windows, follow, match_everywhere
 from slam.tracks.standing import Standing
 from slam.tracks.step import NO_POSE, LandmarkMatches, PoseHypotheses, TrackingState
 from slam.tracks.table import LandmarkTable
+from slam.window.consensus import CLEAR_MAJORITY, PoseConsensus, find_consensus
 
 
 class Localizer:

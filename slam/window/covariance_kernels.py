@@ -9,14 +9,16 @@ import numpy as np
 
 from slam.kernels.linear import assign, row_times, turn
 from slam.kernels.se3 import transform_back
-from slam.kernels.stereo import by_pose, residual
+from slam.kernels.stereo import by_pose
 from slam.runtime.compilation import helper, kernel
-from slam.window.kernels import ELIMINATED, KNOWN
+from slam.window.terms import ELIMINATED, KNOWN, whitened_residual
 
 
 @kernel
-def point_relations(T, points, place, E, pose_of, cross, first, order, column, inverse, X, P_poses, newest, prior):
-    """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each.
+def point_relations(
+    T, points, asked, place, E, pose_of, cross, first, order, column, inverse, X, P_poses, newest, prior
+):  # fmt: skip
+    """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each, of those `asked`.
 
     T's unknowns begin at `newest`, −1 where it is fixed; `X` (n, n) is ``L⁻¹`` of the normal equations' Cholesky
     factor, `P_poses` (6 F, 6 F) the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse`
@@ -30,6 +32,8 @@ def point_relations(T, points, place, E, pose_of, cross, first, order, column, i
     q, D, G, M = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6))
     for p in range(len(points)):
         d = place[p]
+        if not asked[p]:
+            continue
         if d >= 0:
             assign(blocks[d, :, :3], own)
             assign(blocks[d, :, 3:], by)
@@ -108,7 +112,7 @@ def rig_columns(
     `prior` are the derivatives of the prior's η, `by_first` those of its numbers by the first pose; `members` of the
     `unknown` points are the prior's. Second, ``inverse gradient`` (N, 3, m) of the points that are eliminated.
     """
-    pose, point, z, weight = rows
+    pose, point, z, root = rows
     m, mine, shift = field.shape[2], 3 * members, 3 * (unknown - members)
     B = np.zeros((n, m))
     for i in range(len(prior)):
@@ -123,39 +127,39 @@ def rig_columns(
     for row in range(len(pose)):
         T, p, at = poses[pose[row]], point[row], column[pose[row]]
         transform_back(T, points[p], q)
-        if weight[row] == 0.0 or not residual(camera, q, z[row], r, D):
+        if root[row, 0, 0] == 0.0 or not whitened_residual(camera, q, z[row], root[row], r, D):
             continue
         for i in range(3):
-            w = 0.0 if np.isnan(r[i]) else weight[row] * weight[row]
             for k in range(m):
-                F[i, k] = w * field[row, i, k] if w > 0.0 else 0.0
+                F[i, k] = 0.0
+                for j in range(i + 1 if D[i, i % 2] != 0.0 else 0):  # none of what is not measured
+                    F[i, k] += root[row, i, j] * field[row, j, k]
             by_pose(D[i], q, J[i])
             x, y, h = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
             for a in range(3):
                 Jp[i, a] = x * E[p, 0, a] + y * E[p, 1, a] + h * E[p, 2, a]
-        if at >= 0:
-            add_product(J, F, 6, 1.0, B[at : at + 6])
-        if place[p] != KNOWN:
-            add_product(Jp, F, 3, 1.0, gradient[p])
+        for k in range(m):
+            for i in range(3):
+                for a in range(6 if at >= 0 else 0):
+                    B[at + a, k] += J[i, a] * F[i, k]
+                for a in range(3 if place[p] != KNOWN else 0):
+                    gradient[p, a, k] += Jp[i, a] * F[i, k]
     for p in range(len(points)):
-        if place[p] >= 0:
-            B[3 * place[p] : 3 * place[p] + 3] += gradient[p]
-        elif place[p] == ELIMINATED:
-            add_product(inverse[p], gradient[p], 3, 1.0, own[p])
-            for o in range(first[p], first[p + 1]):
-                at = column[pose_of[order[o]]]
-                if at >= 0:
-                    add_product(cross[order[o]].T, own[p], 6, -1.0, B[at : at + 6])
+        for k in range(m):
+            if place[p] >= 0:
+                for i in range(3):
+                    B[3 * place[p] + i, k] += gradient[p, i, k]
+            elif place[p] == ELIMINATED:
+                for i in range(3):
+                    for j in range(3):
+                        own[p, i, k] += inverse[p, i, j] * gradient[p, j, k]
+        for o in range(first[p], first[p + 1] if place[p] == ELIMINATED else first[p]):
+            at = column[pose_of[order[o]]]
+            for a in range(6 if at >= 0 else 0):
+                for k in range(m):
+                    for i in range(3):
+                        B[at + a, k] -= cross[order[o], a, i] * own[p, i, k]
     return B, own
-
-
-@helper
-def add_product(A, X, n, sign, out):
-    """Add ``sign Aᵀ X`` to out (n, m), for A (3, n) and X (3, m)."""
-    for i in range(n):
-        a, b, c = sign * A[0, i], sign * A[1, i], sign * A[2, i]
-        for k in range(X.shape[1]):
-            out[i, k] += a * X[0, k] + b * X[1, k] + c * X[2, k]
 
 
 @kernel
@@ -165,21 +169,25 @@ def rig_points(column, place, E, pose_of, cross, first, order, inverse, own, X):
     `own` (N, 3, m) is by `rig_columns`.
     """
     m = X.shape[1]
-    out, v, d = np.zeros((len(place), 3, m)), np.empty((3, m)), np.empty((3, m))
+    out, d = np.zeros((len(place), 3, m)), np.empty((3, m))
     for p in range(len(place)):
-        if place[p] >= 0:
-            assign(X[3 * place[p] : 3 * place[p] + 3], d)
-        elif place[p] == ELIMINATED:
-            v[:] = 0.0
-            for o in range(first[p], first[p + 1]):
-                at = column[pose_of[order[o]]]
-                for half in range(0, 6 if at >= 0 else 0, 3):
-                    add_product(cross[order[o], half : half + 3], X[at + half : at + half + 3], 3, 1.0, v)
-            assign(own[p], d)
-            add_product(inverse[p], v, 3, -1.0, d)
-        else:
+        if place[p] != ELIMINATED and place[p] < 0:
             continue
-        add_product(E[p].T, d, 3, 1.0, out[p])
+        for i in range(3):
+            for k in range(m):
+                d[i, k] = X[3 * place[p] + i, k] if place[p] >= 0 else own[p, i, k]
+        for o in range(first[p], first[p + 1] if place[p] == ELIMINATED else first[p]):
+            at = column[pose_of[order[o]]]
+            for a in range(6 if at >= 0 else 0):
+                for j in range(3):
+                    for i in range(3):
+                        gain = inverse[p, i, j] * cross[order[o], a, j]
+                        for k in range(m):
+                            d[i, k] -= gain * X[at + a, k]
+        for i in range(3):
+            for j in range(3):
+                for k in range(m):
+                    out[p, i, k] += E[p, i, j] * d[j, k]
     return out
 
 

@@ -6,20 +6,23 @@ pose is brought close first, with the landmarks held where they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry import kernels
-from slam.geometry.pnp import STEPS
-from slam.geometry.se3 import Array, inverse, log
-from slam.window.gating import chi_square_gate, whiteners
+from slam.geometry.se3 import Array
+from slam.window import solver
+from slam.window.gating import whiteners
+from slam.window.problem import RelativePrior, Rows, Window
+from slam.window.solver import row_distances
 from slam.window.stereo import RectifiedStereo
 
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
 _ROUNDS = 3  # numerics: of solving and gating
-_CONVERGED = 1e-5  # numerics: [rad, m]; the steps shrink quadratically, so what is left is far smaller
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,55 +37,48 @@ class PoseProblem:
     information: Array  # of the predicted pose (6, 6)
     probability: float  # share of good measurements that the gate shall let pass
 
+    def window(self, T: Array) -> Window:
+        """One free pose, at T (4, 4), with the prediction as prior, and known points."""
+        n = len(self.points)
+        rows = Rows(np.zeros(n, np.intp), np.arange(n), self.z, self.whiteners)
+        prior = replace(RelativePrior.of_pose(self.predicted, np.eye(6)), information=self.information)
+        return Window(self.stereo, T[None], self.points, rows, known=np.ones(n, bool), prior=prior)
+
+    @cached_property
+    def whiteners(self) -> Array:
+        """What scales residuals to unit variance (M, 3, 3); the third row is zero where there is no right pixel."""
+        W = whiteners(self.noise)
+        W[np.isnan(self.z[:, 2]), 2] = 0
+        return W
+
+    def distances(self, T: Array) -> Array:
+        """Squared distance of each measurement (M,) from what a pose (4, 4) predicts, ∞ behind the camera."""
+        return row_distances(self.window(T))
+
+    def derivatives(self, T: Array) -> Array:
+        """Of the predictions (M, 3, 6) by the pose (4, 4)."""
+        return np.asarray(kernels.residuals(self.stereo.intrinsics, self.points, self.z, T)[1])
+
 
 def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
-    """Pose (4, 4) and which measurements (M,) agree with it: first robust, then least squares on what agrees."""
-    whitener = _whiteners(problem.noise, problem.z)
-    T = _gauss_newton(problem, whitener, start, None)
-    used = _gate(problem, T)
+    """Pose (4, 4) and which measurements (M,) agree with it: first robust, then least squares on what agrees.
+
+    Raises:
+        numpy.linalg.LinAlgError: a value is not finite.
+    """
+    w = problem.window(start)
+    rows = w.rows
+    limits = chi_square_limits(2 + np.isfinite(problem.z[:, 2]), problem.probability)
+    w = solver.solve(w, huber=_HUBER).window
+    used = row_distances(w) <= limits
     for _ in range(_ROUNDS):
-        T = _gauss_newton(problem, whitener, T, used)
-        again = _gate(problem, T)
+        counts = np.where(used[:, None, None], rows.root, 0.0)
+        w = solver.solve(w.at(w.poses, w.points, replace(rows, root=counts))).window
+        again = row_distances(w.at(w.poses, w.points, rows)) <= limits
         if (again == used).all():
             break
         used = again
-    return T, used
-
-
-def whitened(problem: PoseProblem, T: Array) -> tuple[Array, Array, Array]:
-    """What scales to unit variance (M, 3, 3), and `residuals`."""
-    return _whiteners(problem.noise, problem.z), *residuals(problem, T)
-
-
-def residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
-    """Measured less predicted (M, 3), NaN where missing, and the prediction's Jacobians (M, 3, 6) by the pose."""
-    stereo = problem.stereo
-    r, J = kernels.residuals(stereo.intrinsics, problem.points, problem.z, T)
-    return r, J
-
-
-def _gate(problem: PoseProblem, T: Array) -> BoolArray:
-    """Which measurements agree with a pose."""
-    r, _ = residuals(problem, T)
-    return chi_square_gate(r, problem.noise, problem.probability)
-
-
-def _whiteners(noise: Array, z: Array) -> Array:
-    """Inverse Cholesky factors (M, 3, 3); the third row is zero where there is no right pixel."""
-    W = whiteners(noise)
-    W[np.isnan(z[:, 2]), 2] = 0
-    return W
-
-
-def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: BoolArray | None) -> Array:
-    """Pose by Gauss-Newton with the prediction as prior; with Huber weights where `used` is None."""
-    stereo, T = problem.stereo, start[None].copy()
-    rows = np.arange(len(problem.points)) if used is None else np.flatnonzero(used)
-    kernels.gauss_newton(
-        stereo.intrinsics, problem.points, problem.z, whitener, rows[None], problem.information,
-        log(inverse(problem.predicted) @ start), T, _HUBER if used is None else np.inf, STEPS, _CONVERGED,
-    )  # fmt: skip
-    return np.asarray(T[0])
+    return w.poses[0], used
 
 
 def seen_from(T: Array, points: Array, own: Array) -> tuple[Array, Array]:

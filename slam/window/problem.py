@@ -4,35 +4,36 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from slam.geometry.arrays import Array, IndexArray, Table
-from slam.window import chart_kernels, kernels
+from slam.window import chart_kernels, kernels, terms
 from slam.window.stereo import RectifiedStereo
 
-KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
+KNOWN, ELIMINATED = terms.KNOWN, terms.ELIMINATED
 
 
 @dataclass(frozen=True, eq=False)
 class Rows(Table):
-    """Measurements of points from poses, a row each.
+    """Measurements of points from poses, a row each."""
 
-    Attributes:
-        pose, point: indices of the pose and the point (M,).
-        z: as `RectifiedStereo.measure` gives them (M, 3) = (uL, vL, uR); uR is NaN where there is no right pixel.
-        weight: 1 / σ (M,) [1/px]; 0 for a row that does not count.
-    """
+    pose: IndexArray  # indices of the pose (M,)
+    point: IndexArray  # and of the point (M,)
+    z: Array  # as `RectifiedStereo.measure` gives them (M, 3) = (uL, vL, uR) [px]; uR NaN: there is no right pixel
+    root: Array  # inverse Cholesky factors of the noise's covariances (M, 3, 3) [1/px]; 0 for a row that does not count
 
-    pose: IndexArray
-    point: IndexArray
-    z: Array
-    weight: Array
+    @classmethod
+    def of(cls, pose: IndexArray | int, point: IndexArray, z: Array, sigma: float) -> Rows:
+        """Measurements with independent noise of each pixel, `sigma` [px], from one pose or from poses (M,)."""
+        n = len(point)
+        return cls(np.full(n, pose), point, z, np.tile(np.eye(3) / sigma, (n, 1, 1)))
 
     @classmethod
     def none(cls) -> Rows:
         """No measurement."""
-        return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros(0))
+        return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,45 +54,37 @@ class Places(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Motion(Table):
-    """Constant velocity, disturbed by noise: a row for each two successive intervals (paper B, section 2)."""
+class Motion:
+    """Constant velocity, disturbed by noise: a row for each two successive intervals (paper B, section 2).
 
-    poses: IndexArray  # three successive poses (V, 3); −1 first where the first velocity is noise with mean zero
+    Of the poses or, with `cameras`, of a body past which a known camera moves: see `slam.window.terms.add_motion`.
+    """
+
+    poses: IndexArray  # three successive poses (V, 3); −1 first where there is none
     interval: Array  # times between them (V, 2) [s]
-    weight: Array  # 1 / σ of the velocity's change [ω, v] (V, 6)
+    mean: Array  # of the velocity's change [ω, v] (V, 6), or of the velocity where the first pose is −1
+    variance: Array  # likewise
+    # T_world_left (K, 4, 4) of the window's poses, which are T_body_left; none: the motion is that of the poses
+    cameras: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of the cameras together (6 K, 6 K)
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """All of them, as compiled code takes them."""
+        return tuple(vars(self).values())
 
     @classmethod
     def none(cls) -> Motion:
         """No motion model."""
-        return cls(np.zeros((0, 3), np.intp), np.zeros((0, 2)), np.zeros((0, 6)))
+        return cls(np.zeros((0, 3), np.intp), np.zeros((0, 2)), np.zeros((0, 6)), np.zeros((0, 6)))
 
-
-@dataclass(frozen=True, eq=False)
-class Carried:
-    """Constant velocity, disturbed, of a body past which a known camera moves: see `slam.window.carried`."""
-
-    cameras: Array  # T_world_left (K, 4, 4) of the window's poses, which are T_body_left
-    covariance: Array  # of the cameras together (6 K, 6 K)
-    poses: IndexArray  # as of `Motion` (V, 3)
-    interval: Array  # likewise (V, 2)
-    mean: Array  # of [ω, v] (V, 6) where the first pose is −1, ω in body axes, v in world axes; else zero
-    variance: Array  # of the velocity's change (V, 6)
-
-    @classmethod
-    def none(cls) -> Carried:
-        """No motion model."""
-        none, six = np.zeros((0, 3), np.intp), np.zeros((0, 6))
-        return cls(np.zeros((0, 4, 4)), np.zeros((0, 0)), none, np.zeros((0, 2)), six, six)
-
-    @property
-    def arrays(self) -> tuple[Array, ...]:
-        """All of them."""
-        return tuple(vars(self).values())
-
-    def select(self, keep: np.ndarray) -> Carried:
+    def select(self, keep: Any) -> Motion:
         """Some of the rows (a mask or indices)."""
-        rows = (column[keep] for column in (self.poses, self.interval, self.mean, self.variance))
-        return Carried(self.cameras, self.covariance, *rows)
+        return Motion(*(column[keep] for column in self.arrays[:4]), *self.arrays[4:])
+
+    def joined(self, other: Motion) -> Motion:
+        """These rows, then others."""
+        return Motion(*(np.concatenate(pair) for pair in zip(self.arrays[:4], other.arrays[:4])), *self.arrays[4:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +144,7 @@ class Window:
         mean, information: independent priors of points in world coordinates (N, 3), (N, 3, 3) [1/m²], zero for none;
             None for no point.
         places: points that are known relative to a pose.
-        motion: constant velocity between successive poses.
-        carried: constant velocity of what the points belong to.
+        motion: constant velocity between successive poses, or of what the points belong to.
         prior: what is known of the first poses and of some points together.
         joining: points that are unknowns beside those of the prior (J,), instead of being eliminated.
     """
@@ -167,7 +159,6 @@ class Window:
     information: Array | None = None
     places: Places = field(default_factory=Places.none)
     motion: Motion = field(default_factory=Motion.none)
-    carried: Carried = field(default_factory=Carried.none)
     prior: RelativePrior = field(default_factory=RelativePrior.none)
     joining: IndexArray = field(default_factory=lambda: np.zeros(0, np.intp))
 
@@ -220,8 +211,8 @@ class Window:
         """Pose of each row, then of each place."""
         return np.concatenate([self.rows.pose, self.places.pose])
 
-    def at(self, poses: Array, points: Array) -> Window:
-        """With other values of the poses and points."""
-        moved = object.__new__(Window)
-        moved.__dict__.update(self.__dict__, poses=poses, points=points)  # what was derived does not depend on them
+    def at(self, poses: Array, points: Array, rows: Rows | None = None) -> Window:
+        """With other values of the poses and points, and other measurements from the same poses of the same points."""
+        moved = object.__new__(Window)  # what was derived does not depend on these
+        moved.__dict__.update(self.__dict__, poses=poses, points=points, rows=self.rows if rows is None else rows)
         return moved

@@ -20,7 +20,7 @@ from slam.data import BoolArray
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log
 from slam.window import pose_only
-from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance, squared_distances
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
 
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
@@ -93,7 +93,7 @@ def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> boo
     fit any three: the number of others that agree is tested for all triples together (an a contrario test, as in
     Moisan & Stival, IJCV 2004).
     """
-    distances = squared_distances(pose_only.residuals(problem, T)[0], problem.noise)
+    distances = problem.distances(T)
     rejected = distances[~used & np.isfinite(distances)]
     if not len(rejected):
         return True

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+from scipy.linalg.lapack import dtrtri
 
-from slam.geometry.arrays import Array, IndexArray
+from slam.geometry.arrays import Array, BoolArray, IndexArray
 from slam.window import covariance_kernels, kernels
-from slam.window.problem import Window
+from slam.window.problem import ELIMINATED, Window
 
-_STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
-_WHOLE = 128  # cost: rows of a triangular matrix that is inverted as a whole
-_HALVINGS = 8  # numerics: of a step that does not lessen the cost
 #: numerics: Decrease of the cost by a step with the last factor below which that step is the last; it leaves far less.
 CLOSE = 1e-2
-#: numerics: The same for a step with a factor of its own, in units of `close`; it leaves the square of that.
-_NEAR = 50.0
+STEPS = 12  #: numerics: of Gauss-Newton at most; it converges quadratically
+_WHOLE = 128  # cost: rows of a triangular matrix that is inverted as a whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,37 +24,14 @@ class NormalEquations:
     """A window linearised at its present values: ``H x = b``, points eliminated."""
 
     window: Window  # what was linearised
-    H: Array  # information of the unknowns (n, n), lower triangle
-    b: Array  # (n,)
-    cost: float  # sum of squares of everything, with the prior's ``δᵀ Λ δ − 2 ηᵀ δ``
+    H: Array  # information of the unknowns (n, n), lower triangle; of `linearised` alone
     E: Array  # derivatives of points by their charts' coordinates (N, 3, 3)
     inverse: Array  # inverse information of each eliminated point (N, 3, 3)
     gradient: Array  # of each point by its own rows (N, 3)
     cross: Array  # information that each row, then each place, shares between pose and point (M + Q, 6, 3)
+    b: Array  # (n,)
+    cost: float  # sum of squares of everything, with the prior's ``δᵀ Λ δ − 2 ηᵀ δ``
     by_first: Array  # derivatives of the prior's numbers by the first pose (m, 6)
-
-    @cached_property
-    def factor(self) -> Array:
-        """Upper triangular Lᵀ (n, n) in Fortran's order, with ``L Lᵀ = H``.
-
-        Raises:
-            numpy.linalg.LinAlgError: H is not positive definite: something is not determined.
-        """
-        if not len(self.H):
-            return self.H
-        U, info = dpotrf(self.H.T, lower=0, clean=1, overwrite_a=0)
-        if info or not np.isfinite(U[-1:, -1:]).all():
-            raise np.linalg.LinAlgError("the window's information is not positive definite")
-        return np.asarray(U)
-
-    def step(self, factor: Array) -> tuple[Array, float]:
-        """Step of the unknowns (n,) by a factor of these or nearby equations, and the decrease of cost it expects.
-
-        That is of the points that are eliminated, too, which step with them.
-        """
-        x = dpotrs(factor, self.b, lower=0)[0] if len(self.b) else self.b
-        points = np.einsum("ni,nij,nj->", self.gradient, self.inverse, self.gradient)
-        return x, float(x @ self.b + points)
 
     def by_rig(self, field: Array) -> tuple[Array, Array]:
         """Derivatives by m errors of the rig: of b (n, m), and of ``inverse gradient`` of each point (N, 3, m).
@@ -71,53 +46,27 @@ class NormalEquations:
             w.unknowns,
         )  # fmt: skip
 
-    def after(self, x: Array) -> Window:
-        """The window after a step of the unknowns."""
-        w = self.window
-        poses, points = kernels.step(
-            w.poses, w.column, w.points, w.place, self.E, w.pose_of, self.cross, *w.by_point, self.inverse,
-            self.gradient, x,
-        )  # fmt: skip
-        return w.at(poses, points)
 
-
-def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquations:
-    """The normal equations of a window at its present values.
-
-    Args:
-        w: the window.
-        centre: the pose from which inverse distances of points outside the prior count.
-        whole: with H; without it, H is left undefined, and only a factor of other equations may be used.
-    """
-    own = (
-        (np.zeros((0, 3)), np.zeros((0, 3, 3))) if w.mean is None or w.information is None else (w.mean, w.information)
-    )
-    return NormalEquations(w, *kernels.normal_equations(
-        w.stereo.intrinsics, w.poses, w.column, w.points, w.place, w.basis, centre, w.rows.arrays, w.places.arrays, own,
-        w.motion.arrays, w.carried.arrays, w.prior.arrays, w.pose_of, *w.by_point, whole, w.unknowns,
-    ))  # fmt: skip
+def linearised(w: Window, centre: int = 0) -> NormalEquations:
+    """The normal equations of a window at its present values; points outside the prior are in charts about `centre`."""
+    *_, H, at = _gauss_newton(w, centre, np.inf, 0.0, 0)
+    return NormalEquations(w, H, *at[2:])
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A solved window.
+    """A solved window."""
 
-    Attributes:
-        window: poses and points as found.
-        equations: linearised next to the solution.
-        cost: at the solution.
-        converged: False where the steps ran out, or none of them lessened the cost.
-    """
-
-    window: Window
-    equations: NormalEquations
-    cost: float
-    converged: bool = True
+    window: Window  # poses and points as found
+    equations: NormalEquations  # linearised next to the solution
+    factor: Array  # Cholesky's L of the unknowns' information (n, n), in Fortran's order
+    cost: float  # at the solution
+    converged: bool = True  # False where the steps ran out, or none of them lessened the cost
 
     @cached_property
     def inverse_factor(self) -> Array:
         """``L⁻¹`` (n, n), lower triangular."""
-        return np.asarray(_upper_inverse(self.equations.factor).T)
+        return np.asarray(_upper_inverse(self.factor.T).T)
 
     @cached_property
     def pose_covariance(self) -> Array:
@@ -142,12 +91,16 @@ class Solution:
         )
         return X[3 * len(w.members) :], points
 
-    def point_covariances(self, pose: int) -> tuple[Array, Array]:
-        """Covariances (N, 3, 3) of the points in the coordinates of a pose, and in the world; zero for known ones."""
+    def point_covariances(self, pose: int, asked: BoolArray | None = None) -> tuple[Array, Array]:
+        """Covariances (N, 3, 3) of the points in the coordinates of a pose, and in the world.
+
+        They are zero for points that are known, and for those that are not `asked` for (N,); None for all.
+        """
         e = self.equations
         w = e.window
+        asked = np.ones(len(w.points), bool) if asked is None else asked
         return covariance_kernels.point_relations(
-            w.poses[pose], w.points, w.place, e.E, w.pose_of, e.cross, *w.by_point, w.column, e.inverse,
+            w.poses[pose], w.points, asked, w.place, e.E, w.pose_of, e.cross, *w.by_point, w.column, e.inverse,
             self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members),
         )  # fmt: skip
 
@@ -171,46 +124,42 @@ class Solution:
             w.stereo.intrinsics, w.poses[pose], w.points[points], z, local, sigma, least, then.poses[pose],
             then.points[points],
         )  # fmt: skip
-        alone = (first[points + 1] - first[points] == 1) & (w.place[points] == kernels.ELIMINATED)
+        alone = (first[points + 1] - first[points] == 1) & (w.place[points] == ELIMINATED)
         if w.information is not None:
             alone &= w.information[points, 0, 0] == 0
         return np.where(alone, 0.0, distances)
 
 
-def solve(window: Window, close: float = CLOSE) -> Solution:
+def solve(window: Window, close: float = CLOSE, huber: float = np.inf, steps: int = STEPS) -> Solution:
     """The most probable poses and points, by Gauss-Newton with halved steps.
 
     Args:
         window: where to begin.
         close: see `CLOSE`.
+        huber: whitened residual from which on a row's pull no longer grows.
+        steps: at most.
 
     Raises:
         numpy.linalg.LinAlgError: something is not determined, or a value is not finite.
     """
-    now = linearised(window)
-    for _ in range(_STEPS):
-        x, rest = now.step(now.factor)
-        if rest < _NEAR * close:
-            return Solution(now.after(x), now, now.cost - rest)
-        following = _descended(now, x)
-        if following is None:
-            return Solution(now.window, now, now.cost, False)
-        x, rest = following.step(now.factor)
-        if not np.isfinite(rest):
-            raise np.linalg.LinAlgError("a window's step is not finite")
-        if rest < close:  # so near the end the last factor serves once more
-            return Solution(following.after(x), now, following.cost - rest)
-        now = linearised(following.window)
-    return Solution(now.window, now, now.cost, False)
+    poses, points, cost, minimum, L, H, at = _gauss_newton(window, 0, huber, close, steps)
+    return Solution(window.at(poses, points), NormalEquations(window.at(*at[:2]), H, *at[2:]), L, cost, minimum)
 
 
-def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:
-    """Equations, not whole, after a step, or the longest of its halves that does not raise the cost; None for none."""
-    for halving in range(_HALVINGS):
-        following = linearised(now.after(0.5**halving * x), whole=False)
-        if following.cost <= now.cost + 1e-9 * abs(now.cost) + 1e-12:
-            return following
-    return None
+def _gauss_newton(w: Window, centre: int, huber: float, close: float, steps: int) -> tuple[Any, ...]:
+    own = (
+        (np.zeros((0, 3)), np.zeros((0, 3, 3))) if w.mean is None or w.information is None else (w.mean, w.information)
+    )
+    found: tuple[Any, ...] = kernels.gauss_newton(
+        w.stereo.intrinsics, w.poses, w.column, w.points, w.place, w.basis, centre, w.rows.arrays, w.places.arrays, own,
+        w.motion.arrays, w.prior.arrays, w.pose_of, *w.by_point, w.unknowns, huber, close, steps,
+    )  # fmt: skip
+    return found
+
+
+def row_distances(w: Window) -> Array:
+    """Squared distance of each row (M,) from its prediction by poses and points as they are, ∞ behind the camera."""
+    return np.asarray(kernels.row_distances(w.stereo.intrinsics, w.poses, w.points, w.rows.arrays))
 
 
 def _upper_inverse(U: Array) -> Array:

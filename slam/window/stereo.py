@@ -18,7 +18,6 @@ from slam.geometry.kernels import predicted_pixels, project_rectified, triangula
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.models import EstimatorModels
-from slam.window.gating import landmarks_pose
 
 #: Why a back end refuses `slam.interfaces.ConsideringBackend.consider`.
 TOO_LATE = "errors of the rig are followed from before the first predict or insert on"
@@ -134,17 +133,6 @@ class RectifiedMeasurement:
         """
         camera = self.rig.rectified_parameters
         return predicted_pixels(camera, local, covariances, self.models.pixel_sigma, _MOST_CORRELATED)
-
-    def landmarks_pose(self, points: Array, z: Array, T: Array, seed: int) -> Array | None:
-        """The pose (4, 4) on which most landmarks agree, if there is one; see `slam.window.gating.landmarks_pose`.
-
-        Args:
-            points: the landmarks (M, 3) in the world [m].
-            z: measurements (M, 3), see `RectifiedStereo.measure`.
-            T: guess of the pose (4, 4).
-            seed: of the random choice.
-        """
-        return landmarks_pose(self.rig, points, z + np.array([0.0, 0.0, self.stereo.doffs]), self.models, T, seed)
 
 
 def relative_covariance(P: Array, earlier: Array, later: Array) -> Array:

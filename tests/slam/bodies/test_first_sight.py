@@ -9,7 +9,7 @@ import pytest
 
 from slam.bodies.belief import shape_of, slid
 from slam.bodies.estimator import FRAMES
-from slam.window.problem import Carried
+from slam.window.problem import Motion
 from slam.window.stereo import RectifiedStereo
 from tests.slam.bodies.body_scene import box_scene
 from tests.slam.bodies.body_scene import follow as follow_body
@@ -31,6 +31,6 @@ def test_a_point_that_was_given_up_leaves_with_all_its_measurements():
     ids = b.points.ids.copy()
     ids[member] = -1
     given_up = replace(b, points=replace(b.points, ids=ids))
-    after = slid(given_up, RectifiedStereo.of(scene_.rig), Carried.none(), 0.0)
+    after = slid(given_up, RectifiedStereo.of(scene_.rig), Motion.none(), 0.0)
     assert b.points.ids[member] not in after.points.ids
-    assert len(after.points) == len(slid(b, RectifiedStereo.of(scene_.rig), Carried.none(), 0.0).points) - 1
+    assert len(after.points) == len(slid(b, RectifiedStereo.of(scene_.rig), Motion.none(), 0.0).points) - 1

@@ -66,7 +66,7 @@ def test_what_cannot_be_told_is_not_good():
 
 
 def test_a_frames_own_covariance_is_that_of_its_least_squares_pose():
-    from slam.geometry.pnp import find_consensus
+    from slam.window.consensus import find_consensus
 
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-2, 2, 40), rng.uniform(-1, 1, 40), rng.uniform(3, 6, 40)])

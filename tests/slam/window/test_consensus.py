@@ -5,8 +5,9 @@ import pytest
 
 from slam.errors import CalibrationError
 from slam.geometry import se3
-from slam.geometry.pnp import find_consensus, measurement_rows, rigid_fit
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
+from slam.window.consensus import find_consensus
 from tests.slam.scene import RIG, Cloud
 
 
@@ -77,13 +78,3 @@ def test_too_few_matches_do_no_harm(count):
     found = find_consensus(RIG, points, z, np.eye(4), 2.0, 50, seed=0)
     assert np.isfinite(found.T_world_left).all()
     assert found.inliers.shape == (count,)
-
-
-def test_rigid_fit():
-    rng = np.random.default_rng(0)
-    source = rng.normal(size=(5, 4, 3))
-    T = se3.exp(rng.normal(size=(5, 6)))
-    target = source @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-    np.testing.assert_allclose(rigid_fit(source, target), T, atol=1e-12)
-    flat = source * [1, 1, 0]  # three points, or points in a plane: never a mirror image
-    assert (np.linalg.det(rigid_fit(flat[:, :3], flat[:, :3])[:, :3, :3]) > 0).all()

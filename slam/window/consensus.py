@@ -1,0 +1,176 @@
+"""The camera's pose from landmarks of known position, where many matches are wrong: consensus, then least squares.
+
+It tells which matches agree with one rigid motion before any estimator sees them, and gives a smoother its first guess.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.chi_square import chi_square_limit
+from slam.geometry import kernels
+from slam.geometry.arrays import BoolArray, median
+from slam.geometry.pnp import MINIMAL_POINTS, poses_of_three
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.window.gating import MIN_CONSENSUS
+from slam.window.problem import Rows, Window
+from slam.window.solver import STEPS, solve
+from slam.window.stereo import RectifiedMeasurement, RectifiedStereo
+
+CLEAR_MAJORITY = 0.7  #: share of the matches that agree with the guess at which no other pose is tried
+_BATCH = 10  # cost: hypotheses tried at once
+_ENOUGH = 100  # cost: matches that fix a pose far better than is needed to tell which others agree
+
+
+_HYPOTHESES = 200  # cost: poses tried in the search for one on which the landmarks agree
+_AS_NEW = 2.0  # innovation variance of a landmark as uncertain as a new one, in units of the pixel variance
+
+
+@dataclass(frozen=True, eq=False)
+class PoseConsensus:
+    """A pose and the matches that agree with it."""
+
+    T_world_left: Array  # pose (4, 4)
+    inliers: BoolArray  # which matches agree (M,)
+
+
+def find_consensus(
+    rig: StereoRig, points: Array, measured: Array, guess: Array, threshold: float, hypotheses: int, seed: int
+) -> PoseConsensus:
+    """The pose with which most matches agree (RANSAC on minimal sets of three, then least squares on all that agree).
+
+    The guess is tried first, refined on what agrees with it, then on what disagrees with it least, and is enough where
+    a clear majority agrees. Other hypotheses are poses from the left pixels of three matches (P3P).
+
+    Args:
+        rig: the rectified pair.
+        points: landmark positions (M, 3) in world coordinates [m].
+        measured: (M, 3) = (uL, vL, uR), uR NaN for monocular rows.
+        guess: expected pose T_world_left (4, 4).
+        threshold: largest reprojection error of an inlier, on each of uL, vL, uR [px].
+        hypotheses: how many minimal sets are tried.
+        seed: of the random choice.
+
+    Raises:
+        CalibrationError: the rig is not rectified.
+    """
+    matches = _Matches.of(rig, points, measured, threshold)
+    clear = CLEAR_MAJORITY * len(points)
+    first = matches.polished(guess)
+    if first.inliers.sum() >= clear:
+        return first
+    nearer = matches.polished(matches.approached(guess))
+    if nearer.inliers.sum() >= max(clear, float(first.inliers.sum())):
+        return nearer
+    hypothesis = matches.best_hypothesis(rig, measured, hypotheses, seed)
+    if hypothesis is None:
+        return first
+    best = matches.polished(hypothesis)
+    return best if best.inliers.sum() > first.inliers.sum() else first
+
+
+def landmarks_pose(measure: RectifiedMeasurement, points: Array, z: Array, T: Array, seed: int) -> Array | None:
+    """The pose (4, 4) on which most landmarks agree; None if fewer than five agree.
+
+    Args:
+        measure: projection, pixel noise and gate.
+        points: the landmarks (M, 3) in the world [m].
+        z: measurements (M, 3), see `RectifiedStereo.measure`.
+        T: guess of the pose T_world_left (4, 4).
+        seed: of the random choice.
+    """
+    sigma, probability = measure.models.pixel_sigma, measure.models.gate_probability
+    threshold = sigma * float(np.sqrt(_AS_NEW * chi_square_limit(3, probability)))
+    measured = z + np.array([0.0, 0.0, measure.stereo.doffs])
+    found = find_consensus(measure.rig, points, measured, T, threshold, _HYPOTHESES, seed)
+    return found.T_world_left if found.inliers.sum() >= max(MIN_CONSENSUS, (len(z) + 1) // 2) else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """Points and what was measured of them."""
+
+    stereo: RectifiedStereo
+    points: Array  # (M, 3) in world coordinates [m]
+    z: Array  # (M, 3), see `RectifiedStereo.measure`
+    threshold: float  # largest error of an inlier [px]
+
+    @classmethod
+    def of(cls, rig: StereoRig, points: Array, measured: Array, threshold: float) -> _Matches:
+        stereo = RectifiedStereo.of(rig)
+        return cls(stereo, np.ascontiguousarray(points, float), measured - [0.0, 0.0, stereo.doffs], threshold)
+
+    def errors(self, poses: Array) -> Array:
+        """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
+        return np.asarray(kernels.errors(self.stereo.intrinsics, self.points, self.z, poses))
+
+    def agreeing(self, poses: Array) -> BoolArray:
+        """Which matches (H, M) agree with each pose."""
+        return np.asarray(self.errors(poses) < self.threshold)
+
+    def fitted(self, mask: BoolArray, T: Array, steps: int = STEPS) -> Array:
+        """Least-squares pose (4, 4), from T, by some of the matches; T where they do not determine it."""
+        rows = np.flatnonzero(mask)
+        if len(rows) > _ENOUGH:
+            rows = rows[np.linspace(0, len(rows) - 1, _ENOUGH).astype(int)]
+        known = np.ones(len(rows), bool)
+        w = Window(
+            self.stereo, T[None], self.points[rows], Rows.of(0, np.arange(len(rows)), self.z[rows], 1.0), known=known
+        )
+        try:
+            return solve(w, steps=steps).window.poses[0]
+        except np.linalg.LinAlgError:
+            return T
+
+    def polished(self, T: Array) -> PoseConsensus:
+        """Least squares on the matches that agree with a pose, repeated while their number grows."""
+        inliers = self.agreeing(T[None])[0]
+        for _ in range(5):  # 5: of least squares on what agrees, at most
+            if inliers.sum() < MINIMAL_POINTS:
+                break
+            better = self.fitted(inliers, T)
+            again = self.agreeing(better[None])[0]
+            if again.sum() < inliers.sum():
+                break
+            T, grown = better, again.sum() > inliers.sum()
+            inliers = again
+            if not grown:
+                break
+        return PoseConsensus(T, inliers)
+
+    def approached(self, T: Array) -> Array:
+        """A pose (4, 4) nearer to the better half of the matches, where the guess is too far off for any."""
+        for _ in range(3):  # 3: steps towards the better half of the matches, from a guess that is far off
+            error = self.errors(T[None])[0]
+            good = np.isfinite(error)
+            if good.sum() < MINIMAL_POINTS:
+                break
+            T = self.fitted(good & (error <= median(error[good])), T, 2)
+        return T
+
+    def best_hypothesis(self, rig: StereoRig, measured: Array, hypotheses: int, seed: int) -> Array | None:
+        """The pose (4, 4) from three matches with which most matches agree; None where there is none.
+
+        Stops before all hypotheses are tried where a better one is improbable (one in a hundred).
+        """
+        rng = np.random.default_rng(seed)
+        best, most, tried = None, 0, 0
+        among = np.flatnonzero(np.isfinite(measured[:, :2]).all(axis=1))
+        if len(among) < MINIMAL_POINTS:
+            return None
+        while tried < hypotheses:
+            count = min(_BATCH, hypotheses - tried)
+            triples = among[rng.random((count, len(among))).argsort(axis=1)[:, :MINIMAL_POINTS]]
+            poses = poses_of_three(rig, self.points, measured, triples)
+            tried += count
+            if not len(poses):
+                continue
+            support = self.agreeing(poses).sum(axis=1)
+            if support.max() > most:
+                best, most = poses[int(np.argmax(support))], int(support.max())
+            if (1 - (most / len(self.points)) ** MINIMAL_POINTS) ** tried < 0.01:
+                break
+        return best
