@@ -7,7 +7,6 @@ three successive frames; nothing is approximated.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -19,8 +18,8 @@ from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_po
 from backends.smoother.graph import FAILURES, minimised
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Tracks
-from slam.bounds import from_options, require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
+from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
@@ -33,45 +32,28 @@ _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
 _DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determines a landmark well enough for Cholesky
 
 
-@dataclass(frozen=True)
-class BatchConfig:
-    """Options of `BatchBackend`.
-
-    Attributes:
-        online: whether each frame's pose is that of the problem solved so far, and not the smoother's.
-
-    Raises:
-        ConfigurationError: it is neither true nor false.
-    """
-
-    online: bool = False
-
-    def __post_init__(self) -> None:
-        require_not_negative(self, {}, "batch")
-
-
 class BatchBackend:
     """Levenberg-Marquardt over all poses and landmarks.
 
     `estimate` and `trajectory` raise `SlamError` where gtsam cannot solve the problem.
 
     A smoother runs along, of whose graph every measured frame is a pose: it predicts, gates and gives the first values.
-    The problem is solved when the trajectory or the landmarks are asked for; with ``online=True`` whenever the pose is,
-    which costs more with every frame.
+    The problem is solved when the trajectory or the landmarks are asked for; the pose alone is the smoother's.
 
     Args:
         rig: the cameras.
         models: noise, priors, motion and gate.
-        options: see `BatchConfig`.
+        options: there are none.
 
     Raises:
-        ConfigurationError: an option is unknown or out of range.
+        ConfigurationError: an option is given.
     """
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
+        if options:
+            raise ConfigurationError(f"batch: unknown option {min(options)!r}; there are none")
         self.rig = rig
         self.models = models
-        self.config = from_options(BatchConfig, "batch", options)
         self._smoother = SmootherBackend(rig, models, lag=None)
         self._solution: _BatchSolution | None = None
 
@@ -126,7 +108,7 @@ class BatchBackend:
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         rough = self._smoother.estimate(landmarks)
-        if not (landmarks or self.config.online):
+        if not landmarks:
             return rough
         solution, s = self._solved(), self._smoother.state
         positions, covariances = rough.positions.copy(), rough.covariances.copy()

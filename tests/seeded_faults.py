@@ -45,7 +45,8 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "self.marks[b:, :b] - V_marks @ V_left.T + shift", "self.marks[b:, :b] + shift",
+        "cross = self.marks[b:, :b] - V_marks @ V_left.T + shift @ head[:POSE, h : h + b]",
+        "cross = self.marks[b:, :b] + shift @ head[:POSE, h : h + b]",
         "tests/backends/test_ekf_parts.py tests/backends/test_rest.py tests/backends/test_ekf.py",
     ),
     Fault(

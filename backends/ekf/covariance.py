@@ -176,8 +176,8 @@ class Covariance:
             summands = self.marks.diagonal()[b:] + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1)
             positive(marks, summands, terms)
         if b:
-            cross, state = self.marks[b:, :b] - V_marks @ V_left.T + shift @ head[:POSE, h : h + b], marks
-            marks = self.marks.copy()
+            state, marks = marks, self.marks.copy()
+            cross = self.marks[b:, :b] - V_marks @ V_left.T + shift @ head[:POSE, h : h + b]
             marks[b:, b:], marks[b:, :b], marks[:b, b:] = state, cross, cross.T
         by_rig[h + b :] += shift @ by_rig[:POSE] - V_marks @ lost_by_rig
         head[:, h + b :] += head[:, :POSE] @ shift.T

@@ -131,7 +131,7 @@ class Linearisation:
         nu = np.where(rows, update.z - self.z, 0.0).reshape(-1)
         nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) - by_pose @ self.mean[:POSE]
         with_camera = _times(own, by_pose, P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
-        with_marks = _times(own, by_pose, P.head[:POSE, h + b :], P.marks[numbers][:, b:])
+        with_marks = _times(own, by_pose, P.head[:POSE, h + b :], P.marks[:, b:][numbers])
         S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
         S[np.diag_indices(len(S))] += update.sigma**2
         return Innovation(self, rows, own, by_pose, (with_camera, with_marks), nu, S)
@@ -154,7 +154,7 @@ class Innovation:
         update, P = self.at.update, self.at.update.covariance
         numbers, h, b = 3 * P.left + update.numbers, len(P.head), 3 * P.left
         with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h : h + b]], axis=1)
-        with_marks = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[numbers][:, :b]], axis=1)
+        with_marks = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
         by_rig = _times(self.own, self.by_pose, P.by_rig[:POSE], P.by_rig[h + numbers])
         by_rig -= np.where(self.rows[:, :, None], update.field(update.z), 0.0).reshape(by_rig.shape)
         return _times(self.own, self.by_pose, with_pose, with_marks), by_rig

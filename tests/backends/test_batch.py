@@ -60,16 +60,6 @@ def test_the_smoother_is_nearly_as_good_as_the_optimum():
     assert whole < 1.2 * best and ours < 1.5 * best, errors
 
 
-def test_online_the_pose_is_the_solved_one():
-    data = drive(8)
-    late, online = BatchBackend(RIG, MODELS), BatchBackend(RIG, MODELS, online=True)
-    run(late, data)
-    run(online, data)
-    np.testing.assert_allclose(
-        online.estimate(landmarks=False).T_world_left, late.trajectory().poses[-1], atol=1e-6
-    )  # two solutions, each to its last step
-
-
 def test_landmarks_seen_once_are_the_smoothers():
     data = drive(1)
     backend = BatchBackend(RIG, MODELS)

@@ -105,7 +105,8 @@ def test_a_setting_of_an_earlier_version_is_one_line():
 def test_options_of_front_ends_and_back_ends_are_there(every, role):
     for name in registry.names(f"{role}s"):
         part = registry.create(f"{role}s", name, RIG)
-        wanted = {f"{role}.{f.name}" for f in fields(part.config) if can_be_set(f"{role}.{f.name}", name)}
+        options = fields(part.config) if name != "batch" else ()  # which has none
+        wanted = {f"{role}.{f.name}" for f in options if can_be_set(f"{role}.{f.name}", name)}
         assert {s.key for s in every if s.owner == name and s.key.startswith(role)} == wanted
 
 
