@@ -127,7 +127,7 @@ def test_what_rows_alone_say_is_not_applied():
         T = pose(k)
         f = street.features(0.1 * k, T, noise=0.1)
         z = calibration.model.points(np.column_stack([f.uv_left, f.uv_right[:, 0]]))
-        error = calibration.model.vertical(z) @ theta
+        error = calibration.model.field(z)[:, 3] @ theta
         calibration.observe(replace(f, uv_right=f.uv_right - np.column_stack([0 * error, error])), T)
         calibration.apply()
         applied.append(calibration.model.field(calibration.model.far())[:, 2] @ calibration.applied.parameters)
