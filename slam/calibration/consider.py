@@ -130,7 +130,7 @@ class RemainingRigError:
 
         It is the symmetric root, so that its columns mean the same in all frames.
         """
-        covariance = self._calibration.covariance
+        covariance = self._calibration.posterior.covariance
         if self._root is None or not np.array_equal(self._root[0], covariance):
             values, vectors = np.linalg.eigh(covariance)
             self._root = covariance, vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T

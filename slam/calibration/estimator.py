@@ -91,14 +91,9 @@ class SelfCalibration:
         return self._motion.count
 
     @property
-    def covariance(self) -> Array:
-        """Of the present posterior (n, n)."""
-        return self._own.covariance + self._by_bias
-
-    @property
     def posterior(self) -> RigPosterior:
         """The present posterior of the rig's error in this recording."""
-        return RigPosterior(self._own.mean.copy(), self.covariance)
+        return RigPosterior(self._own.mean.copy(), self._own.covariance + self._by_bias)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
