@@ -82,7 +82,7 @@ class RigModel:
         A shift of both principal points looks almost like a rotation of the whole rig, and neither is known well. Lest
         the pose rotate with each revision, the ideal rig is rotated such that the left image as a whole does not move.
         """
-        field, n = _field(points, self.focal), len(self.names)
+        field, n = field_and_turn(points, self.focal), len(self.names)
         return np.asarray(field[:, :, :n] + field[:, :, n:] @ self._gauge)
 
     def shift(self, points: Array, parameters: Array) -> Array:
@@ -93,7 +93,7 @@ class RigModel:
     def _gauge(self) -> Array:
         """Rotation of the ideal rig (3, n) [rad] that cancels the left image's mean displacement by the parameters."""
         n = len(self.names)
-        rows = _field(self.far(), self.focal)[:, :2].reshape(-1, n + 3)
+        rows = field_and_turn(self.far(), self.focal)[:, :2].reshape(-1, n + 3)
         return -np.asarray(np.linalg.lstsq(rows[:, n:], rows[:, :n], rcond=None)[0])
 
     def residual_field(self, points: Array) -> Array:
@@ -112,13 +112,7 @@ class RigModel:
         return np.asarray(_SCALES * products[:, _COLUMNS])
 
 
-def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
-    """Change of x and of y (N, 8 each) [focal lengths] by the parameters of one camera, see `LENS`."""
-    field = _field(np.column_stack([x, y, np.zeros(len(x))]), 1.0)
-    return field[:, 0, : len(LENS)], field[:, 1, : len(LENS)]
-
-
-def _field(points: Array, focal: float) -> Array:
+def field_and_turn(points: Array, focal: float) -> Array:
     """Change (N, 4, n + 3) [px] of points (N, 3) [px] and their vertical disparities by parameters and a turn."""
     from slam.calibration.kernels import field
 
@@ -145,16 +139,12 @@ class RigCorrection:
         return self.model.rows(points)
 
     def features(self, features: StereoFeatures) -> StereoFeatures:
-        """Features with both pixels corrected."""
-        uv_left, uv_right = self.pixels(features.uv_left, features.uv_right)
-        return replace(features, uv_left=uv_left, uv_right=uv_right)
-
-    def pixels(self, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
-        """Corrected rectified pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
-        points = self.model.points(np.column_stack([uv_left, uv_right[:, 0]]))
+        """Features with both pixels corrected; the right row keeps the remaining vertical disparity."""
+        left, right = features.uv_left, features.uv_right
+        points = self.model.points(np.column_stack([left, right[:, 0]]))
         change = self.model.field(points) @ self.parameters
-        z, vertical = self.model.rows(points + change[:, :3]), uv_right[:, 1] - uv_left[:, 1] + change[:, 3]
-        return z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
+        z, vertical = self.model.rows(points + change[:, :3]), right[:, 1] - left[:, 1] + change[:, 3]
+        return replace(features, uv_left=z[:, :2], uv_right=np.column_stack([z[:, 2], z[:, 1] + vertical]))
 
 
 @dataclass(frozen=True, eq=False)
