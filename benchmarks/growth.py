@@ -42,21 +42,13 @@ LANDMARKS, MEASURED, FEATURES, OBJECTS, FRAMES = (
 
 @dataclass(frozen=True)
 class Point:
-    """A point of a curve.
+    """A point of a curve."""
 
-    Attributes:
-        by: what grows.
-        what: whose time it is.
-        size: how much there is of it.
-        milliseconds: of a frame, or of the part of it that the curve is about.
-        floor: of what cannot be done without; None where it was not measured.
-    """
-
-    by: str
-    what: str
-    size: int
-    milliseconds: float
-    floor: float | None
+    by: str  # what grows
+    what: str  # whose time it is
+    size: int  # how much there is of it
+    milliseconds: float  # of a frame, or of the part of it that the curve is about
+    floor: float | None  # of what cannot be done without; None where it was not measured
 
     def row(self) -> list[object]:
         """As `HEADER`."""
@@ -133,7 +125,7 @@ def by_features(name: str, count: int, frames: int) -> Point:
     """Whole frames over SURF alone."""
     sequence = open_sequence(f"synthetic:desk?frames={frames}")
     config = SystemConfig.for_kind(sequence.kind).with_settings([f"frontend.features={count}"])
-    system, whole, surf = StereoSlam(sequence.rig, backend=name, kind=sequence.kind, config=config), [], []
+    system, whole, surf = StereoSlam(sequence.rig, backend=name, config=config), [], []
     for frame in sequence:
         start = time.process_time()
         features = system.frontend.extract(frame)  # type: ignore[union-attr]
@@ -149,7 +141,7 @@ def by_objects(name: str, cars: int, frames: int) -> Point:
     features, found = [sequence.observations(k) for k in range(frames)], []  # type: ignore[attr-defined]
     for mode in ("detect", "off"):
         config = SystemConfig.for_kind(sequence.kind, None).with_settings([f"objects.mode={mode}"])
-        system = StereoSlam(sequence.rig, None, name, kind=sequence.kind, config=config)
+        system = StereoSlam(sequence.rig, None, name, config=config)
         found.append(float(np.median(timed(system.process_features, features)[1][frames // 3 :])))
     return Point(OBJECTS, name, cars, *found)
 

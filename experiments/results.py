@@ -3,10 +3,10 @@
     SLAM_DATA=/path/to/data python experiments/results.py [--quick] [--only NAME …] [--out DIR] [--page FILE]
         [--processes N]
 
-Runs the scripts beside this one, each with a folder of its own; what a script prints as Markdown is its section of a
-page in the folder ``results`` beside the first page, and the pictures that it leaves are copied there. A script that
-fails is said on its page, and the exit status is 1; the others run all the same. ``--processes 2`` runs two at once,
-which spoils their times. ``--only`` replaces the sections of some scripts and leaves the others as they are.
+Runs the scripts beside this one and the benchmarks, each with a folder of its own. What a script prints as Markdown is
+its section of a page in the folder ``results`` beside the first page, and the pictures that it leaves are copied there.
+A script that fails is said on its page, and the exit status is 1; the others run all the same. ``--processes 2`` runs
+two at once, which spoils their times. ``--only`` replaces the sections of some scripts and leaves the others.
 """
 
 from __future__ import annotations
@@ -32,40 +32,66 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Experiment:
-    """A script beside this one.
+    """A script."""
 
-    Attributes:
-        name: of the script, without ``.py``.
-        page: one of `PAGES`.
-        title: heading of its section.
-        paper: what the paper had; empty for our own.
-        pictures: captions of those that are shown, by name.
-        arguments: of its long form.
-        left_out: columns of its tables that are not shown on the page; they are in the files that it leaves.
-    """
-
-    name: str
-    page: str
-    title: str
-    paper: str = ""
-    pictures: dict[str, str] | None = None
-    arguments: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
+    name: str  # without ``.py``
+    page: str  # one of `PAGES`
+    title: str  # heading of its section
+    paper: str = ""  # what the paper had; empty for our own
+    says: str = ""  # what its table says, where it does not say so itself
+    pictures: dict[str, str] | None = None  # captions of those that are shown, by name
+    arguments: tuple[str, ...] = ()  # of its long form
+    left_out: tuple[str, ...] = ()  # columns that are not shown on the page; they are in the files that it leaves
+    folder: str = "experiments"
 
     def command(self, quick: bool) -> list[str]:
-        """Script and arguments, without the folder."""
-        return [f"experiments/{self.name}.py", *(["--quick"] if quick else self.arguments)]
+        """Script and arguments, without the folder for what it leaves."""
+        return [f"{self.folder}/{self.name}.py", *(["--quick"] if quick else self.arguments)]
 
 
-#: Title and question of each page, by its name.
+#: Title and question of each page, and the answer in short, by its name.
 PAGES = {
-    "recordings": ("Real recordings", "How far from the truth are paths on real drives, and what is each part worth?"),
-    "honesty": ("Covariances", "Do the back ends know how sure they are, also with a wrong calibration?"),
-    "papers": ("The papers' experiments", "What did the papers find, and what is found here?"),
-    "objects": ("Moving objects", "Are bodies found without being told, and how well are their motions known?"),
-    "loops": ("Loops", "What does closing loops give on long drives that come back?"),
-    "faults": ("Faults", "What do blackouts, lost frames, a kidnapped camera, and spoilt images do?"),
-    "cost": ("Cost", "What does a frame cost, next to others, and how does that grow?"),
+    "recordings": (
+        "Real recordings",
+        "How far from the truth are paths on real drives, and what is each part worth?",
+        "Centimetres on the shorter drives, some decimetres on the longest, whose truth is hardly better. "
+        "Self-calibration is worth most; the path hardly needs the detector of moving objects.",
+    ),
+    "honesty": (
+        "Covariances",
+        "Do the back ends know how sure they are, also with a wrong calibration?",
+        "They do in worlds: NEES is in its band, along a corridor of a thousand frames too, where the papers' plain "
+        "filter is overconfident beyond use, and errors are near the Cramér-Rao bound. Self-calibration finds a wrong "
+        "rig within its uncertainty.",
+    ),
+    "papers": (
+        "The papers' experiments",
+        "What did the papers find, and what is found here?",
+        "Features, savings of the short descriptor, and the map of the aisle are as in the papers; the path is twice "
+        "as near, and a wrong start is mended in one frame. The short descriptor makes no map better or worse.",
+    ),
+    "objects": (
+        "Moving objects",
+        "Are bodies found without being told, and how well are their motions known?",
+        "All are found within some frames, their motions known to millimetres and tenths of a degree a frame, cars' "
+        "speeds to a hundredth. Their covariances are too small. What the paper's own procedure sees is far off.",
+    ),
+    "loops": (
+        "Loops",
+        "What does closing loops give on long drives that come back?",
+        "The final path over kilometres is within some decimetres, in most cases several times nearer than without; no "
+        "loop is false.",
+    ),
+    "faults": (
+        "Faults",
+        "What do blackouts, lost frames, a kidnapped camera, and spoilt images do?",
+        "After each of them the camera is tracked again within some frames, and the path stays within centimetres.",
+    ),
+    "cost": (
+        "Cost",
+        "What does a frame cost, next to others, and how does that grow?",
+        "About the CPU time of SIFT for one image, or half of it, however long the run.",
+    ),
 }
 ERRORS = "Error of the online pose (solid), and the standard deviation that is claimed (dashed)."
 EXPERIMENTS = (
@@ -73,18 +99,22 @@ EXPERIMENTS = (
         "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
     ),
     Experiment("ablation", "recordings", "What each part is worth"),
-    Experiment("knee", "recordings", "How many features and landmarks"),
+    Experiment(
+        "knee", "recordings", "How many features and landmarks", left_out=("±", "ekf", "window", "CPU extract"),
+    ),
     Experiment(
         "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
             "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."
-        },
+        }, left_out=("with 10 % wrong",),
     ),
     Experiment(
         "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "4"), pictures={
             "corridor": "Left: mean NEES and its band. Right: what is claimed of the heading, which nothing measures."
-        },
+        }, left_out=("lost updates",),
     ),
-    Experiment("calibration", "honesty", "Self-calibration: wrong rigs, and one rig on two drives"),
+    Experiment(
+        "calibration", "honesty", "Self-calibration: wrong rigs, and one rig on two drives", left_out=("ratio",),
+    ),
     Experiment(
         "detector", "papers", "D_threshold, octaves, radius (A, III.A)",
         "One 320x240 webcam image: 837 features at D_threshold 0, 41 at 10000; "
@@ -128,12 +158,26 @@ EXPERIMENTS = (
     ),
     Experiment(
         "faults", "faults", "Blackout, dropped frames, a kidnapped camera",
-        pictures={"faults": "Error of the position, frame by frame; the fault is grey."},
+        pictures={"faults": "Error of the position, frame by frame; the fault is grey."}, left_out=("end [cm]",),
     ),
     Experiment("perturbations", "faults", "Real drives many times over, and spoilt"),
     Experiment(
-        "cost", "cost", "What a frame costs, next to others", pictures={"growth": "Floors are dashed."},
-        left_out=("by", "ATE [mm]", "frames lost", "wall / SIFT", "CPU / SIFT", "cv2.SIFT at 752x480, wall / CPU [ms]"),
+        "frame", "cost", "Whole frames", folder="benchmarks",
+        says="Median times of a frame, images in memory, the detector of moving objects on, and their ratios to "
+        "`cv2.SIFT` on one image and to ORB-SLAM3 on the same images; with overlap, times from one result to the next. "
+        "CPU time adds up all threads.",
+        left_out=("ATE [mm]", "frames lost", "wall / SIFT", "CPU / SIFT"),
+    ),
+    Experiment(
+        "growth", "cost", "How it grows", folder="benchmarks", pictures={"growth": "Floors are dashed."},
+        says="CPU time over the number of landmarks, features, moving cars and frames, and of what cannot be done "
+        "without (floor, dashed): the filter's bare `dsyrk`, gtsam's own calls, SURF alone, no detector.",
+        left_out=("by",),
+    ),
+    Experiment(
+        "command", "cost", "Whole runs", folder="benchmarks",
+        says="`slam run` with nothing compiled and once more, and its peak memory.",
+        left_out=("cv2.SIFT at 752x480, wall / CPU [ms]",),
     ),
 )  # fmt: skip
 
@@ -143,8 +187,6 @@ SHOWN = (("real_sequences", "paths"), ("consistency", "consistency"), ("aisle", 
 
 def run(experiment: Experiment, folder: Path, quick: bool) -> tuple[str, str]:
     """Run a script: what it printed, and why it failed (empty where it did not)."""
-    if not (ROOT / "experiments" / f"{experiment.name}.py").exists():
-        return "", "there is no such script"
     out = (folder / experiment.name).absolute()
     out.mkdir(parents=True, exist_ok=True)
     for left in out.glob("*.png"):
@@ -199,6 +241,7 @@ def section(experiment: Experiment, printed: str, failure: str, pictures: Sequen
     text = readable(text, experiment.left_out)
     parts = [f"## {experiment.title}"]
     parts += [f"**The paper:** {experiment.paper}"] if experiment.paper else []
+    parts += [experiment.says] if experiment.says else []
     parts += [f"**Failed:** {failure}"] if failure else []
     return "\n\n".join([*parts, text, *pictures, f"`python {' '.join(experiment.command(quick))}`\n"])
 
@@ -212,19 +255,19 @@ def with_section(page: str, title: str, text: str) -> str:
 
 
 def page_head(name: str, quick: bool) -> str:
-    """Title and question."""
-    short = " In the short form, which shows that everything runs, and no more." if quick else ""
-    title, question = PAGES[name]
-    return f"# {title}\n\n{question}{short} Errors, covariances and NEES: see [concepts](../concepts.md).\n"
+    """Title, question, and the answer in short."""
+    title, question, answer = PAGES[name]
+    answer = "In the short form, which shows that everything runs, and no more." if quick else answer
+    return f"# {title}\n\n{question} {answer} Errors, covariances and NEES: see [concepts](../concepts.md).\n"
 
 
 def first_page() -> str:
-    """A screen: what the README says of recordings; pictures; the pages."""
+    """A screen: the README's table of recordings; pictures; the pages."""
     text = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Results\n")[2].partition("\n## ")[0]
-    recordings = text.strip().partition("\n\nOn worlds")[0].replace("](docs/", "](")
+    recordings = text.strip().partition("\n\nAll frames")[0].replace("](docs/", "](")
     captions = {(e.name, name): said for e in EXPERIMENTS for name, said in (e.pictures or {}).items()}
     pictures = [f"![{captions.get(shown, shown[0])}](images/results/{'_'.join(shown)}.png)" for shown in SHOWN]
-    pages = [f"- [{title}](results/{name}.md): {question}" for name, (title, question) in PAGES.items()]
+    pages = [f"- [{title}](results/{name}.md): {question}" for name, (title, question, _) in PAGES.items()]
     used = ", ".join(f"{package} {version}" for package, version in versions().items())
     made = f"Written by `python experiments/results.py`, with {used}."
     return "\n\n".join(["# Results", recordings, *pictures, "\n".join(pages), made]) + "\n"
@@ -239,8 +282,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--processes", type=int, default=1, help="how many scripts run at once")
     given = parser.parse_args(arguments)
     chosen = [e for e in EXPERIMENTS if not given.only or e.name in given.only]
-    with ThreadPoolExecutor(given.processes) as pool:
-        outcomes = list(pool.map(lambda e: run(e, given.out, given.quick), chosen))
+    with ThreadPoolExecutor(given.processes) as pool:  # the last ones take longest
+        outcomes = list(pool.map(lambda e: run(e, given.out, given.quick), chosen[::-1]))[::-1]
     folder = given.page.with_name("results")
     folder.mkdir(parents=True, exist_ok=True)
     for name in dict.fromkeys(e.page for e in chosen):

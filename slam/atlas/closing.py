@@ -13,9 +13,9 @@ from slam.atlas.config import AtlasConfig
 from slam.atlas.keyframes import Loop, distance
 from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.chi_square import chi_square_limit
+from slam.data import CommonError
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.rig_error import CommonError
 
 _DIMENSIONS = 6  # fixed: mean of χ² of a pose
 #: Largest squared Mahalanobis distance of a loop from the path alone: a number beyond five sigma is as rare. Drift

@@ -8,10 +8,9 @@ import pytest
 
 import slam
 from slam import registry
-from slam.commands.settings import listing
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
-from slam.run.settings_reference import settings
+from slam.run.settings_reference import listing, settings
 from slam.settings import SETTABLE, can_be_set, leaves, require_settable
 
 RIG = slam.StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
@@ -25,7 +24,7 @@ def every():
 @pytest.fixture
 def read(every, monkeypatch):
     """The settings are read once for all tests of their listing."""
-    monkeypatch.setattr("slam.commands.settings.settings", lambda: every)
+    monkeypatch.setattr("slam.run.settings_reference.settings", lambda: every)
 
 
 def test_what_can_be_set_is_there_with_its_defaults(every):
@@ -83,13 +82,19 @@ def test_settings_may_be_a_dict():
             SystemConfig().with_settings(wrong)
 
 
+def test_a_kind_beside_a_configuration_is_refused():
+    """It was ignored, also where the configuration was that of another kind."""
+    config = SystemConfig.for_kind("driving")
+    with pytest.raises(ConfigurationError, match="kind does not go with config"):
+        slam.StereoSlam(RIG, kind="handheld", config=config)
+    assert slam.StereoSlam(RIG, config=config).config.map == config.map
+
+
 def test_a_setting_of_an_earlier_version_is_one_line():
+    gone = r"^setting {}: there is no such setting in this version$".format
     for tree, words in (
-        (
-            {"association": {"hypotheses": 50}},
-            r"^setting association\.hypotheses: there is no such setting in this version$",
-        ),
-        ({"map": {"colour": 1}}, r"^setting map\.colour: there is no such setting in this version$"),
+        ({"association": {"hypotheses": 50}}, gone(r"association\.hypotheses")),
+        ({"map": {"colour": 1}}, gone(r"map\.colour")),
         *((bad, "setting") for bad in ([], "x", {"map": {"__doc__": 1}}, {"association": {"hypotheses": [1]}})),
     ):
         with pytest.raises(ConfigurationError, match=words):
