@@ -105,7 +105,7 @@ class SelfCalibration:
         still, as the prior holds them back.
         """
         error = float(self._focal @ self._own.mean)
-        allowed = np.sqrt(self._focal @ (self._prior.covariances[-1] + self.covariance) @ self._focal)
+        allowed = np.sqrt(self._focal @ (self._prior.covariances[-1] + self.posterior.covariance) @ self._focal)
         if abs(error - self._focal @ self._prior.mean) <= 5 * allowed:
             return ""
         return (
