@@ -51,7 +51,7 @@ class RemainingRigError:
     def field(self, z: Array) -> Array:
         """Derivatives (N, 3, n + 2) of true rows (uL, vL, uR) by what is followed, at corrected rows (N, 3) [px]."""
         points = self._calibration.model.points(z)
-        field = self._calibration.model.field(points)
+        field = self._calibration.model.field(points)[:, :3]
         field[:, 2] = field[:, 0] - field[:, 2]
         out = np.zeros((len(z), 3, field.shape[2] + 2))
         out[:, :, :-2], out[:, 2, -2] = (
@@ -129,7 +129,7 @@ class RemainingRigError:
 
         It is the symmetric root, so that its columns mean the same in all frames.
         """
-        covariance = self._calibration.covariance
+        covariance = self._calibration.posterior.covariance
         if self._root is None or not np.array_equal(self._root[0], covariance):
             values, vectors = np.linalg.eigh(covariance)
             self._root = covariance, vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from slam.calibration.model import LENS, RigModel, lens_change
+from slam.calibration.model import LENS, RigModel, field_and_turn
 from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
@@ -30,10 +30,6 @@ def corrected_rig(model: RigModel, parameters: Array) -> CorrectedRig:
     Focal lengths, principal point and distortion of each camera are fitted to the pixels of the corrected rays. A
     camera without distortion gets k1, k2, p1 and p2. A fisheye model has no tangential distortion. The left camera's
     axes are kept: the rotation of the ideal rig in `RigModel.field` is left out.
-
-    Args:
-        model: the parameters' meaning, and the rig as calibrated.
-        parameters: the corrections (n,).
     """
     rig, rectified = model.rig, model.rig.rectified
     side = len(LENS)
@@ -51,12 +47,8 @@ def _camera(
 ) -> tuple[PinholeCamera, float]:
     """A camera fitted to the corrected rays, and the root mean square deviation [px].
 
-    Args:
-        camera: as calibrated.
-        ideal: the corresponding camera of the rectified rig.
-        rectify: maps pixels (N, 2) of `camera` to those of the rectified camera.
-        R: rotation from the camera's axes to those of the rectified camera (3, 3).
-        theta: the corrections (8,) of `LENS`.
+    `rectify` maps its pixels (N, 2) to those of the `ideal` camera of the rectified rig, `R` (3, 3) its axes to that
+    camera's; `theta` (8,) are the corrections of `LENS`.
     """
     # (25, 15): grid of pixels to which the cameras are fitted, columns and rows
     u, v = np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip((camera.width, camera.height), (25, 15))))
@@ -66,7 +58,8 @@ def _camera(
     pixels, seen = pixels[good], seen[good]
     if 2 * len(pixels) < 4 + max(len(camera.distortion), 4):
         raise CalibrationError("the camera's pixels have no rays: its distortion cannot be undone")
-    true = seen + np.stack(lens_change(*seen.T), axis=1) @ theta
+    by_lens = field_and_turn(np.column_stack([seen, np.zeros(len(seen))]), 1.0)[:, :2, : len(LENS)]
+    true = seen + by_lens @ theta
     rays = np.column_stack([true, np.ones(len(true))]) @ R
     distortion = camera.distortion or (0.0,) * 4
     start = np.array([camera.fu, camera.fv, camera.u0, camera.v0, *distortion])

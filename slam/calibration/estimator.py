@@ -80,6 +80,8 @@ class SelfCalibration:
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
         self._scattered = 4  # 4: number of pairs that the configured noise counts for
         self._waiting: list[View] = []
+        self._open: Evidence | None = None  # of a pair that is not complete
+        self._frames, self._solved = 0, 0  # frames of the incomplete pair: now, and when last solved
         self._seen = 0
         self._looked: Array | None = None  # pose of the last frame that was used
         self.unsolved = 0
@@ -91,14 +93,9 @@ class SelfCalibration:
         return self._motion.count
 
     @property
-    def covariance(self) -> Array:
-        """Of the present posterior (n, n)."""
-        return self._own.covariance + self._by_bias
-
-    @property
     def posterior(self) -> RigPosterior:
         """The present posterior of the rig's error in this recording."""
-        return RigPosterior(self._own.mean.copy(), self.covariance)
+        return RigPosterior(self._own.mean.copy(), self._own.covariance + self._by_bias)
 
     @property
     def doubt(self) -> str:
@@ -108,7 +105,7 @@ class SelfCalibration:
         still, as the prior holds them back.
         """
         error = float(self._focal @ self._own.mean)
-        allowed = np.sqrt(self._focal @ (self._prior.covariances[-1] + self.covariance) @ self._focal)
+        allowed = np.sqrt(self._focal @ (self._prior.covariances[-1] + self.posterior.covariance) @ self._focal)
         if abs(error - self._focal @ self._prior.mean) <= 5 * allowed:
             return ""
         return (
@@ -146,7 +143,7 @@ class SelfCalibration:
 
     def _motion_agrees(self) -> bool:
         """Whether the evidence of motion is likelier with the posterior mean than with the calibration as delivered."""
-        motion, mean = self._motion.total(), self._own.mean
+        motion, mean = self._moved(), self._own.mean
         gain = 0.0 if motion is None else motion.e @ mean - 0.5 * mean @ motion.S @ mean
         return bool(gain > 1)  # 1: a fitted parameter's gain (Akaike)
 
@@ -177,7 +174,7 @@ class SelfCalibration:
         self._rows.add(rows)
         self._fields = fields if self._fields is None else self._fields + fields
         self._compare(view)
-        if self.pairs:
+        if self.pairs or self._open is not None:
             self._update()
 
     def _has_turned(self, T_world_left: Array) -> bool:
@@ -202,15 +199,30 @@ class SelfCalibration:
             evidence = self._evidence(first, view, matched) if len(matched) >= c.minimum_common else None
             if evidence is not None:
                 self._motion.add(evidence)
+        if waiting and not ended and self.pairs < 6:  # 6: with fewer pairs, an incomplete one counts provisionally
+            self._frames += 1
+            # 1.25: an incomplete pair is solved again after so many times the frames: parallax grows no faster
+            if self._frames >= 1.25 * self._solved:
+                self._open, self._solved = self._evidence(waiting[0], view, matched), self._frames
+        else:
+            self._open, self._frames, self._solved = None, 0, 0
         self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
     def evidence(self) -> RigEvidence | None:
         """The evidence of this recording alone, without any prior; None if no motion was seen."""
-        moved, rows = self._motion.total(), self._rows.total()
+        moved, rows = self._moved(), self._rows.total()
         if moved is None or rows is None or self._fields is None:
             return None
         whole, scales = rows + moved, residual_likelihoods(self._prior, self._fields)
         return RigEvidence(whole, whole.with_error(self._systematic), scales)
+
+    def _moved(self) -> Evidence | None:
+        """The evidence of motion: of the pairs, and of the incomplete one."""
+        complete = self._motion.total()
+        if self._open is None:
+            return complete
+        part = self._open.scaled(1 / self._motion.inflation)
+        return part if complete is None else complete + part
 
     def kept(self) -> SavedCalibration:
         """What is known of the rig, as a prior for further recordings of it."""
@@ -250,7 +262,7 @@ class SelfCalibration:
         """Update the posterior by Bayes' rule from all pairs of views and all rows so far."""
         for part in (self._rows, self._motion):
             part.update_inflation(self._own.mean, self._own.covariance)
-        moved, found = self._motion.total(), self.evidence()
+        moved, found = self._moved(), self.evidence()
         assert moved is not None and found is not None  # because there are pairs
         # The correction is to explain this recording, so it may take up what the residual fields do here.
         self._own = solve(self._own_prior, moved, found.plain)

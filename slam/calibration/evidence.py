@@ -172,7 +172,7 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
         The evidence of the parameters (n), and of them followed by the right camera's residual fields of y (n + k). The
         left camera's fields have the same effect with opposite sign.
     """
-    A, fields = model.vertical(points), model.residual_vertical(points)
+    A, fields = model.field(points)[:, 3], model.residual_field(points)[:, 3]
     squared = np.square(vertical + A @ parameters)
     # Weights by Student's t distribution of four degrees of freedom, with tails like those of matches.
     # 0.03: standard deviation of a row [px], the least that is believed

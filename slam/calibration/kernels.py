@@ -12,23 +12,6 @@ from slam.kernels.se3 import exp
 from slam.runtime.compilation import helper, kernel
 
 
-@kernel
-def polynomials(at, beyond, first, second, scales):
-    """Products (K, N) of Legendre polynomials of degrees `first` in x and `second` in y (K,), times `scales` (K,).
-
-    Points `at` (2, N) are in half sizes from the image's centre; farther than `beyond` the polynomials are constant.
-    """
-    out, P = np.empty((len(first), at.shape[1])), np.ones((2, max(np.max(first), np.max(second)) + 1))
-    for p in range(at.shape[1]):
-        for axis in range(2):
-            P[axis, 1] = v = min(max(at[axis, p], -beyond), beyond)
-            for i in range(2, P.shape[1]):
-                P[axis, i] = (P[axis, i - 1] * v * (2 * i - 1) - P[axis, i - 2] * (i - 1)) / i
-        for k in range(len(first)):
-            out[k, p] = scales[k] * P[0, first[k]] * P[1, second[k]]
-    return out
-
-
 @helper
 def _field_at(x, y, d, focal, out):
     """Change [px] of a point ``(x, y, d)`` and of its vertical disparity [focal lengths]: `out` (4, n + 3)."""

@@ -28,10 +28,10 @@ _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "
 
 #: Products of Legendre polynomials in x and y, up to these degrees, for what no lens model holds. Constant and linear
 #: ones are left out: `LENS` and `POSE` have them.
-_DEGREES = 5, 3
+_DEGREES = [5, 3]
 RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
-_FIRST, _SECOND = np.array(RESIDUAL).T.copy()
-_SCALES = np.sqrt((2 * _FIRST + 1) * (2 * _SECOND + 1))  # for a mean square of one over the image
+_COLUMNS = [(_DEGREES[1] + 1) * i + j for i, j in RESIDUAL]  # of all products
+_SCALES = np.array([np.sqrt((2 * i + 1) * (2 * j + 1)) for i, j in RESIDUAL])  # for a mean square of one over the image
 
 
 class RigModel:
@@ -73,75 +73,46 @@ class RigModel:
         return np.column_stack([u, points[:, 0] - points[:, 2] + self.right_u0])
 
     def field(self, points: Array) -> Array:
-        """Change (N, 3, n) [px] of points ``(x, y, d)`` (N, 3) [px] by the parameters.
+        """Change (N, 4, n) [px] by the parameters, of points ``(x, y, d)`` (N, 3) [px] and of their vertical disparity.
 
         With the right camera's true direction ``(x - d, y)`` and the baseline ``(1, down, forward)``, the true d is
-        ``x_left - x_right`` plus ``forward · d · x_right``. Rows of x and y are finite where d is not.
+        ``x_left - x_right`` plus ``forward · d · x_right``, and the vertical disparity, right row less left row, which
+        an ideal rig does not have, grows by ``d · (forward · y - down)``. Rows of x and y are finite where d is not.
 
         A shift of both principal points looks almost like a rotation of the whole rig, and neither is known well. Lest
         the pose rotate with each revision, the ideal rig is rotated such that the left image as a whole does not move.
         """
-        field, n = _field(points, self.focal), len(self.names)
-        return np.asarray(field[:, :3, :n] + field[:, :3, n:] @ self._gauge)
+        field, n = field_and_turn(points, self.focal), len(self.names)
+        return np.asarray(field[:, :, :n] + field[:, :, n:] @ self._gauge)
 
     def shift(self, points: Array, parameters: Array) -> Array:
         """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,)."""
-        return np.asarray(self.field(points) @ parameters)
+        return np.asarray(self.field(points)[:, :3] @ parameters)
 
     @cached_property
     def _gauge(self) -> Array:
         """Rotation of the ideal rig (3, n) [rad] that cancels the left image's mean displacement by the parameters."""
         n = len(self.names)
-        rows = _field(self.far(), self.focal)[:, :2].reshape(-1, n + 3)
+        rows = field_and_turn(self.far(), self.focal)[:, :2].reshape(-1, n + 3)
         return -np.asarray(np.linalg.lstsq(rows[:, n:], rows[:, :n], rcond=None)[0])
 
-    def vertical(self, points: Array) -> Array:
-        """Change (N, n) [px] of the vertical disparity, right row less left row, by the parameters.
-
-        A pair of pixels of one point on an ideal rig has none; the baseline's direction adds
-        ``d · (forward · y - down)``, which the correction takes away.
-        """
-        return _field(points, self.focal)[:, 3, : len(self.names)]
-
-    def residual_products(self, factors: Array, points: Array) -> Array:
-        """Sum over points (N, 3) of factors (N, 3, n) times the residual fields (N, 3, m) there: (n, m).
-
-        The fields are those of x and y of the left camera, then of the right one.
-        """
+    def residual_field(self, points: Array) -> Array:
+        """As `field`, by the residual fields (N, 4, m): of x and y of the left camera, then of the right one."""
         x, y, d = points.T / self.focal
-        n = len(RESIDUAL)
-        out = np.zeros((factors.shape[2], 4 * n))
         left, right = (self.focal * self._polynomials(v, y) for v in (x, x - d))
-        out[:, :n] = (factors[:, 0] + factors[:, 2]).T @ left
-        out[:, n : 2 * n] = factors[:, 1].T @ left
-        out[:, 2 * n : 3 * n] = -(factors[:, 2].T @ right)
-        return out
-
-    def residual_vertical(self, points: Array) -> Array:
-        """As `vertical`, by the residual fields (N, m)."""
-        x, y, d = points.T / self.focal
-        n = len(RESIDUAL)
-        out = np.zeros((len(points), 4 * n))
-        out[:, n : 2 * n] = -self.focal * self._polynomials(x, y)
-        out[:, 3 * n :] = self.focal * self._polynomials(x - d, y)
-        return out
+        o = np.zeros_like(left)
+        rows = [left, o, o, o], [o, left, o, o], [left, o, -right, o], [o, -left, o, right]
+        return np.stack([np.concatenate(row, axis=1) for row in rows], axis=1)
 
     def _polynomials(self, x: Array, y: Array) -> Array:
         """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
-        from slam.calibration.kernels import polynomials
-
-        # 1.1: polynomials are held constant beyond the image, this many half widths from its centre
-        at = (np.stack([x, y]) - self._centre[:, None]) / self._half[:, None]
-        return np.asarray(polynomials(at, 1.1, _FIRST, _SECOND, _SCALES)).T
-
-
-def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
-    """Change of x and of y (N, 8 each) [focal lengths] by the parameters of one camera, see `LENS`."""
-    field = _field(np.column_stack([x, y, np.zeros(len(x))]), 1.0)
-    return field[:, 0, : len(LENS)], field[:, 1, : len(LENS)]
+        at = (np.column_stack([x, y]) - self._centre) / self._half
+        u, v = np.clip(at, -1.1, 1.1).T  # 1.1: half widths from the centre, beyond which they are held constant
+        products: Array = np.polynomial.legendre.legvander2d(u, v, _DEGREES)
+        return np.asarray(_SCALES * products[:, _COLUMNS])
 
 
-def _field(points: Array, focal: float) -> Array:
+def field_and_turn(points: Array, focal: float) -> Array:
     """Change (N, 4, n + 3) [px] of points (N, 3) [px] and their vertical disparities by parameters and a turn."""
     from slam.calibration.kernels import field
 
@@ -168,16 +139,12 @@ class RigCorrection:
         return self.model.rows(points)
 
     def features(self, features: StereoFeatures) -> StereoFeatures:
-        """Features with both pixels corrected."""
-        uv_left, uv_right = self.pixels(features.uv_left, features.uv_right)
-        return replace(features, uv_left=uv_left, uv_right=uv_right)
-
-    def pixels(self, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
-        """Corrected rectified pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
-        points = self.model.points(np.column_stack([uv_left, uv_right[:, 0]]))
-        z = self.model.rows(points + self.model.shift(points, self.parameters))
-        vertical = uv_right[:, 1] - uv_left[:, 1] + self.model.vertical(points) @ self.parameters
-        return z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
+        """Features with both pixels corrected; the right row keeps the remaining vertical disparity."""
+        left, right = features.uv_left, features.uv_right
+        points = self.model.points(np.column_stack([left, right[:, 0]]))
+        change = self.model.field(points) @ self.parameters
+        z, vertical = self.model.rows(points + change[:, :3]), right[:, 1] - left[:, 1] + change[:, 3]
+        return replace(features, uv_left=z[:, :2], uv_right=np.column_stack([z[:, 2], z[:, 1] + vertical]))
 
 
 @dataclass(frozen=True, eq=False)

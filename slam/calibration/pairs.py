@@ -129,11 +129,9 @@ class Fit(NamedTuple):
 def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Fit | None:
     """Fit the motion and the first view's true points by Gauss-Newton; None if it does not converge.
 
-    Points are weighted by Student's t distribution, whose scale is estimated.
-
     `first` and `second` are the same points ``(x, y, d)`` (N, 3) [px] of an ideal rig with a focal length `focal` [px],
-    `R` (3, 3) and `t` (3,) [baselines] a first guess. Of the `noise`, a point's covariance (3, 3) [px²], only the form
-    matters.
+    `R` (3, 3) and `t` (3,) [baselines] a first guess. Points are weighted by Student's t distribution, whose scale is
+    estimated, so that of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
     """
     from slam.calibration.kernels import fit
 
@@ -154,13 +152,13 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
     if fit is None:
         return None
     at = fit.linear
-    by_rig = at.J_point @ model.field(fit.points) - model.field(at.moved)
+    by_rig = at.J_point @ model.field(fit.points)[:, :3] - model.field(at.moved)[:, :3]
     J = np.concatenate([at.J_motion, by_rig], axis=2)
     by_moved = fit.weights[:, None, None] * at.information @ J
     rows = by_moved.reshape(-1, J.shape[2])
     normal, gradient = rows.T @ J.reshape(rows.shape), rows.T @ at.residual.ravel()
-    by_point = np.swapaxes(at.J_point, 1, 2) @ by_moved
-    cross = model.residual_products(by_point, fit.points) - model.residual_products(by_moved, at.moved)
+    by_fields = at.J_point @ model.residual_field(fit.points)[:, :3] - model.residual_field(at.moved)[:, :3]
+    cross = rows.T @ by_fields.reshape(len(rows), -1)
     H = normal[:6, :6] + 1e-12 * np.trace(normal[:6, :6]) * np.eye(6)  # invertible
     motion = np.linalg.solve(H, normal[:6, 6:])  # Schur complement
     S = normal[6:, 6:] - motion.T @ normal[:6, 6:]

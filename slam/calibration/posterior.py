@@ -92,8 +92,8 @@ def prior_information(model: RigModel) -> Array:
     sigmas = np.array([SIGMAS[name.removeprefix("left_").removeprefix("right_")] for name in model.names])
     information = np.diag(sigmas**-2)
     far = model.far()
-    for changes, sigma in ((model.field(far)[:, 2], MEAN_DISPARITY), (model.vertical(far), MEAN_VERTICAL)):
-        change = changes / model.focal
+    field = model.field(far) / model.focal
+    for change, sigma in ((field[:, 2], MEAN_DISPARITY), (field[:, 3], MEAN_VERTICAL)):
         mean = change.mean(axis=0)
         information += np.outer(mean, mean) / sigma**2
         information += change.T @ change * (10 / (len(far) * FIELD**2))  # 10: independent values of such a field
@@ -115,7 +115,7 @@ def systematic_variance(model: RigModel, error: float) -> Array:
     far = model.far()
     near = far + np.array([0.0, 0.0, 0.05 * model.focal])
     points = np.concatenate([far, near])
-    effect = np.square(model.field(points)[:, 2]) + np.square(model.vertical(points))
+    effect = np.square(model.field(points)[:, 2:]).sum(axis=1)
     return np.asarray(error**2 / effect.mean(axis=0))
 
 

@@ -141,7 +141,7 @@ def _judged(
     Recordings that are `apart`, see `agreement`, do not speak of one rig; a single one may speak of itself.
     """
     points = model.far() + np.array([0.0, 0.0, model.focal / _AWAY])
-    fields = np.stack([model.field(points)[:, 2], model.vertical(points)])  # of disparity and rows (2, N, n)
+    fields = np.moveaxis(model.field(points)[:, 2:], 1, 0)  # of disparity and rows (2, N, n)
     off = np.sqrt(np.square(fields @ posterior.mean).mean(axis=1))
     sigma = np.sqrt((fields @ posterior.covariance * fields).sum(axis=2).mean(axis=1))
     left = noise / np.sqrt(max(matched, 1.0))

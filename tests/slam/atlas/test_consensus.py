@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from slam.atlas.atlas import Atlas
-from slam.atlas.closing import close
+from slam.atlas.closing import close, disagreement
 from slam.atlas.keyframes import Keyframe, Loop
 from slam.atlas.pose_graph import Chain, PoseGraph
 from slam.data import CommonError
@@ -74,6 +75,18 @@ def error(atlas: Atlas) -> float:
 def _one_witness(monkeypatch):
     """A loop needs no other keyframe that sees it."""
     monkeypatch.setattr("slam.atlas.closing._agree", lambda *_: True)
+
+
+@pytest.mark.parametrize(("squared", "closes"), [(32.0, True), (45.0, False)])
+def test_the_first_loop_may_be_five_sigma_from_the_path(squared, closes):
+    """χ²(6) of 39.5 is as rare as a number beyond five sigma; at 25 right loops after a hand-held walk were refused."""
+    graph = PoseGraph.solved(Chain(ODOM[:63], CHAIN.steps[:63]), [], ODOM[:63], (2, 62))
+
+    def off_by(size: float) -> Loop:
+        return loop(62, exp(np.array([0.0, 0.0, 0.0, size, 0.0, 0.0])))
+
+    size = brentq(lambda size: disagreement(graph, off_by(size)) - squared, 0.5, 20.0)
+    assert bool(closed([off_by(size)]).loops) == closes
 
 
 def test_true_loops_take_the_place_of_a_false_one_before_them():

@@ -19,16 +19,6 @@ def residual_fields(rng):
     return np.sqrt(field_variance()) * rng.standard_normal(4 * len(RESIDUAL))
 
 
-def residual_field(model, points):
-    """The fields (N, 3, m) of x and y of the left camera, then of the right one, at points (N, 3)."""
-    x, y, d = points.T / model.focal
-    n = len(RESIDUAL)
-    out = np.zeros((len(points), 3, 4 * n))
-    out[:, 0, :n] = out[:, 1, n : 2 * n] = out[:, 2, :n] = model.focal * model._polynomials(x, y)
-    out[:, 2, 2 * n : 3 * n] = -model.focal * model._polynomials(x - d, y)
-    return out
-
-
 class Street:
     """Points beside the road with unit descriptors."""
 
@@ -54,10 +44,10 @@ class Street:
         theta = np.zeros(len(model.names)) if parameters is None else parameters
         z = RigCorrection(model, theta).undone(z)
         points = model.points(z)
-        vertical = -model.vertical(points) @ theta
+        vertical = -model.field(points)[:, 3] @ theta
         if residual is not None:
-            z = model.rows(points - residual_field(model, points) @ residual)
-            vertical -= model.residual_vertical(points) @ residual
+            z = model.rows(points - model.residual_field(points)[:, :3] @ residual)
+            vertical -= model.residual_field(points)[:, 3] @ residual
         left, right = z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
         left = left + noise * rng.standard_normal((n, 2))
         right = right + noise * rng.standard_normal((n, 2))

@@ -33,7 +33,7 @@ def with_error(features: StereoFeatures, delta: np.ndarray) -> StereoFeatures:
     """What a rig that is off by `delta` sees: the correction by it gives the ideal pixels."""
     z = np.column_stack([features.uv_left, features.uv_right[:, 0]])
     points = MODEL.points(z)
-    z = MODEL.rows(points - MODEL.field(points) @ delta)
+    z = MODEL.rows(points - MODEL.field(points)[:, :3] @ delta)
     return replace(features, uv_left=z[:, :2].copy(), uv_right=np.column_stack([z[:, 2], z[:, 1]]))
 
 

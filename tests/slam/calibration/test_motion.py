@@ -36,7 +36,7 @@ def test_a_pair_without_noise_gives_the_truth():
     R, t = se3.so3_exp(np.array([0.03, -0.1, 0.02])), np.array([0.5, 0.2, -3.0])
     ideal = np.column_stack([rng.uniform(-500, 500, 300), rng.uniform(-150, 150, 300), rng.uniform(0, 40, 300)])
     pair = [ideal, move(ideal, R, t, F)[0]]
-    measured = [x - MODEL.field(x) @ theta for x in pair]
+    measured = [x - MODEL.field(x)[:, :3] @ theta for x in pair]
     corrected = [x + MODEL.shift(x, theta) for x in measured]
     evidence = pair_evidence(MODEL, Pair(*corrected, R, t), theta, NOISE)
     strong = 1e8

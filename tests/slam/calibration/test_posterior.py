@@ -33,7 +33,7 @@ def test_how_large_the_residual_fields_are_is_seen_in_the_rows(scale):
     for _ in range(10):
         xyz = [[-0.7, -0.2, 0.01], [0.7, 0.2, 0.05]]
         points = model.focal * rng.uniform(*xyz, (300, 3))
-        vertical = -model.vertical(points) @ theta - model.residual_vertical(points) @ fields
+        vertical = -model.field(points)[:, 3] @ theta - model.residual_field(points)[:, 3] @ fields
         found = row_evidence(model, points, vertical + 0.1 * rng.standard_normal(300), theta)[1]
         rows = found if rows is None else rows + found
     said, nothing = (
@@ -90,7 +90,7 @@ def test_rows_weigh_the_inverse_of_their_variance_and_outliers_next_to_nothing()
     model, rng = RigModel(CAR), np.random.default_rng(3)
     points = model.focal * rng.uniform([-0.7, -0.2, 0.01], [0.7, 0.2, 0.05], (2000, 3))
     vertical, theta = 0.2 * rng.standard_normal(2000), np.zeros(len(model.names))
-    A = model.vertical(points)
+    A = model.field(points)[:, 3]
     clean = row_evidence(model, points, vertical, theta)[0]
     assert np.trace(clean.S) == pytest.approx(np.trace(A.T @ A) / 0.2**2, rel=0.1)
     wrong = vertical + 40.0 * (np.arange(2000) == 0)

@@ -21,7 +21,6 @@ from tests.slam.calibration.drives import (
     drive,
     parameters,
     pose,
-    residual_field,
     residual_fields,
 )
 
@@ -149,7 +148,7 @@ def test_recordings_together_are_surer_and_agree(first):
     together, alone = joint(*drives), [d.kept().posterior for d in drives]
     assert np.abs((together.mean - TURNED) / together.sigma).max() < 3
     far = first.model.far()
-    pixels = np.concatenate([first.model.field(far)[:, 2], first.model.vertical(far)])
+    pixels = np.concatenate([first.model.field(far)[:, 2], first.model.field(far)[:, 3]])
     joint_variance, *variances = (np.einsum("ni,ij,nj->", pixels, p.covariance, pixels) for p in (together, *alone))
     assert joint_variance < 0.7 * min(variances)  # of what pixels of far points are off by
     found = agreement(first.model, [d.evidence() for d in drives])
@@ -161,8 +160,8 @@ def test_recordings_together_are_surer_and_agree(first):
 def shown(model, depths, theta, fields, rng):
     """The evidence of a recording that measures disparities and rows of points, to 0.05 px."""
     points = model.focal * rng.uniform([-0.8, -0.25, depths[0]], [0.8, 0.25, depths[1]], (200, 3))
-    A = np.concatenate([model.field(points)[:, 2], model.vertical(points)]) / 0.05
-    F = np.concatenate([residual_field(model, points)[:, 2], model.residual_vertical(points)]) / 0.05
+    A = np.concatenate([model.field(points)[:, 2], model.field(points)[:, 3]]) / 0.05
+    F = np.concatenate([model.residual_field(points)[:, 2], model.residual_field(points)[:, 3]]) / 0.05
     scales = -1e3 * np.abs(np.arange(len(RESIDUAL_SCALES)) - 6)  # that of the fields is known
     plain = Evidence(A.T @ A, A.T @ (A @ theta - F @ fields), A.T @ F)
     return RigEvidence(plain, plain.with_error(systematic_variance(model, 0.01)), scales)
