@@ -60,7 +60,7 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
         "both.mp4": r"folder should be; a video .* is .*both\.mp4\?layout=sbs",
         "garden/left": f"{here} has no 'garden'",
         "pair": r"by other names: 'pair\?left=…&right=…'$",
-        "run": "it is what a run of synthetic:desk left: give that, or look at the run with `slam view run`$",
+        "run": "it is what a run of synthetic:desk left: give that, or look at the run with `slam view .*run`$",
         "run/frames.csv": "a file where .* it is what a run of synthetic:desk left",
         "two/other": "by other names",
         kitti / "image_0": rf"give {kitti} .format kitti",
