@@ -86,6 +86,7 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
         ("times=/dev/zero", SequenceError, None),
         ("times=t.txt&fps=3", ConfigurationError, "'fps' does nothing here"),
         ("tolerance=0.1", ConfigurationError, "'tolerance' does nothing here"),
+        ("fps=3&kind=driving&fps=30", ConfigurationError, "an option is given twice: fps=3"),
         ("fps=0", ConfigurationError, "fps must be a number from 0.001"),
         ("fps=fast", ConfigurationError, "got 'fast'"),
         ("unit=feet", ConfigurationError, "unit must be m or cm or mm"),
