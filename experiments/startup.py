@@ -71,7 +71,7 @@ def stored_map(sequence: WorldSequence) -> SavedMap:
     signs: dict[int, int] = {}
     look = open_sequence(f"synthetic:startup?seed={sequence.values['seed'] + 1000}&frames=20")
     assert isinstance(look, WorldSequence)
-    for one in look.observe():
+    for one in map(look.simulate, range(len(look))):
         for row, i in enumerate(one.ids.tolist()):
             if i >= 0:
                 seen.setdefault(i, one.features.descriptors[row])

@@ -69,7 +69,7 @@ def _with_images(backend: str) -> Iterator[FrameResult]:
 def _with_bodies(backend: str) -> Iterator[FrameResult]:
     world = open_sequence(_BODIES)
     system = StereoSlam(world.rig, None, backend, kind=world.kind)
-    yield from (system.process_features(seen.features) for seen in world.observe())  # type: ignore[attr-defined]
+    yield from (system.process_features(world.observations(k)) for k in range(len(world)))  # type: ignore[attr-defined]
     system.estimate()
 
 

@@ -140,10 +140,10 @@ class RecordedSequence:
     def frame(self, k: int) -> StereoFrame:
         """Frame k alone, as ``sequence[k]``; SequenceError where there is none, or its left image is unreadable."""
         first = require_frame(self.name, k, len(self))
-        found = next(self._read(first, first + 1), None)
-        if found is None:
+        found = list(self._read(first, first + 1))
+        if not found:
             raise SequenceError(f"{self.name}: the left image of frame {first} cannot be read (see its warnings)")
-        return found
+        return found[0]
 
     __getitem__ = frame
 

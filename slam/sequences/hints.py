@@ -38,7 +38,7 @@ def of_run(folder: Path) -> str:
         return ""
     with suppress(SlamError):
         source = read_object(files[0]).get("source") or "something"
-        return f"; it is what a run of {source} left: give that, or look at the run with `slam view {folder.name}`"
+        return f"; it is what a run of {source} left: give that, or look at the run with `slam view {folder}`"
     return ""
 
 

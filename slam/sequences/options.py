@@ -60,7 +60,8 @@ def value_of(name: str, text: str) -> Any:
 class Options(dict[str, Any]):
     """Options of a format by name, with their values; they remember which of them were read.
 
-    ConfigurationError where the query, ``key=value&key=value``, has one that is not `known`, or whose value is none.
+    ConfigurationError where the query, ``key=value&key=value``, has one twice, one that is not `known`, or whose value
+    is none.
     """
 
     def __init__(self, query: str, format: str, known: frozenset[str]) -> None:
@@ -70,6 +71,8 @@ class Options(dict[str, Any]):
         if strange:
             hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"
             raise ConfigurationError(f"unknown option {strange[0]!r} of format {format}{hint}")
+        if len(parse_qsl(query, keep_blank_values=True)) > len(texts):
+            raise ConfigurationError(f"an option is given twice: {query}")
         super().__init__({name: value_of(name, text) for name, text in texts.items()})
 
     def __getitem__(self, name: str) -> Any:

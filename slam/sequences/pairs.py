@@ -53,10 +53,6 @@ class Pairs:
     rows: IntArray  # of the left and the right listing (N, 2), -1 where there is no right image
     stamps: Array  # times (N,) [s], strictly increasing
 
-    def select(self, rows: IntArray, stamps: Array) -> Pairs:
-        """These frames at these times."""
-        return Pairs(self.keys[rows], self.rows[rows], stamps)
-
 
 @dataclass(frozen=True, eq=False)
 class ImagePairs:
@@ -204,11 +200,10 @@ def pair_up(
     to the left images that they name, else to those in order; with `by_number`, or where there are more rows than
     images, a row's number is a frame's. SequenceError where nothing pairs, or hardly a frame has a time.
     """
-    rate = None if times else options.get("fps")
     partner = np.full(len(left), -1)
     kept = np.arange(len(left))
     if right is not None:
-        tolerance = _tolerance(left, options, bool(times or rate))
+        tolerance = _tolerance(left, options, times is not None or "fps" in options)
         partner = pair(left.keys, right.keys, tolerance)
         kept = kept[trim(partner)]
         if not len(kept):
@@ -216,19 +211,40 @@ def pair_up(
         swap = options.get("swap", False)
         _report_alone(left, right, partner, kept, swap, faults)
         kept = kept[partner[kept] >= 0] if swap else kept
-    pairs = Pairs(left.keys[kept], np.stack([kept, partner[kept]], axis=1), 1e-9 * left.keys[kept])
+    source = left.folder if times is None else times.path
+    stamps = _stamps_of(left, kept, options, faults, times, by_number)
+    timed = np.flatnonzero(np.isfinite(stamps))
+    good = timed[increasing(stamps[timed])]
+    untimed, unordered = len(kept) - len(timed), len(timed) - len(good)
+    if 2 * len(good) < len(kept):
+        what = f"{untimed} have no time and {unordered} one that does not increase"
+        raise SequenceError(f"{source}: of {len(kept)} images {what}")
+    for number, what in (
+        (untimed, "images have no time; left out"),
+        (unordered, "times stand twice or run backwards; images left out"),
+    ):
+        if number:
+            faults.report("stamps", f"{source}: {number} {what}")
+    kept = kept[good]
+    return Pairs(left.keys[kept], np.stack([kept, partner[kept]], axis=1), stamps[good])
+
+
+def _stamps_of(
+    left: Listing, kept: IntArray, options: Options, faults: FaultLog, times: Times | None, by_number: bool
+) -> Array:
+    """Times of the `kept` left images [s], see `pair_up`; NaN for none."""
     if times is not None:
-        return pairs.select(*_stamped(_rows_of(left, times, by_number, faults)[kept], times.rows, times.path, faults))
+        rows = _rows_of(left, times, by_number, faults)[kept]
+        if rows[-1] + 1 < len(times.rows):
+            faults.report("stamps", f"{times.path}: the last {len(times.rows) - rows[-1] - 1} rows have no image")
+        return np.append(times.rows, np.nan)[np.minimum(rows, len(times.rows))]
+    rate = options.get("fps")
     if left.stamped and rate is None:
-        good = increasing(pairs.stamps)
-        if len(good) < len(pairs.stamps):
-            line = f"{left.folder}: {len(pairs.stamps) - len(good)} stamps are nearer than a microsecond to the"
-            faults.report("stamps", f"{line} one before; images left out")
-        return pairs.select(good, pairs.stamps[good])
+        return 1e-9 * left.keys[kept]
     if rate is None:
         faults.report("times", f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
-    numbers = kept if left.stamped else pairs.keys - (0 if by_number else pairs.keys[0])
-    return replace(pairs, stamps=numbers / (rate or RATE))
+    numbers = kept if left.stamped else left.keys[kept] - (0 if by_number else left.keys[kept[0]])
+    return np.asarray(numbers / (rate or RATE))
 
 
 def _rows_of(left: Listing, times: Times, by_number: bool, faults: FaultLog) -> IntArray:
@@ -275,26 +291,6 @@ def _report_alone(
         faults.report("pairs", f"{line} (first: {left.names[alone[0]]}); {what}")
     if unused:
         faults.report("pairs", f"{right.folder}: {count(unused, 'image')} without a partner in {left.folder}; left out")
-
-
-def _stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:
-    """Rows and stamps of the frames that have a time, as most must; `times` (T,) is by frame number, NaN for none."""
-    inside = numbers < len(times)
-    stamps = np.where(inside, times[np.minimum(numbers, len(times) - 1)], np.nan)
-    good = np.flatnonzero(np.isfinite(stamps))
-    keep = good[increasing(stamps[good])]
-    untimed, unordered = len(numbers) - len(good), len(good) - len(keep)
-    if 2 * len(keep) < len(numbers):
-        what = f"{untimed} have no time and {unordered} one that does not increase"
-        raise SequenceError(f"{path}: of {len(numbers)} images {what}")
-    for rows, what in (
-        (len(times) - int(numbers[-1]) - 1, "the last {} rows have no image"),
-        (untimed, "{} images have no time; left out"),
-        (unordered, "{} times stand twice or run backwards; images left out"),
-    ):
-        if rows > 0:
-            faults.report("stamps", f"{path}: {what.format(rows)}")
-    return keep, stamps[keep]
 
 
 def _no_pair(left: Listing, right: Listing, tolerance: float) -> str:

@@ -75,10 +75,11 @@ def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
     rows = read_rows(path, row, faults)
     table = np.array([(*(row or ())[:2], np.nan, np.nan)[:2] for row in rows])
     times, second = table.T
-    if len(table) > 1 and (np.diff(times) == 1).all() and (np.diff(second) > 0).all() and times[0] in (0, 1):
+    low, high = SINCE_1970
+    counts = len(table) > 1 and times[0] % 1 == 0 and 0 <= times[0] < low and (np.diff(times) == 1).all()
+    if counts and (np.diff(second) > 0).all():
         faults.report("times", f"{path}: the first number of each row counts rows; the second one is taken as time")
         times = second
-    low, high = SINCE_1970
     for unit, size in UNITS if len(times) > 1 else ():
         if low <= np.nanmedian(np.abs(times)) / size <= high and np.nanmedian(np.abs(np.diff(times))) < size * _SLOWEST:
             faults.report("times", f"{path}: the times are taken as {unit}")

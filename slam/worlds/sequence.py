@@ -106,11 +106,6 @@ class WorldSequence:
         """Poses ``T_world_object`` (B, 4, 4) of the moving objects 1 to B in frame k."""
         return self.world.T_world_object[:, self.source(k)]
 
-    def observe(self, start: int = 0, stop: int | None = None) -> Iterator[SimulatedFeatures]:
-        """Features with their truth, without images, of frames `start` up to, but without, `stop`; see `frames`."""
-        first, last = frame_range(start, stop, len(self))
-        return (self.simulate(k) for k in range(first, last))
-
     def observations(self, k: int) -> StereoFeatures:
         """Features of frame k, without images."""
         return self.simulate(k).features

@@ -129,13 +129,14 @@ def test_images_in_two_formats_are_taken_once(two_folders: Path) -> None:
         ("", "{ns}", 1.7e9, 0.1),
         ("#id t exposure\n", "{ns} {s:.9f} 1.2", 1.7e9, 0.1),
         ("", "{i} {ns}", 1.7e9, 0.1),
+        ("frame;t\n", "{n};{s:.6f}", 1.7e9, 0.1),
         ("", "2023-11-14 22:13:2{i}.500000", 1.7e9 + 0.5, 1.0),
         *(("", row, 1.7e9, 0.1) for row in ("{i:03d}.png {s:.6f}", "{s:.6f} left/{i:03d}.png", "{i} {s:.6f} 0.004")),
     ],
 )
 def test_times_as_other_programs_write_them(two_folders: Path, heading, row, first, step) -> None:
     """A heading is no row, which would shift all times by one; nanoseconds are no seconds."""
-    rows = [row.format(i=i, s=1.7e9 + 0.1 * i, ns=17 * 10**17 + i * 10**8) + "\n" for i in range(6)]
+    rows = [row.format(i=i, n=i + 100, s=1.7e9 + 0.1 * i, ns=17 * 10**17 + i * 10**8) + "\n" for i in range(6)]
     (two_folders / "times.txt").write_text(heading + "".join(rows))
     sequence = open_sequence(two_folders)
     assert np.allclose(sequence.stamps, first + step * np.arange(6), rtol=0, atol=1e-5) and len(sequence) == 6

@@ -36,10 +36,10 @@ def test_noise_is_isotropic_and_keeps_to_the_epipolar_geometry(rig):
     assert np.abs(off).max() < 1e-6
 
 
-def test_frames_are_the_same_alone_and_in_sequence_and_differ_by_seed():
+def test_frames_are_the_same_in_any_order_and_differ_by_seed():
     a, b, c = (open_world(f"desk?seed={seed}") for seed in (1, 1, 2))
-    for k, seen in zip(range(30, 34), a.observe(30, 34)):
-        f, g, h = seen.features, b.observations(k), c.observations(k)
+    for k in (33, 30, 31):
+        f, g, h = a.simulate(k).features, b.observations(k), c.observations(k)
         assert np.array_equal(f.uv_left, g.uv_left)
         assert np.array_equal(f.uv_right, g.uv_right, equal_nan=True)
         assert np.array_equal(f.descriptors, g.descriptors)
