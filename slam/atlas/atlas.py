@@ -18,11 +18,10 @@ from scipy.linalg import block_diag
 from slam.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.atlas.places import PlaceIndex
 from slam.atlas.pose_graph import Chain, PoseGraph, between_keyframes
-from slam.data import Estimate
+from slam.data import CommonError, Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import ANYWHERE, EstimatorModels
-from slam.rig_error import CommonError
 
 _ACTIVE = 200  # cost: loops in the pose graph at most: each makes the next one slower
 _INACTIVE = 200  # cost: loops outside the pose graph that are kept
@@ -41,7 +40,7 @@ class MapAnchor:
     # in the map: joint covariance (6 + n, 6 + n) of the pose, perturbing on the right, and of the common errors
     covariance: Array
     common: Array  # estimate of the common errors (n,), in units of their prior standard deviations
-    rig: CommonError  # what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`
+    rig: CommonError  # what the common errors stand for and how they move the pose, see `slam.data.CommonError`
 
     def belief(self, rig: CommonError) -> tuple[Array, Array]:
         """The common errors (n,) in units of `rig`, as the rig's posterior has changed since, and their covariance.

@@ -111,6 +111,22 @@ class SelfCalibration:
         """The present posterior of the rig's error in this recording."""
         return RigPosterior(self._own.mean.copy(), self.covariance)
 
+    @property
+    def doubt(self) -> str:
+        """What is wrong with focal lengths that the motion contradicts by far, in a line; empty where it does not.
+
+        Errors beyond 5 standard deviations of what is allowed to a calibration are none of it: the true ones are larger
+        still, as the prior holds them back.
+        """
+        error = float(self._focal @ self._own.mean)
+        allowed = np.sqrt(self._focal @ (self._prior.covariances[-1] + self.covariance) @ self._focal)
+        if abs(error - self._focal @ self._prior.mean) <= 5 * allowed:
+            return ""
+        return (
+            f"the images fit a focal length at least {abs(100 * error):.0f} % {'shorter' if error > 0 else 'longer'} "
+            "than the calibration's: is the calibration of this camera, and for images of this size?"
+        )
+
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
 

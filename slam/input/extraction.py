@@ -14,7 +14,7 @@ from slam.input.features import documented, outside_masks
 from slam.input.warnings import InputWarnings, shows_something
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
-from slam.runtime.stages import Stages
+from slam.runtime.compilation import Stages
 from slam.runtime.threads import OneThread, one_blas_thread
 from slam.third_party import named_failures
 
