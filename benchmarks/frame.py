@@ -5,9 +5,10 @@
 Real and rendered recordings, all back ends, detector of moving objects on, reading left out. Frame by frame, in turns:
 each back end, one ``cv2.SIFT`` with 800 features on the left image, and `orb_odometry`. Then each back end by itself
 with overlap (`StereoSlam.run`): the time from one result to the next. Then, with ``--orbslam3``, ORB-SLAM3 on the same
-images as fast as it goes; PYTHON is the interpreter of an environment in which ``orbslam3-python`` is installed
-(``python -m venv E && E/bin/pip install orbslam3-python``), which is never imported here. Median times;
-compare the ratios, not the milliseconds. ORB-SLAM3's vocabulary is a small one of rendered images, good for tracking.
+images as fast as it goes; PYTHON, by default what the variable ORBSLAM3 names, is the interpreter of an environment in
+which ``orbslam3-python`` is installed (``python -m venv E && E/bin/pip install orbslam3-python``), which is never
+imported here. Median times; compare the ratios, not the milliseconds. ORB-SLAM3's vocabulary is a small one of
+rendered images, good for tracking.
 A second table has the CPU time of each stage, and the way of a frame through the code (`calls`): files entered, calls
 from one file to another, and Python calls in all, the back end left out.
 
@@ -37,13 +38,13 @@ from benchmarks.orb_odometry import OrbOdometry
 from benchmarks.orb_vocabulary import write_vocabulary
 from experiments.common import script_options
 from experiments.tables import markdown, write_json
-from slam.data import FrameResult, FrameStatus, StereoFrame
+from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError
 from slam.evaluation.metrics import absolute_errors, associate
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
-from slam.runtime import stages
+from slam.runtime import compilation
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
@@ -54,7 +55,6 @@ STAGES = ("extract", "predict", "associate", "update", "estimate", "objects", "m
 WAYS = ("images", "what", *(f"{name} [ms]" for name in STAGES), "files", "calls between files", "Python calls")
 SIFT, ORB, ORBSLAM3 = "cv2.SIFT, 800 features, left", "cv2.ORB and PnP", "ORB-SLAM3"
 OVERLAP = "{}, overlap"  # of a back end
-_SEEN = (FrameStatus.STARTED, FrameStatus.TRACKED)
 
 
 @dataclass(frozen=True)
@@ -135,12 +135,12 @@ def ways(size: Size) -> Iterable[list[str]]:
     """Of each back end, medians over the frames that count: CPU time by stage, and the way through the code."""
     sequence, last = open_sequence(size.sequence), size.skipped + size.counted
     for name in ONLINE:
-        clock, stages.working_time = stages.working_time, time.process_time
+        clock, compilation.working_time = compilation.working_time, time.process_time
         try:
             system = StereoSlam(sequence.rig, backend=name, kind=sequence.kind)
             spent = [system.process(frame).milliseconds for frame in sequence.frames(0, last)][size.skipped :]
         finally:
-            stages.working_time = clock
+            compilation.working_time = clock
         way = np.median([w.summary() for w in ways_of(sequence, name, size.skipped, last)], axis=0)
         by_stage = (np.median([s.get(stage, 0.0) for s in spent]) for stage in STAGES)
         yield [size.name, name, *(f"{x:.1f}" for x in by_stage), *(f"{x:.0f}" for x in way)]
@@ -148,7 +148,7 @@ def ways(size: Size) -> Iterable[list[str]]:
 
 def tracked(result: FrameResult) -> Array | None:
     """The pose of a frame, None where it was lost."""
-    return result.estimate.T_world_left if result.status in _SEEN else None
+    return result.estimate.T_world_left if result.status.measured else None
 
 
 def with_orbslam3(python: str, sequence: Sequence, frames: list[StereoFrame], features: int) -> Times:
@@ -208,15 +208,17 @@ def rows(size: Size, times: dict[str, Times]) -> Iterable[list[str]]:
 
 
 def main() -> int:
-    parser = script_options(__file__, __doc__, "a few frames of each: does it work?")
-    parser.add_argument("--orbslam3", metavar="PYTHON", help="interpreter that has orbslam3-python")
+    parser = script_options(__file__, __doc__, "a few frames of some: does it work?")
+    python = os.environ.get("ORBSLAM3")
+    parser.add_argument("--orbslam3", metavar="PYTHON", default=python, help="interpreter that has orbslam3-python")
     arguments = parser.parse_args()
     table: list[list[str]] = []
     by_way: list[list[str]] = []
-    for size in sizes(arguments.quick):
+    for size in sizes(arguments.quick)[:: 3 if arguments.quick else 1]:
         table += rows(size, measure(size, arguments.orbslam3))
         by_way += ways(size)
-    print(markdown(HEADER, table, 2), markdown(WAYS, by_way, 2), sep="\n\n")
+    load = f"Load of the machine in the last minute: {os.getloadavg()[0]:.1f}, of {os.cpu_count()} cores."
+    print(markdown(HEADER, table, 2), markdown(WAYS, by_way, 2), load, sep="\n\n")
     write_json(arguments.out / "table.json", HEADER, table)
     write_json(arguments.out / "ways.json", WAYS, by_way)
     return 0

@@ -42,21 +42,13 @@ LANDMARKS, MEASURED, FEATURES, OBJECTS, FRAMES = (
 
 @dataclass(frozen=True)
 class Point:
-    """A point of a curve.
+    """A point of a curve."""
 
-    Attributes:
-        by: what grows.
-        what: whose time it is.
-        size: how much there is of it.
-        milliseconds: of a frame, or of the part of it that the curve is about.
-        floor: of what cannot be done without; None where it was not measured.
-    """
-
-    by: str
-    what: str
-    size: int
-    milliseconds: float
-    floor: float | None
+    by: str  # what grows
+    what: str  # whose time it is
+    size: int  # how much there is of it
+    milliseconds: float  # of a frame, or of the part of it that the curve is about
+    floor: float | None  # of what cannot be done without; None where it was not measured
 
     def row(self) -> list[object]:
         """As `HEADER`."""

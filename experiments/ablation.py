@@ -12,7 +12,6 @@ variant, ratios to everything on.
 
 from __future__ import annotations
 
-import csv
 import itertools
 import sys
 from collections.abc import Iterator
@@ -24,15 +23,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
-from experiments.ablation_parts import ALL_ON, CASES, GROUPS, Case, Variant, error_of, opened
+from experiments.ablation_parts import ALL_ON, CASES, GROUPS, Case, Variant, opened, path_figures
 from experiments.common import script_options, timed
 from experiments.perturbations import NONE, features_of, frames_of
-from experiments.tables import show
+from experiments.tables import resumed, show
 from frontends import create
 from slam.data import StereoFeatures
-from slam.evaluation.summary import consistency
 from slam.interfaces import Frontend
-from slam.run.summary import RunRecord
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
@@ -62,8 +59,7 @@ def run(
     sequence: Sequence, case: Case, frontend: Frontend, features: list[StereoFeatures], backend: str, variant: Variant
 ) -> list[float | int]:
     """Error [m], NEES, number of frames, of those without a measured pose, and CPU time of a step, median [ms]."""
-    record, nan = RunRecord(), float("nan")
-    config = variant.config(sequence, case, backend)
+    config, nan = variant.config(sequence, case, backend), float("nan")
     try:
         with variant.patch():
             system = StereoSlam(sequence.rig, frontend, backend, config=config)
@@ -71,13 +67,7 @@ def run(
     except slam.SlamError as error:  # a run that ends before its last frame has no figures
         print(f"{case.name}, {backend}, {variant.name}: {error}", file=sys.stderr, flush=True)
         return [nan, nan, len(features), len(features), nan]
-    for number, result in enumerate(results):
-        record.add(number, result)
-    measured = np.array(record.measured)
-    path, rows = record.trajectory.select(measured), np.flatnonzero(measured)
-    common = [record.common[row] for row in rows]
-    nees = consistency(path, np.array(record.covariances)[rows], sequence, common).get(f"NEES over {case.over} m", nan)
-    return [error_of(path, sequence), nees, len(results), len(results) - len(path), float(np.median(times))]
+    return [*path_figures(results, case, sequence), float(np.median(times))]
 
 
 def runs(cases: list[Case], trials: int, names: list[str], done: set[tuple[str, ...]]) -> Iterator[list[object]]:
@@ -155,17 +145,7 @@ def main() -> int:
     if given.quick:
         cases, trials, names = [Case("desk", "synthetic:desk?frames=12", 12)], 1, [ALL_ON.name, "no patch alignment"]
     file = given.out / ("quick.csv" if given.quick else "ablation.csv")
-    given.out.mkdir(parents=True, exist_ok=True)
-    if not file.exists():
-        file.write_text(",".join(HEADER) + "\n", encoding="utf-8")
-    with file.open(newline="", encoding="utf-8") as before:
-        done = {tuple(row[:4]) for row in csv.reader(before)}
-    with file.open("a", newline="", encoding="utf-8") as after:
-        for row in runs(cases, trials, names, done):
-            csv.writer(after).writerow(row)
-            after.flush()
-    with file.open(newline="", encoding="utf-8") as whole:
-        rows = list(csv.DictReader(whole))
+    rows = resumed(file, HEADER, HEADER[:4], lambda done: runs(cases, trials, names, done))
     for backend in BACKENDS:
         print(f"\n# {backend}\n")
         show(given.out / f"{backend}.json", COLUMNS, table(rows, backend))

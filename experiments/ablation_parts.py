@@ -13,33 +13,24 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from experiments.common import recordings
+from experiments.common import path_of, recordings
 from slam.config import SystemConfig
-from slam.data import CommonError
-from slam.evaluation.summary import evaluate
+from slam.data import CommonError, FrameResult
+from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence, open_sequence
 
 
 @dataclass(frozen=True)
 class Case:
-    """A sequence.
+    """A sequence."""
 
-    Attributes:
-        name: for the table.
-        path: of a recording below SLAM_DATA, or text of a world.
-        frames: how many of it, the first ones.
-        over: length of the stretches of which the NEES is given [m].
-        trials: most runs of it.
-        settings: for all of its runs.
-    """
-
-    name: str
-    path: str
-    frames: int
-    over: int = 1
-    trials: int = 100
-    settings: tuple[str, ...] = ()
+    name: str  # for the table
+    path: str  # of a recording below SLAM_DATA, or text of a world
+    frames: int  # how many of it, the first ones
+    over: int = 1  # length of the stretches of which the NEES is given [m]
+    trials: int = 100  # most runs of it
+    settings: tuple[str, ...] = ()  # for all of its runs
 
 
 _DAY = "kitti_raw/2011_09_26/2011_09_26_drive_"
@@ -85,19 +76,13 @@ BASE = {"driving": ("association.align=true", "map.target_in_view=150", "backend
 
 @dataclass(frozen=True)
 class Variant:
-    """What is switched off, or changed.
+    """What is switched off, or changed."""
 
-    Attributes:
-        name: for the table.
-        settings: by kind of motion; those of both where it is one tuple. A back end that has none of them is left out.
-        patch: the change of the program for what has no setting.
-        base: whether the settings are changes of `BASE`; else of the defaults.
-    """
-
-    name: str
+    name: str  # for the table
+    #: By kind of motion; those of both where it is one tuple. A back end that has none of them is left out.
     settings: tuple[str, ...] | dict[str, tuple[str, ...]] = ()
-    patch: Callable[[], AbstractContextManager[object]] = nullcontext
-    base: bool = True
+    patch: Callable[[], AbstractContextManager[object]] = nullcontext  # for what has no setting
+    base: bool = True  # whether the settings are changes of `BASE`; else of the defaults
 
     def config(self, sequence: Sequence, case: Case, backend: str) -> SystemConfig:
         """All settings of a run."""
@@ -157,3 +142,12 @@ def error_of(path: Trajectory, sequence: Sequence) -> float:
     if sequence.ground_truth is None:
         return closing_error(path, sequence)
     return evaluate(path, sequence).get("ATE RMSE [m]", float("nan"))
+
+
+def path_figures(results: list[FrameResult], case: Case, sequence: Sequence) -> list[float]:
+    """Error of the online path [m], NEES, number of frames, and of those without a measured pose."""
+    measured = [r for r in results if r.status.measured]
+    path, P = path_of(measured), np.array([r.estimate.covariance for r in measured])
+    found = consistency(path, P, sequence, [r.common for r in measured])
+    nees = found.get(f"NEES over {case.over} m", float("nan"))
+    return [error_of(path, sequence), nees, len(results), len(results) - len(measured)]

@@ -19,11 +19,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.ablation_parts import RECORDED, USUAL, Case, error_of, opened
-from experiments.common import script_options
-from experiments.perturbations import MEASURED, NONE, features_of, frames_of
+from experiments.common import path_of, script_options
+from experiments.perturbations import NONE, features_of, frames_of
 from frontends import create
 from slam.config import SystemConfig
-from slam.geometry.trajectory import Trajectory
+from slam.data import FrameResult, StereoFeatures
+from slam.interfaces import Frontend
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
@@ -32,7 +33,6 @@ ROOM = 1.5  # of a test, times the median
 FILE = Path(__file__).resolve().parents[1] / "tests" / "bars.json"
 
 Medians = dict[str, dict[str, dict[str, float]]]
-Names = tuple[str, ...]
 
 
 def bars(name: str) -> dict[str, dict[str, float]]:
@@ -41,19 +41,21 @@ def bars(name: str) -> dict[str, dict[str, float]]:
     return {b: {f: ROOM * value for f, value in figures.items()} for b, figures in medians[name].items()}
 
 
-def errors(case: Case, sequence: Sequence, names: Names, trial: int) -> dict[str, dict[str, float]]:
-    """Of each back end, the error of the online and of the final path in one trial [m]."""
+def perturbed(case: Case, sequence: Sequence, trial: int) -> tuple[Frontend, list[StereoFeatures]]:
+    """The front end of one trial, and what it finds."""
     options = {**SystemConfig.for_kind(sequence.kind).frontend, "features": features_of(sequence, trial)}
     frontend = create("surf", sequence.rig, **options)
-    features = [frontend.extract(frame) for frame in frames_of(sequence, NONE, case.frames, trial)]
-    found = {}
-    for backend in names:
-        config = USUAL.config(sequence, case, backend)
-        system = StereoSlam(sequence.rig, frontend, backend, config=config)
-        estimates = [r.estimate for r in map(system.process_features, features) if r.status in MEASURED]
-        online = Trajectory(np.array([e.stamp for e in estimates]), np.array([e.T_world_left for e in estimates]))
-        found[backend] = {"online": error_of(online, sequence), "final": error_of(system.trajectory(), sequence)}
-    return found
+    return frontend, [frontend.extract(frame) for frame in frames_of(sequence, NONE, case.frames, trial)]
+
+
+def errors(
+    case: Case, sequence: Sequence, frontend: Frontend, features: list[StereoFeatures], backend: str
+) -> tuple[dict[str, float], list[FrameResult]]:
+    """The error of the online and of the final path of one back end [m], and the results of the frames."""
+    system = StereoSlam(sequence.rig, frontend, backend, config=USUAL.config(sequence, case, backend))
+    results = [system.process_features(one) for one in features]
+    paths = {"online": path_of(results, measured=True), "final": system.trajectory()}
+    return {name: error_of(path, sequence) for name, path in paths.items()}, results
 
 
 def _medians(trials: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
@@ -73,7 +75,8 @@ def main() -> int:
     for case in RECORDED[: 1 if given.quick else None]:
         sequence = opened(case, 0)
         if sequence is not None and (not given.sequences or case.name in given.sequences):
-            runs = [errors(case, sequence, given.backends, t) for t in range(min(trials, case.trials))]
+            seen = (perturbed(case, sequence, t) for t in range(min(trials, case.trials)))
+            runs = [{b: errors(case, sequence, *one, b)[0] for b in given.backends} for one in seen]
             found[case.name] = found.get(case.name, {}) | _medians(runs)
             print(case.name, found[case.name], file=sys.stderr, flush=True)
     if not os.environ.get("SLAM_DATA"):

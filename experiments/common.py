@@ -14,6 +14,7 @@ import numpy as np
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
+from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence
 
 T = TypeVar("T")
@@ -51,6 +52,13 @@ def features_of(sequence: Sequence) -> list[StereoFeatures]:
         return [sequence.observations(k) for k in range(len(sequence))]
     frontend = create("surf", sequence.rig, **SystemConfig.for_kind(sequence.kind).frontend)
     return [frontend.extract(frame) for frame in sequence]
+
+
+def path_of(results: Iterable[FrameResult], measured: bool = False) -> Trajectory:
+    """The poses as they were reported; of the frames that measured them alone, if so asked."""
+    estimates = [r.estimate for r in results if r.status.measured or not measured]
+    poses = np.array([e.T_world_left for e in estimates]).reshape(-1, 4, 4)
+    return Trajectory(np.array([e.stamp for e in estimates]), poses)
 
 
 def timed(step: Callable[[T], FrameResult], frames: Iterable[T]) -> tuple[list[FrameResult], np.ndarray]:

@@ -33,42 +33,26 @@ _BOUNDS = 4  # frames at which the online bound is computed
 
 @dataclass(frozen=True)
 class Run:
-    """What one back end made of one recording of F frames.
+    """What one back end made of one recording of F frames."""
 
-    Attributes:
-        online: errors of the newest pose (F, 6), [rotation, translation].
-        final: errors of the whole path at the end (F, 6).
-        nees: of the newest pose (F,).
-        nis, dof: of the updates (F,), 0 where there was none.
-        landmark: mean NEES of the landmarks at the end, three degrees of freedom.
-        rejected: share of the observations that were rejected.
-    """
-
-    online: Array
-    final: Array
-    nees: Array
-    nis: Array
-    dof: Array
-    landmark: float
-    rejected: float
+    online: Array  # errors of the newest pose (F, 6), [rotation, translation]
+    final: Array  # errors of the whole path at the end (F, 6)
+    nees: Array  # of the newest pose (F,)
+    nis: Array  # of the updates (F,), 0 where there was none
+    dof: Array  # likewise
+    landmark: float  # mean NEES of the landmarks at the end, three degrees of freedom
+    rejected: float  # share of the observations that were rejected
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One seed of a case: the runs by back end, without and with wrong matches, and the bounds.
+    """One seed of a case: the runs by back end, without and with wrong matches, and the bounds."""
 
-    Attributes:
-        runs, spoilt: by the back end's name.
-        checked: frames (B,) of the online bound.
-        online_bound: least covariances (B, 6, 6) of the newest pose.
-        final_bound: least covariances (F, 6, 6) of the whole path.
-    """
-
-    runs: dict[str, Run]
-    spoilt: dict[str, Run]
-    checked: np.ndarray
-    online_bound: Array
-    final_bound: Array
+    runs: dict[str, Run]  # by the back end's name
+    spoilt: dict[str, Run]  # likewise
+    checked: np.ndarray  # frames (B,) of the online bound
+    online_bound: Array  # least covariances (B, 6, 6) of the newest pose
+    final_bound: Array  # least covariances (F, 6, 6) of the whole path
 
 
 def simulated(case: str, seed: int, frames: int) -> tuple[Recording, WorldSequence]:

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
 from experiments.common import script_options
-from experiments.long_run import DT, MODELS, RIG, Corridor, measured
+from experiments.long_run import MODELS, RIG, Corridor, walk
 from experiments.tables import picture, show
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.geometry import se3
@@ -42,19 +42,12 @@ HEADING, AT = slice(1, 2), slice(3, 6)  # of a pose's error: about the vertical,
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One back end in one run of F frames.
+    """One back end in one run of F frames."""
 
-    Attributes:
-        errors: of the newest pose (F, 6), [rotation, translation] [rad], [m].
-        deviations: what it claims of them (F, 6).
-        nees: of the pose (F,).
-        lost: updates that used nothing.
-    """
-
-    errors: Array
-    deviations: Array
-    nees: Array
-    lost: int
+    errors: Array  # of the newest pose (F, 6), [rotation, translation] [rad], [m]
+    deviations: Array  # what it claims of them (F, 6)
+    nees: Array  # of the pose (F,)
+    lost: int  # updates that used nothing
 
 
 def start(seed: int) -> EstimatorModels:
@@ -65,28 +58,12 @@ def start(seed: int) -> EstimatorModels:
 
 
 def run(name: str, options: Mapping[str, object], frames: int, seed: int) -> Run:
-    """Along the corridor; landmarks join where they come into view and leave once they lie behind."""
-    route, rng = Corridor(), np.random.default_rng(seed)
+    """Along the corridor, see `walk`."""
     backend = backends.create(name, RIG, models=start(seed), **options)
-    known: set[int] = set()
-    poses, covariances, lost = [], [], 0
-    for k in range(frames):
-        stamp = DT * k
-        ids, points = route.landmarks(stamp)
-        seen = measured(route.pose(stamp), points, ids, rng)
-        old = np.array([i in known for i in seen.ids.tolist()], bool)
-        gone = known - set(ids.tolist())
-        backend.predict(stamp)
-        report = backend.update(seen.select(old))
-        lost += k > 0 and not len(report.used)
-        backend.remove(sorted(gone))
-        backend.add(seen.select(~old))
-        known = (known | set(seen.ids.tolist())) - gone
-        estimate = backend.estimate(landmarks=False)
-        poses.append(estimate.T_world_left)
-        covariances.append(estimate.covariance)
-    P = np.array(covariances)
-    errors = pose_residuals(np.array([route.pose(DT * k) for k in range(frames)]), np.array(poses))
+    steps = list(walk(backend, frames, np.random.default_rng(seed), Corridor()))
+    P = np.array([step.estimate.covariance for step in steps])
+    errors = pose_residuals(np.array([s.T for s in steps]), np.array([s.estimate.T_world_left for s in steps]))
+    lost = sum(not len(step.report.used) for step in steps[1:])
     return Run(errors, np.sqrt(np.diagonal(P, axis1=1, axis2=2)), nees(errors, P), lost)
 
 

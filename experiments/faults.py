@@ -39,20 +39,13 @@ HEADER = (
 
 @dataclass(frozen=True)
 class Fault:
-    """One recording of the desk.
+    """One recording of the desk."""
 
-    Attributes:
-        name: for the table.
-        options: of the world.
-        jump: the camera is carried from one frame to another: (last before, first after); None for not.
-        last_good: the last frame before the fault.
-        over: the first frame after it.
-    """
-
-    name: str
-    options: str
-    last_good: int
-    over: int
+    name: str  # for the table
+    options: str  # of the world
+    last_good: int  # the last frame before the fault
+    over: int  # the first frame after it
+    #: The camera is carried from one frame to another: (last before, first after); None for not
     jump: tuple[int, int] | None = None
 
 

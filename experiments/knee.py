@@ -15,9 +15,9 @@ error is the least number whose error is larger than the smallest by no more tha
 
 from __future__ import annotations
 
-import csv
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,16 +26,14 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
-from experiments.ablation_parts import RECORDED, Case, error_of, opened
+from experiments.ablation_parts import RECORDED, Case, opened, path_figures
 from experiments.common import script_options
 from experiments.perturbations import NONE, frames_of
-from experiments.tables import show
+from experiments.tables import resumed, show
 from frontends import create
 from slam.config import SystemConfig
-from slam.data import StereoFeatures
-from slam.evaluation.summary import consistency
-from slam.run.summary import RunRecord
-from slam.runtime import stages
+from slam.data import FrameResult, StereoFeatures
+from slam.runtime import compilation
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
@@ -65,7 +63,7 @@ numbers stay: MH_01 is as good with fewer of both, V1_01 and the desk are not. N
 """
 
 Row = dict[str, str]
-Key = tuple[str, str, str, str, str]  # the columns that tell a run from others, without the kind
+KEYS = ("sequence", "trial", "back end", "asked", "in view")
 
 
 class Run:
@@ -76,36 +74,26 @@ class Run:
         largest = round(ROOM * in_view) if sequence.kind == "driving" else max(config.map.max_landmarks, in_view)
         wanted = {"map.target_in_view": in_view, "map.max_landmarks": largest}
         self.system = StereoSlam(sequence.rig, frontend, backend, config=config.with_settings(wanted))
-        self.sequence, self.case, self.record = sequence, case, RunRecord()
-        self.counts: list[tuple[float, ...]] = []  # features, landmarks measured, CPU time [ms]
-        self.bodies = 0
+        self.results: list[FrameResult] = []
         self.failed = False
 
-    def step(self, number: int, features: StereoFeatures) -> None:
+    def step(self, features: StereoFeatures) -> None:
         """A frame; nothing after one that ended the run."""
-        if self.failed:
-            return
         try:
-            result = self.system.process_features(features)
+            if not self.failed:
+                self.results.append(self.system.process_features(features))
         except slam.SlamError as error:
-            print(f"{self.case.name}: {error}", file=sys.stderr, flush=True)
+            print(error, file=sys.stderr, flush=True)
             self.failed = True
-            return
-        self.record.add(number, result)
-        self.counts.append((len(features), len(result.matched), sum(result.milliseconds.values())))
-        self.bodies += len(result.objects)
 
-    def figures(self) -> list[float]:
+    def figures(self, case: Case, sequence: Sequence) -> list[float]:
         """Error [m], NEES, frames without a measured pose, features and landmarks measured (medians), bodies, times."""
         if self.failed:
             return [float("nan")] * 7
-        measured = np.array(self.record.measured)
-        path, rows = self.record.trajectory.select(measured), np.flatnonzero(measured)
-        common = [self.record.common[row] for row in rows]
-        nees = consistency(path, np.array(self.record.covariances)[rows], self.sequence, common)
-        figures = error_of(path, self.sequence), nees.get(f"NEES over {self.case.over} m", float("nan"))
-        middle = np.median(self.counts, axis=0)
-        return [*figures, int((~measured).sum()), *middle[:2], self.bodies, *middle[2:].round(2)]
+        error, nees, _, lost = path_figures(self.results, case, sequence)
+        counts = [(len(r.features), len(r.matched), sum(r.milliseconds.values())) for r in self.results]
+        features, measured, took = np.median(counts, axis=0)
+        return [error, nees, lost, features, measured, sum(len(r.objects) for r in self.results), round(took, 2)]
 
 
 def settings(kind: str) -> dict[int, list[int]]:
@@ -116,7 +104,7 @@ def settings(kind: str) -> dict[int, list[int]]:
     return wanted
 
 
-def runs(cases: list[Case], trials: int, done: set[Key]) -> Iterator[list[object]]:
+def runs(cases: list[Case], trials: int, done: set[tuple[str, ...]]) -> Iterator[list[object]]:
     """The rows that are missing, trial by trial; all runs with one number of features get the same ones."""
     for trial, case in ((t, c) for t in range(trials) for c in cases if t < c.trials):
         sequence = opened(case, trial)
@@ -132,14 +120,14 @@ def runs(cases: list[Case], trials: int, done: set[Key]) -> Iterator[list[object
             frontend = create("surf", sequence.rig, **{**SystemConfig.for_kind(kind).frontend, "features": asked})
             systems = [Run(sequence, case, frontend, *one) for one in wanted]
             extraction = []
-            for number, frame in enumerate(frames):
+            for frame in frames:
                 start = time.process_time()
                 features = frontend.extract(frame)
                 extraction.append(1e3 * (time.process_time() - start))
                 for system in systems:
-                    system.step(number, features)
+                    system.step(features)
             for (backend, in_view), system in zip(wanted, systems):
-                figures, took = system.figures(), round(float(np.median(extraction)), 2)
+                figures, took = system.figures(case, sequence), round(float(np.median(extraction)), 2)
                 yield [case.name, kind, trial, backend, asked, in_view, *figures[:6], took, *figures[6:]]
 
 
@@ -208,24 +196,13 @@ def main() -> int:
     if given.quick:
         cases = [Case("desk", "synthetic:desk?frames=12", 12)]
     file = given.out / ("quick.csv" if given.quick else "knee.csv")
-    given.out.mkdir(parents=True, exist_ok=True)
-    if not file.exists():
-        file.write_text(",".join(HEADER) + "\n", encoding="utf-8")
-    with file.open(newline="", encoding="utf-8") as before:
-        done = {(r["sequence"], r["trial"], r["back end"], r["asked"], r["in view"]) for r in csv.DictReader(before)}
-    stages.working_time = time.process_time
-    with file.open("a", newline="", encoding="utf-8") as after:
-        for row in runs(cases, 1 if given.quick else given.trials, done):
-            csv.writer(after).writerow(row)
-            after.flush()
-    with file.open(newline="", encoding="utf-8") as whole:
-        rows = list(csv.DictReader(whole))
+    compilation.working_time = time.process_time
+    trials = 1 if given.quick else given.trials
+    rows = resumed(file, HEADER, KEYS, lambda done: runs(cases, trials, done))
     tables = {kind: table(rows, kind) for kind in USUAL}
     show(given.out / "knee.json", COLUMNS, [row for shown, _ in tables.values() for row in shown], 2)
-    trials: dict[str, set[str]] = {}
-    for row in rows:
-        trials.setdefault(row["sequence"], set()).add(row["trial"])
-    print("\nTrials:", ", ".join(f"{name} {len(of)}" for name, of in trials.items()) + ".")
+    done = Counter(name for name, _ in {(row["sequence"], row["trial"]) for row in rows})
+    print("\nTrials:", ", ".join(f"{name} {count}" for name, count in sorted(done.items())) + ".")
     for kind, (_, knees) in tables.items():
         for what, number in knees.items():
             print(f"\nKnee of the error, {kind}, {NAMES[what]}: {number}.")

@@ -19,17 +19,11 @@ _SPAN = 5  # frames over which a labelled speed is taken, to both sides
 
 @dataclass(frozen=True)
 class Car:
-    """A labelled car, or cyclist, in a frame.
+    """A labelled car, or cyclist, in a frame."""
 
-    Attributes:
-        place: middle of its bottom (3,) in left-camera coordinates [m].
-        box: left, top, right, bottom (4,) in the left image [px]; None where the labels have none.
-        kind: what it is, where the labels say so.
-    """
-
-    place: Array
-    box: Array | None = None
-    kind: str = ""
+    place: Array  # middle of its bottom (3,) in left-camera coordinates [m]
+    box: Array | None = None  # left, top, right, bottom (4,) in the left image [px]; None where the labels have none
+    kind: str = ""  # what it is, where the labels say so
 
 
 Labels = dict[int, dict[int, Car]]

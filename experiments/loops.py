@@ -48,19 +48,12 @@ _FAR = 40.0  # from which a place can be seen again, at most [m]
 
 @dataclass
 class Drive:
-    """One drive with one back end.
+    """One drive with one back end."""
 
-    Attributes:
-        results: of the frames, without their features.
-        atlas: at the end.
-        final: the path as estimated at the end.
-        truth: in the axes of its first pose (F, 4, 4).
-    """
-
-    results: list[FrameResult] = field(default_factory=list)
-    atlas: Atlas = field(default_factory=Atlas)
-    final: Trajectory = field(default_factory=Trajectory.empty)
-    truth: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    results: list[FrameResult] = field(default_factory=list)  # of the frames, without their features
+    atlas: Atlas = field(default_factory=Atlas)  # at the end
+    final: Trajectory = field(default_factory=Trajectory.empty)  # the path as estimated at the end
+    truth: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # in the axes of its first pose (F, 4, 4)
 
     @property
     def online(self) -> np.ndarray:

@@ -22,13 +22,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
-from experiments.common import script_options
+from experiments.common import path_of, script_options
 from experiments.labelled_cars import Car, Labels, hidden, labelled_speed, nearest_car, read_labels, read_tracklets
 from experiments.object_runs import (
     body_row,
     camera_figures,
-    features_where,
-    path_of,
     places_together,
     plain_table,
     scored_run,
@@ -199,7 +197,7 @@ def ids_about(seed: int, backend: str, frames: int, images: bool) -> tuple[set[i
     before, after, delay = set(), set(), WATCHED_AFTER
     seen = seen_in(name, images, HIDDEN_AT + max(HIDDEN_FOR) + WATCHED_AFTER, WATCHED_FROM)
     for k, (features, labels) in enumerate(seen[: back + WATCHED_AFTER - WATCHED_FROM], WATCHED_FROM):
-        shown = features_where(features, labels == 0) if HIDDEN_AT <= k < back else features
+        shown = features.select(labels == 0) if HIDDEN_AT <= k < back else features
         ids = {thing.id for thing in system.process_features(shown).objects if thing.estimate.measured}
         if k < HIDDEN_AT:
             before |= ids
@@ -230,7 +228,7 @@ def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     frames = 12 if quick else len(sequence)
     system = system_for(sequence, "ekf", True, [])
     features = [system.frontend.extract(frame) for frame in sequence.frames(0, frames)]
-    clear = [features_where(f, ~hidden(f, labels.get(k, {}), MOVING_CARS)) for k, f in enumerate(features)]
+    clear = [f.select(~hidden(f, labels.get(k, {}), MOVING_CARS)) for k, f in enumerate(features)]
     rows = []
     for backend in BACKENDS:
         results = drive(sequence, backend, features)

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 import slam
+from experiments.common import path_of
 from experiments.tables import markdown
 from slam import registry
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.objects import ObjectScore, labels_in_images, score_for
 from slam.evaluation.summary import evaluate
-from slam.geometry.trajectory import Trajectory
 
 
 @lru_cache(maxsize=2)
@@ -48,20 +47,8 @@ def steps(
     for k, (features, labels) in enumerate(seen_in(name, images, frames)):
         if without:
             keep = labels == 0 if images else labels <= 0  # features on its outline move with it
-            features, labels = features_where(features, keep), labels[keep]
+            features, labels = features.select(keep), labels[keep]
         yield k, system.process_features(features), labels
-
-
-def features_where(features: StereoFeatures, keep: Any) -> StereoFeatures:
-    """Those features (M) for which `keep` (N,) is true."""
-    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
-    return replace(features, **{name: getattr(features, name)[keep] for name in names})
-
-
-def path_of(results: list[FrameResult]) -> Trajectory:
-    return Trajectory(
-        np.array([r.estimate.stamp for r in results]), np.array([r.estimate.T_world_left for r in results])
-    )
 
 
 def camera_figures(sequence: Any, results: list[FrameResult]) -> dict[str, float]:

@@ -59,21 +59,13 @@ OUTCOMES = ("same", "within the scatter", "beyond it", "fails", "not read", "not
 
 @dataclass(frozen=True)
 class Parameter:
-    """A constant at the top of a module.
+    """A constant at the top of a module."""
 
-    Attributes:
-        file: path from the root of the project.
-        name: of the constant.
-        value: a number or a tuple of numbers.
-        comment: what its author says of it.
-        kind: one of `KINDS`.
-    """
-
-    file: str
-    name: str
-    value: Any
-    comment: str
-    kind: str
+    file: str  # path from the root of the project
+    name: str  # of the constant
+    value: Any  # a number or a tuple of numbers
+    comment: str  # what its author says of it
+    kind: str  # one of `KINDS`
 
     @property
     def module(self) -> str:

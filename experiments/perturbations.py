@@ -23,11 +23,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from experiments.common import recordings, script_options
+from experiments.common import path_of, recordings, script_options
 from experiments.tables import show
 from frontends import create
 from slam.config import SystemConfig
-from slam.data import FrameStatus, StereoFeatures, StereoFrame
+from slam.data import StereoFeatures, StereoFrame
 from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -42,7 +42,6 @@ HEADER = ("images", "drive", *(f"ATE {name} [m]" for name in ONLINE))
 
 _FIRST = 5  # frames that may be left out at the beginning
 _FEATURES = 0.2  # by how much the number of features may differ
-MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
 
 Image = np.ndarray
 #: Spoils the two images of a frame.
@@ -86,17 +85,11 @@ def shifted(rows: float) -> Spoil:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a recording.
+    """What is wrong with a recording."""
 
-    Attributes:
-        name: for the table.
-        spoil: of the images.
-        every: so many frames are one of the recording.
-    """
-
-    name: str
-    spoil: Spoil
-    every: int = 1
+    name: str  # for the table
+    spoil: Spoil  # of the images
+    every: int = 1  # so many frames are one of the recording
 
 
 NONE = Fault("none", unspoilt)
@@ -113,19 +106,12 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Drive:
-    """What a drive is for a run.
+    """What a drive is for a run."""
 
-    Attributes:
-        kind: of motion.
-        rig: the cameras.
-        ground_truth: true path of the left one; None where it is not known.
-        frames: from a number up to, but without, another.
-    """
-
-    kind: str
+    kind: str  # of motion
     rig: StereoRig
-    ground_truth: Trajectory | None
-    frames: Callable[[int, int], Iterator[StereoFrame]]
+    ground_truth: Trajectory | None  # true path of the left camera; None where it is not known
+    frames: Callable[[int, int], Iterator[StereoFrame]]  # from a number up to, but without, another
 
 
 def mirrored(drive: Sequence) -> Drive:
@@ -189,21 +175,15 @@ def extracted(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -
 def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str) -> float:
     """One back end on one trial: error of the path [m]."""
     system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
-    results = [system.process_features(one) for one in features]
-    measured = [r.estimate for r in results if r.status in MEASURED]
-    path = Trajectory(np.array([e.stamp for e in measured]), np.array([e.T_world_left for e in measured]))
-    ate = evaluate(path, sequence).get("ATE RMSE [m]") if len(measured) > 2 else None
-    return float("nan") if ate is None else float(ate)
+    path = path_of(map(system.process_features, features), measured=True)
+    return float(evaluate(path, sequence).get("ATE RMSE [m]", np.nan)) if len(path) > 2 else float("nan")
 
 
 def figures(fault: Fault, sequence: Drive | Sequence, last: int, trials: int) -> list[object]:
     """The figures of a row, behind image and drive, in the order of `HEADER`."""
-    ates: dict[str, list[float]] = {backend: [] for backend in ONLINE}
-    for trial in range(trials):
-        features = extracted(sequence, fault, last, trial)
-        for backend in ONLINE:
-            ates[backend].append(run(sequence, features, backend))
-    return [quartiles(ates[backend]) for backend in ONLINE]
+    features = (extracted(sequence, fault, last, trial) for trial in range(trials))
+    ates = [[run(sequence, of_trial, backend) for backend in ONLINE] for of_trial in features]
+    return [quartiles(list(of_backend)) for of_backend in zip(*ates)]
 
 
 def quartiles(values: list[float]) -> str:

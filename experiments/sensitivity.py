@@ -30,12 +30,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
+from experiments.common import path_of
 from experiments.parameters import ROOT, Parameter, find
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors, associate
 from slam.evaluation.objects import labels_in_images, score_for
-from slam.geometry.trajectory import Trajectory
 
 BACKENDS = ("ekf", "smoother")
 FACTORS = (0.5, 2.0)
@@ -68,19 +68,12 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Errors:
-    """What a run was off by.
+    """What a run was off by."""
 
-    Attributes:
-        camera: RMSE of the online positions [m].
-        bodies: RMSE of the bodies' motion from frame to frame [m]; None where the sequence knows of none.
-        covered: share of the frames in view in which a body was measured.
-        path: the poses as bytes: equal for runs that are equal.
-    """
-
-    camera: float
-    bodies: float | None
-    covered: float
-    path: bytes
+    camera: float  # RMSE of the online positions [m]
+    bodies: float | None  # RMSE of the bodies' motion from frame to frame [m]; None where the sequence knows of none
+    covered: float  # share of the frames in view in which a body was measured
+    path: bytes  # the poses: equal for runs that are equal
 
 
 def cases() -> list[Case]:
@@ -111,17 +104,15 @@ def run(index: int, backend: str, noise_seed: int | None = None) -> Errors:
     score = score_for(data.sequence)
     config = SystemConfig.for_kind(data.sequence.kind)
     system = slam.StereoSlam(data.sequence.rig, None, backend, config=config)
-    stamps, poses = [], []
+    results = []
     for k, features in enumerate(data.features):
         if noise_seed is not None:
             shift = _PIXEL_NOISE * rng.standard_normal(features.uv_left.shape)
             features = replace(features, uv_left=features.uv_left + shift, uv_right=features.uv_right + shift)
-        result = system.process_features(features)
+        results.append(system.process_features(features))
         if score is not None and data.labels is not None:
-            score.add(k, result, data.labels[k])
-        stamps.append(result.estimate.stamp)
-        poses.append(result.estimate.T_world_left)
-    path = Trajectory(np.array(stamps), np.array(poses))
+            score.add(k, results[-1], data.labels[k])
+    path = path_of(results)
     own, true = associate(path, data.sequence.ground_truth, interpolated=True)
     camera = absolute_errors(own, true).rmse
     bodies = [] if score is None else list(score.summary()["bodies"].values())

@@ -50,22 +50,14 @@ HEADER = (
 
 @dataclass(frozen=True)
 class StartUp:
-    """One start.
+    """One start."""
 
-    Attributes:
-        pixels: ``"stereo"`` or ``"left"``, or ``"stereo, no search"`` for the back end by itself.
-        backend, start: names.
-        positions: estimated places of the camera (F + 1, 3) [m]; the first is where the state began.
-        truth: true places (F, 3) [m].
-        sigma: standard deviation of the position, all axes together (F,) [m].
-    """
-
-    pixels: str
-    backend: str
-    start: str
-    positions: np.ndarray
-    truth: np.ndarray
-    sigma: np.ndarray
+    pixels: str  # ``"stereo"`` or ``"left"``, or ``"stereo, no search"`` for the back end by itself
+    backend: str  # names
+    start: str  # likewise
+    positions: np.ndarray  # estimated places of the camera (F + 1, 3) [m]; the first is where the state began
+    truth: np.ndarray  # true places (F, 3) [m]
+    sigma: np.ndarray  # standard deviation of the position, all axes together (F,) [m]
 
     @property
     def errors(self) -> np.ndarray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,33 @@ def show(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]], texts
     """Print a table, with words below it, and write its cells to a JSON file."""
     print(markdown(header, rows, texts) + (f"\n\n{words}" if words else ""), flush=True)
     write_json(path, header, rows)
+
+
+Runs = Callable[[set[tuple[str, ...]]], Iterator[Sequence[Any]]]
+
+
+def resumed(path: Path, header: Sequence[str], keys: Sequence[str], runs: Runs) -> list[dict[str, str]]:
+    """All rows of a CSV file, after those that are missing were appended to it one by one.
+
+    Args:
+        path: of the file; it and its folder are made where they are missing.
+        header: names of the columns.
+        keys: columns that tell a run from the others.
+        runs: makes the rows of the runs that are missing, given the keys of those that are there.
+    """
+
+    def read() -> list[dict[str, str]]:
+        with path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists():
+        path.write_text(",".join(header) + "\n", encoding="utf-8")
+    with path.open("a", newline="", encoding="utf-8") as file:
+        for row in runs({tuple(row[key] for key in keys) for row in read()}):
+            csv.writer(file).writerow(row)
+            file.flush()
+    return read()
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import transform
 from slam.geometry.trajectory import Trajectory
 from slam.input.extraction import Extracted, Extractor, as_frame
 from slam.input.features import Rectification, documented, following
@@ -226,7 +227,7 @@ class StereoSlam:
         with self._named(f"frame {extracted.frame.index}"):
             result = self._process(extracted.features, extracted.checksum)
         if result.reason == REPEATED:
-            self._extractor.warn_of_repeated(extracted.frame.index)
+            self._extractor.input_warnings.note_repeated(extracted.frame.index)
         return replace(result, milliseconds={**extracted.milliseconds, **result.milliseconds})
 
     def _named(self, place: str) -> AbstractContextManager[None]:
@@ -334,7 +335,8 @@ class StereoSlam:
             if self._state.tracks is None:
                 raise SlamError("there is no map yet: no frame was processed")
             estimate = self._estimate(of_map=True)
-            rows = self._state.tracks.landmarks().in_world(self.atlas.T_map_odom)
+            rows = self._state.tracks.landmarks()
+            rows = replace(rows, seen_from=transform(self.atlas.T_map_odom, rows.seen_from))
             keyframes = (k.corrected(self.calibration.applied, self._tracker.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
             return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas, self.rig)
@@ -342,7 +344,8 @@ class StereoSlam:
     @property
     def warnings(self) -> list[str]:
         """Warnings about images, stamps or baseline, one line each (see `slam.input.warnings`)."""
-        return self._extractor.warnings
+        said = self._extractor.input_warnings
+        return [*said.lines, *filter(None, [said.repeated])]
 
     def __getstate__(self) -> dict[str, object]:
         """State for copying and pickling; refused while another thread is in a step."""

@@ -25,6 +25,15 @@ settings.register_profile("repeatable", derandomize=True, deadline=None, suppres
 settings.load_profile("repeatable")
 
 
+#: What takes minutes comes first: at the end one process would wait for the other.
+LONGEST = ("test_real_sequences.py", "test_docs_commands.py", "test_same_bytes.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest tests first; the others stay in their order."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.fixture(scope="session")
 def slam_data() -> Path:
     """Folder with the real sequences; skips where the environment variable SLAM_DATA is not set."""

@@ -45,7 +45,7 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "cross = self.cross - lost[h:].T + shift @ head[:POSE, n:]", "cross = self.cross + shift @ head[:POSE, n:]",
+        "self.marks[b:, :b] - V_marks @ V_left.T + shift", "self.marks[b:, :b] + shift",
         "tests/backends/test_ekf_parts.py tests/backends/test_rest.py tests/backends/test_ekf.py",
     ),
     Fault(
@@ -127,13 +127,13 @@ FAULTS = (
     ),
     # tracks
     Fault(
-        "a second feature that is as near counts for nothing", "slam/tracks/follow_kernels.py",
+        "a second feature that is as near counts for nothing", "slam/tracks/follow.py",
         "elif d < second[row]:  # also one that is as near as the first",
         "elif nearest[row] < d < second[row]:",
         "tests/slam/tracks",
     ),
     Fault(
-        "a match need not be mutual", "slam/tracks/follow_kernels.py",
+        "a match need not be mutual", "slam/tracks/follow.py",
         "good[p] = good[p] and distance[p] <= of_column[columns[p]]", "pass",
         "tests/slam/tracks",
     ),

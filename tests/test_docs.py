@@ -11,13 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer.main
 
 import backends
 import slam
 from backends.ekf import EkfBackend
 from slam import worlds
-from slam.commands.cli import app
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.evaluation.metrics import absolute_errors
@@ -38,16 +36,12 @@ PAGES = [
 ]
 
 
-def pose_fit():
-    return load_script("docs/examples/pose_fit.py").PoseFit
-
-
 @pytest.mark.slow
 def test_the_back_end_in_50_lines_is_one_and_follows_the_camera():
     lines = [line for line in (DOCS / "examples" / "pose_fit.py").read_text().splitlines() if line.strip()]
     assert len(lines) <= 50
     sequence = slam.open_sequence("synthetic:aisle?frames=25")
-    system = slam.StereoSlam(sequence.rig, None, pose_fit()(sequence.rig))
+    system = slam.StereoSlam(sequence.rig, None, load_script("docs/examples/pose_fit.py").PoseFit(sequence.rig))
     assert isinstance(system.backend, Backend)
     results = [system.process_features(sequence.observations(k)) for k in range(len(sequence))]
     assert all(result.status.value == "tracked" for result in results[1:])
@@ -172,7 +166,7 @@ def commands(page, *languages):
                 words = words[end + 1 :]
 
 
-def require_accepted(settings, backend=None):
+def require_accepted(settings):
     """Raise where a setting is refused by the configuration, the front end, or every back end that it could be for."""
     needed = ["objects.database=FILE.npz"] if "objects.mode=procedure1" in settings else []
     default = SystemConfig.for_kind("handheld")
@@ -182,23 +176,13 @@ def require_accepted(settings, backend=None):
     slam.StereoSlam(rig, backend="ekf", config=SystemConfig(frontend=config.frontend))
     if config.backend:
         refused = []
-        for name in [backend] if backend else backends.names():
+        for name in backends.names():
             try:
                 backends.create(name, rig, models=config.models, **config.backend)
                 return
             except ConfigurationError as error:
                 refused.append(str(error))
         raise ConfigurationError("; ".join(refused))
-
-
-@each_page
-def test_commands_in_blocks_are_understood_by_the_command_line(page):
-    group = typer.main.get_command(app)
-    for words in commands(page):
-        if words[0] == "slam" and "--help" not in words:
-            context = group.commands[words[1]].make_context(words[1], words[2:])  # raises what the user would be told
-            if context.params.get("settings"):
-                require_accepted(context.params["settings"], context.params.get("backend"))
 
 
 @each_page

@@ -1,9 +1,17 @@
-"""Imports between the rooms of `slam` run one way, and in no package in a circle."""
+"""Imports run one way, between packages and between the rooms of `slam`, in no circle; each brings what it needs."""
 
 from __future__ import annotations
 
 import ast
+import dataclasses
+import importlib
+import inspect
+import re
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parent.parent
 SLAM = ROOT / "slam"
@@ -18,7 +26,7 @@ MAY_IMPORT = {
     "data": {"geometry"},
     "window": {"data", "geometry", "kernels", "runtime"},
     "tracks": {"data", "geometry", "kernels", "runtime"},
-    "calibration": {"data", "geometry", "kernels", "runtime"},
+    "calibration": {"tracks", "data", "geometry", "kernels", "runtime"},
     "atlas": {"tracks", "window", "data", "geometry", "runtime"},
     "bodies": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
     "papers": {"bodies", "tracks", "data", "geometry", "runtime"},
@@ -117,3 +125,66 @@ def test_every_room_says_what_it_is_for():
         if (SLAM / room).is_dir():
             lines = ast.get_docstring(ast.parse((SLAM / room / "__init__.py").read_text(encoding="utf-8"))) or ""
             assert len(lines.splitlines()) >= 2 and "import" in lines.lower(), f"slam/{room}/__init__.py"
+
+
+ALLOWED = {"slam": {"slam"}, "frontends": {"slam", "frontends"}, "backends": {"slam", "backends"}}
+OURS = {*ALLOWED, "tests", "experiments", "benchmarks"}
+
+
+def imported(file: Path) -> set[str]:
+    """Top-level names of all imports in a file."""
+    nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+    whole = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    return {name.partition(".")[0] for name in whole | {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)}}
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_packages_import_one_way_and_gtsam_and_numba_stay_in_their_place(package):
+    for file in modules(package).values():
+        place, names = file.relative_to(ROOT).as_posix(), imported(file)
+        assert names & OURS <= ALLOWED[package], place
+        assert not names & {"gtsam", "gtsam_unstable"} or place.startswith(("backends/smoother", "backends/batch")), (
+            place
+        )
+        assert "numba" not in names or place == "slam/runtime/compilation.py", place
+
+
+EKF_RUN = """
+import slam, numpy as np
+system = slam.StereoSlam(slam.StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240), "surf", "ekf")
+image = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
+for k in range(2):
+    system.process(image, image[:, ::-1], 0.1 * k)
+"""
+HEAVY = {"scipy", "cv2", "gtsam", "numba", "pydantic", "typer", "rich", "matplotlib", "backends", "frontends"}
+LOADS = {
+    "import slam": HEAVY,
+    "import backends, frontends; backends.names(); frontends.names()": {"gtsam", "numba", "scipy", "cv2"},
+    EKF_RUN: {"gtsam", "gtsam_unstable"},
+}
+
+
+@pytest.mark.parametrize("code", LOADS, ids=["slam", "names", "ekf"])
+def test_nothing_heavy_is_loaded_before_it_is_used(code):
+    listing = f"{code}\nimport sys; print(' '.join({{m.partition('.')[0] for m in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", listing], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert not set(done.stdout.split()) & LOADS[code]
+
+
+def test_dataclasses_of_arrays_are_compared_by_identity():
+    """Generated `==` of arrays has no truth value; the same holds for what is in them."""
+    classes = {
+        c for name in modules(*ALLOWED) if not name.endswith("__main__")
+        for c in vars(importlib.import_module(name)).values()
+        if inspect.isclass(c) and dataclasses.is_dataclass(c) and c.__module__ == name
+    }  # fmt: skip
+    words = {
+        c: set(re.findall(r"\w+", " ".join(re.sub(r"Callable\[.*", "", str(f.type)) for f in dataclasses.fields(c))))
+        for c in classes
+    }
+    names, found = {"Array", "BoolArray", "IdArray", "IndexArray", "NDArray", "ndarray"}, set()
+    while more := {c for c in classes - found if words[c] & names}:
+        found |= more
+        names |= {c.__name__ for c in more}
+    assert len(found) > 50
+    assert not {c for c in found if c.__dataclass_params__.eq and "__eq__" not in inspect.getsource(c)}

@@ -133,10 +133,7 @@ def _compare(patch, planes, window, n):
 
 @helper
 def _best_place(image, shape, start, reach, min_correlation, window, half, planes, other):
-    """Where an image looks like a patch with these gradients, by steps from a start (x, y); NaN where nowhere.
-
-    `other` takes the samples of the image.
-    """
+    """Where an image looks like a patch with these gradients, by steps from a start (x, y); NaN where nowhere."""
     rows, lanes = 2 * half + 1, 2 * half + 2
     n = rows * lanes
     mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(planes, window, n)

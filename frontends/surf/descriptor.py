@@ -31,10 +31,7 @@ def gaussian_weights(areas: int) -> NDArray[np.float32]:
 
 @vector_helper
 def _place_boxes(px, py, cosine, sine, extent, least, last_x, last_y, stride, place, weight):
-    """Where the boxes of a row of turned cells lie in the flat integral image, from (px, py) on.
-
-    ``place`` (3, lanes) takes top left corners, widths, and heights in rows of the image; ``weight`` one over areas.
-    """
+    """Boxes of a row of turned cells in the flat integral image: corners, widths and heights; one over their areas."""
     zero, narrow, wide = np.float32(0.0), np.float32(1.0) / np.float32(least), np.float32(1.0) / np.float32(least + 1)
     for j in range(weight.size):
         left = min(max(px + np.float32(j) * cosine, zero), last_x)
@@ -50,11 +47,7 @@ def _place_boxes(px, py, cosine, sine, extent, least, last_x, last_y, stride, pl
 
 @vector_helper
 def _average_cells(pixels, shape, x, y, width, angle, extent, space):
-    """Cell means of a turned square about (x, y): axis-aligned boxes of whole pixels about the turned cell centres.
-
-    Boxes are `extent` [px] wide, each edge rounded by itself. Those that would leave the image are pushed back to its
-    edge.
-    """
+    """Cell means of a turned square: boxes `extent` [px] wide about the cell centres, each edge rounded by itself."""
     place, weight, cells, _ = space
     n = cells.shape[0]
     cosine, sine = np.float32(width * np.cos(angle)), np.float32(width * np.sin(angle))

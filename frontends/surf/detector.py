@@ -1,10 +1,7 @@
 """The fast Hessian detector (paper A, III.A): responses, non-maximum suppression and refinement in one pass.
 
-The responses of a few rows at a time live in a small rotating buffer, so they never make a round trip through main
-memory; the first and the last layer of an octave, which only rival the maxima of the others, are computed only where
-such a maximum needs them.
-
-The box filters are on OpenCV's conventions: sizes, rounding, response scale.
+Responses of a few rows live in a small rotating buffer; the first and the last layer of an octave, which only rival the
+maxima of the others, are computed where such a maximum needs them. Box filters are on OpenCV's conventions.
 """
 
 from __future__ import annotations
@@ -106,12 +103,7 @@ def _response_at(pixels, at, offsets, weights, layer):
 
 @vector_helper
 def _vertical_parts(s, at, stride, c, need, n, out, to, between):
-    """Combine rows of the flat integral image for the filters whose top row begins at `at`.
-
-    Dxx takes the rows at its lobes' top and bottom edges; Dyy three lobes one above the other, weights 1, -2, 1; Dxy
-    an upper and a lower lobe, weights 1, -1. They go to `to`, `to + between` and `to + 2 between`, n elements each,
-    where `need` asks for them.
-    """
+    """Vertical part of the filters for Dxx, Dyy and Dxy whose top row begins at `at`, n columns each, where needed."""
     if need[0]:
         a, b = at + c[2] * stride, at + c[7] * stride
         for x in range(n):
@@ -221,10 +213,9 @@ def _collect(space, pixels, stride, filters, layer, row, out, found):
 
 
 def _column_phases(integral: NDArray[np.int32], step: int, first: int, last: int) -> NDArray[np.int32]:
-    """The columns of an integral image sorted by their remainder: ``out[p, y, j] = integral[y, step * j + p]``.
+    """Columns of an integral image by their remainder, ``out[p, y, j] = integral[y, step * j + p]``, of some rows.
 
-    A filter that moves in steps of `step` then reads neighbouring memory. Shape (step, H+1, ceil((W+1) / step)); only
-    the rows from `first` to before `last` are filled in, and columns beyond the image are not.
+    A filter that moves in steps of `step` then reads neighbouring memory.
     """
     rows, columns = integral.shape
     if step == 1:
@@ -239,11 +230,7 @@ def _column_phases(integral: NDArray[np.int32], step: int, first: int, last: int
 def detect_octave(
     integral: NDArray[np.int32], filters: Filters, octave: int, threshold: float, first_row: int, last_row: int
 ) -> NDArray[np.float64]:
-    """Maxima of the Hessian determinant above a threshold in an octave, from a grid row to before another.
-
-    Returns:
-        Candidates (N, COLUMNS) in raster order of the grid.
-    """
+    """Candidates (N, COLUMNS) above a threshold in an octave, from a grid row to before another, in raster order."""
     top, bottom = first_row - 1 - filters.centre[-2], last_row + 1 + filters.centre[-2]  # that inner layers read
     phases = _column_phases(integral, filters.step, max(top, 0) * filters.step, (bottom + 1) * filters.step)
     found = _scan(integral, phases, filters, np.float32(threshold), first_row, last_row)

@@ -127,10 +127,7 @@ def _take_patch(pixels, stride, x, y, space):
 
 @vector_helper
 def _correlate(image, stride, y, first, count, own, space):
-    """Normalised correlation of a patch with the places at columns first, first + 1, ... of row y, into `scores`.
-
-    It goes on to the end of a vector register: `_LANES - 1` more scores and, in the images, pixels at most.
-    """
+    """Normalised correlation of a patch with `count` places of row y, and to the end of a vector register."""
     pixels, weights, patch, scores = image.pixels, image.weight, space.patch, space.scores
     count = (count + _LANES - 1) & -_LANES
     for j in range(count):
@@ -200,8 +197,7 @@ def _height(image, stride, y, x, own, score, side, space):
 def _unresolved(image, stride, x, y, space):
     """How much too low a height may be by noise, and by linear interpolation between places half a column apart.
 
-    It is half of the share of the variance about (x, y) that interpolation between whole columns leaves unexplained,
-    over 4: a share that falls with the fourth power of the distance in smooth images, and more slowly in coarse ones.
+    An eighth of the share of the variance about (x, y) that interpolation between whole columns leaves unexplained.
     """
     pixels, between, inner = space.pixels, space.between, space.side - 1
     _cut(image.pixels, stride, x, y, space.side, pixels)
@@ -224,10 +220,9 @@ def _search(image, shape, band, y, first, last, own, limits, space):
     """The place of the patch in columns first..last of the rows within `band` of y: x, y; -1 where there is none.
 
     It correlates with at least the first of `limits`, and clearly better than any rival: ``(1 - height) / (1 - rival)``
-    is at most the second, with the third taken from the rival's side as what noise may do. Heights are the correlations
-    with the best places between columns: a wrong place of a repeated pattern that happens to lie on a whole column
-    looks better than the true one that does not. Between any two columns there may be one: beside lines far apart
-    correlations are a plateau by the lines along the row, and a crossing stands out of it for less than a column.
+    is at most the second, with the third taken from the rival's side as what noise may do. Heights are correlations
+    between columns, of which there may be one between any two: a wrong place of a repeated pattern on a whole column
+    looks better than the true one between two.
     """
     scores, (min_correlation, uniqueness, unresolved), (rows, stride) = space.scores, limits, shape
     count, one = last - first + 1, np.float32(1.0)  # no literal number: Numba would compile a helper again for it

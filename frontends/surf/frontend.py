@@ -146,11 +146,7 @@ class SurfFrontend:
         return self._rectify((mask != 0).astype(np.uint8), 0)
 
     def _detect(self, picture: Picture) -> tuple[Keypoints, float]:
-        """Features, and the D_threshold that found them (paper A, III.A).
-
-        It was adapted after the last image. Should it still find less than half of what is wanted, as in the first
-        image or after the light went out, it is lowered at once.
-        """
+        """Features, and the D_threshold that found them: lowered at once where it finds less than half (A, III.A)."""
         target = int(_CHOICE * _SURPLUS * self.config.features)
         for _ in range(_TRIES):
             threshold = self._threshold
@@ -167,7 +163,9 @@ class SurfFrontend:
     def _match(self, views: list[_View], uv: NDArray, size: NDArray) -> NDArray[np.float64]:
         """Right pixels (N, 2) of left features in the rectified images, NaN where unmatched."""
         c, (left, right) = self.config, views
-        low, high = self._disparities()
+        rectified = self.rig.rectified.rig
+        shift, product = rectified.left.u0 - rectified.right.u0, rectified.left.fu * rectified.baseline
+        low, high = product / c.max_depth + shift, product / c.min_depth + shift
         band = max(int(np.rint(0.5 * (c.epipolar - _OWN_BAND))), 0)
         start = search_rows(left.half, right.half, uv, low, high, band, _COARSE * _CORRELATION, _UNIQUENESS)
         found = self._refine(left.pixels, right.pixels, uv, size, start)
@@ -181,10 +179,3 @@ class SurfFrontend:
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
         reaches = np.array([(_REACH, self.config.epipolar), (_FINE_REACH, _FINE_REACH)])
         return align(left[None], uv, np.zeros((0, 2, 2)), right, size, start, _CORRELATION, reaches, self._windows)
-
-    def _disparities(self) -> tuple[float, float]:
-        """Range of disparities [px] of the rectified pair for the range of depths."""
-        rectified_rig = self.rig.rectified.rig
-        shift = rectified_rig.left.u0 - rectified_rig.right.u0
-        product = rectified_rig.left.fu * rectified_rig.baseline
-        return product / self.config.max_depth + shift, product / self.config.min_depth + shift

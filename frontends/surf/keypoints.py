@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import SequenceError
+from slam.geometry.arrays import Table
 from slam.runtime.compilation import kernel
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ _NO_ANGLE = -1.0  # fixed: of a cv2.KeyPoint [degrees]
 
 
 @dataclass(frozen=True, eq=False)
-class Keypoints:
+class Keypoints(Table):
     """Detected features, a row each, by falling response.
 
     As a sequence its items are ``cv2.KeyPoint``: ``cv2.drawKeypoints`` and the like take it as it is.
@@ -46,9 +47,6 @@ class Keypoints:
     laplacian: NDArray[np.int8]
     octave: NDArray[np.int8]
 
-    def __len__(self) -> int:
-        return len(self.uv)
-
     def __getitem__(self, row: int) -> cv2.KeyPoint:
         import cv2
 
@@ -64,13 +62,6 @@ class Keypoints:
 
     def __repr__(self) -> str:
         return f"Keypoints({len(self)} features)"
-
-    def select(self, rows: NDArray) -> Keypoints:
-        """The features of these rows (a mask or indices)."""
-        return Keypoints(
-            self.uv[rows], self.size[rows], self.angle[rows], self.response[rows], self.laplacian[rows],
-            self.octave[rows],
-        )  # fmt: skip
 
     @classmethod
     def from_cv2(cls, keypoints: Iterable[cv2.KeyPoint]) -> Keypoints:

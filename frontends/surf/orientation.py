@@ -11,8 +11,6 @@ from slam.runtime.compilation import helper, kernel, vector_helper
 
 RADIUS = 6  # paper: of the sampled disc, in units of the feature's scale s
 _SIGMA = 2.5  # paper: of the Gaussian weight, in the same units
-
-
 _BINS = 144  # fixed: two for each five degrees: the degree 5k alone, and the four after it
 _WINDOW = 23  # fixed: bins in 60 degrees, the ends left out
 
@@ -26,7 +24,6 @@ class Disc(NamedTuple):
 
 
 def _disc() -> Disc:
-    """The tables."""
     line = np.arange(-RADIUS, RADIUS + 1)
     weight = np.exp(-(line**2) / (2 * _SIGMA**2))
     weight /= weight.sum()
@@ -92,8 +89,7 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, space):
 def _strongest_window(space, n, bins):
     """Direction [rad] of the largest sum of gradients within a window of 60°, moved in steps of 5°; first one wins.
 
-    A window holds the whole degrees less than 30 from its centre. Gradients are summed by bins first; a window is
-    then the difference of two running sums, which go on beyond the full circle by a window's width.
+    A window is the difference of two running sums over bins, which go on beyond the full circle by its width.
     """
     gx, gy, degrees, sums = space[2:]
     for k in range(sums.shape[1]):  # a slice would take longer to compile

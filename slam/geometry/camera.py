@@ -1,4 +1,4 @@
-"""One pinhole camera with lens distortion: projection, its Jacobian, and the way back (paper A, Eq. 5)."""
+"""One pinhole camera with lens distortion: projection, and the way back (paper A, Eq. 5)."""
 
 from __future__ import annotations
 
@@ -124,30 +124,9 @@ class PinholeCamera:
 
     def project(self, points: Array) -> Array:
         """Pixels (N, 2) of points (N, 3) [m] in camera coordinates; NaN for points not in front of the camera."""
-        if self.has_distortion:
-            return self.project_with_jacobian(points, jacobian=False)[0]
-        z = np.where(points[:, 2:] > _NEAREST, points[:, 2:], np.nan)
-        return np.asarray(points[:, :2] / z * (self.fu, self.fv) + (self.u0, self.v0))
-
-    def project_with_jacobian(self, points: Array, jacobian: bool = True) -> tuple[Array, Array]:
-        """Pixels (N, 2) and Jacobian (N, 2, 3) [px/m] of the projection by the point.
-
-        Rows of points at or behind the camera are NaN (never a mirrored pixel).
-        """
         points = np.asarray(points, float).reshape(-1, 3)
-        z = np.where(points[:, 2] > _NEAREST, points[:, 2], np.nan)
-        a, b = points[:, 0] / z, points[:, 1] / z
-        distorted, D = self._distort(np.stack([a, b], axis=1), jacobian)
-        uv = distorted * (self.fu, self.fv) + (self.u0, self.v0)
-        if not jacobian:
-            return uv, np.empty((0, 2, 3))
-        J = np.zeros((len(points), 2, 3))
-        J[:, 0, 0] = J[:, 1, 1] = 1 / z
-        J[:, 0, 2], J[:, 1, 2] = -a / z, -b / z
-        if D is not None:
-            J = D @ J
-        J *= np.array([self.fu, self.fv])[:, None]
-        return uv, J
+        ab = points[:, :2] / np.where(points[:, 2:] > _NEAREST, points[:, 2:], np.nan)
+        return np.asarray(self._distort(ab) * (self.fu, self.fv) + (self.u0, self.v0))
 
     def normalise(self, uv: Array) -> Array:
         """Undistorted normalised coordinates (N, 2) = (x/z, y/z) of pixels (N, 2); NaN stays NaN."""
@@ -170,20 +149,19 @@ class PinholeCamera:
         """Which points (N, 3) are in the angle of view: in front and inside the image (paper A, Fig. 3)."""
         return self.in_image(self.project(points))
 
-    def _distort(self, ab: Array, jacobian: bool) -> tuple[Array, Array | None]:
-        """Distorted normalised coordinates (N, 2) and, if asked for, the Jacobian (N, 2, 2).
+    def _distort(self, ab: Array) -> Array:
+        """Distorted normalised coordinates (N, 2).
 
         Rows outside the region where the distortion is one-to-one are NaN: there the polynomial folds far rays back
         into the image.
         """
         if not self.has_distortion:
-            return ab, None
+            return ab
         if self.model == "equidistant":
-            return _distort_equidistant(ab, np.asarray(self.distortion), jacobian)
+            return _distort_equidistant(ab, np.asarray(self.distortion))
         from slam.geometry import kernels
 
-        distorted, D = kernels.distort(ab, self._coefficients, self._radius_limit, jacobian)
-        return distorted, D if jacobian else None
+        return np.asarray(kernels.distort(np.ascontiguousarray(ab), self._coefficients, self._radius_limit, False)[0])
 
     @cached_property
     def _coefficients(self) -> Array:
@@ -258,24 +236,12 @@ def _undistort_equidistant(target: Array, coefficients: Array) -> Array:
     return target * np.where(near, 1.0, np.tan(theta) / np.where(near, 1.0, theta_d))[:, None]
 
 
-def _distort_equidistant(ab: Array, coefficients: Array, jacobian: bool) -> tuple[Array, Array | None]:
+def _distort_equidistant(ab: Array, coefficients: Array) -> Array:
     """Kannala-Brandt distortion: ``θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`` along the ray's azimuth."""
     k1, k2, k3, k4 = coefficients
-    a, b = ab[:, 0], ab[:, 1]
-    r = np.hypot(a, b)
+    r = np.hypot(ab[:, 0], ab[:, 1])
     theta = np.arctan(r)
     t2 = theta * theta
     theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
     near = r < 1e-8
-    safe = np.where(near, 1.0, r)
-    scale = np.where(near, 1.0, theta_d / safe)
-    out = ab * scale[:, None]
-    if not jacobian:
-        return out, None
-    d_theta_d = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-    d_scale = np.where(near, 0.0, (d_theta_d / (1 + r * r) - scale) / safe**2)
-    D = np.empty((len(ab), 2, 2))
-    D[:, 0, 0] = scale + a * a * d_scale
-    D[:, 0, 1] = D[:, 1, 0] = a * b * d_scale
-    D[:, 1, 1] = scale + b * b * d_scale
-    return out, D
+    return np.asarray(ab * np.where(near, 1.0, theta_d / np.where(near, 1.0, r))[:, None])

@@ -207,16 +207,14 @@ class StereoRig:
 
         The right image's row adds only the epipolar check (paper A uses only its x, Eq. 8), so it is no part of the
         measurement. Rows of points behind a camera are NaN. With ``jacobian=False`` the Jacobian is empty.
-        """
-        if self.is_rectified:
-            from slam.geometry.kernels import project_rectified
 
-            z, J = project_rectified(self.rectified_parameters, np.ascontiguousarray(points, float), jacobian)
-            return z, J
-        left, J_left = self.left.project_with_jacobian(points, jacobian)
-        right, J_right = self.right.project_with_jacobian((points + self.b) @ self.R.T, jacobian)
-        z = np.concatenate([left, right[:, :1]], axis=1)
-        return z, np.concatenate([J_left, (J_right @ self.R)[:, :1]], axis=1)
+        Raises:
+            CalibrationError: the rig is not rectified.
+        """
+        from slam.geometry.kernels import project_rectified
+
+        z, J = project_rectified(self.rectified_parameters, np.ascontiguousarray(points, float), jacobian)
+        return z, J
 
     @cached_property
     def rectified_parameters(self) -> Array:
@@ -254,6 +252,9 @@ class StereoRig:
 
         First order: the inverse of the (3, 3) stereo projection Jacobian carries the noise back. `sigma` is one
         number or (3,) numbers.
+
+        Raises:
+            CalibrationError: the rig is not rectified.
         """
         _, J = self.project_stereo(points)
         out = np.full((len(points), 3, 3), np.nan)
@@ -264,9 +265,7 @@ class StereoRig:
         return out
 
     def depth_deviation(self, points: Array, sigma: float) -> Array:
-        """Standard deviations (N,) [m] of the depths of triangulated points (N, 3), see `triangulation_covariance`."""
-        if not self.is_rectified:
-            return np.sqrt(self.triangulation_covariance(points, sigma)[:, 2, 2])
+        """Standard deviations (N,) [m] of the depths that a rectified rig triangulates; points (N, 3)."""
         with np.errstate(over="ignore"):  # at infinity
             return np.asarray(points[:, 2] ** 2 * (np.sqrt(2.0) * sigma / (self.left.fu * self.baseline)))
 

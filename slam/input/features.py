@@ -56,16 +56,16 @@ def outside_masks(features: StereoFeatures, frame: StereoFrame, rig: StereoRig) 
         features = features.select(_at(frame.left_mask, uv))
     if frame.right_mask is not None:
         uv = rig.rectified.unrectify_right(features.uv_right) if features.rectified else features.uv_right
-        there = _at(frame.right_mask, uv)[:, None]
-        features = replace(features, uv_right=np.where(there, features.uv_right, np.nan))
+        visible = _at(frame.right_mask, uv)[:, None]
+        features = replace(features, uv_right=np.where(visible, features.uv_right, np.nan))
     return features
 
 
 def _at(mask: BoolArray, uv: Array) -> BoolArray:
     """The mask (H, W) at pixels (N, 2); True beyond its border and where a pixel is NaN."""
-    out, there = np.ones(len(uv), bool), np.isfinite(uv).all(axis=1)
-    column, row = np.rint(uv[there]).astype(int).T.clip(0, np.array([mask.shape[1] - 1, mask.shape[0] - 1])[:, None])
-    out[there] = mask[row, column]
+    out, visible = np.ones(len(uv), bool), np.isfinite(uv).all(axis=1)
+    column, row = np.rint(uv[visible]).astype(int).T.clip(0, np.array([mask.shape[1] - 1, mask.shape[0] - 1])[:, None])
+    out[visible] = mask[row, column]
     return out
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from slam.errors import SequenceError, SlamError
 from slam.files import read_object
 from slam.naming import nearest
-from slam.sequences.folders import is_side
 from slam.sequences.images import IMAGE_SUFFIXES
 
 _LOOKED_AT = 500  # entries of a folder, and folders below one that is no sequence
@@ -38,13 +37,15 @@ def of_run(folder: Path) -> str:
     if not all(file.is_file() for file in files):
         return ""
     with suppress(SlamError):
-        source = read_object(files[0]).get("source")
+        source = read_object(files[0]).get("source") or "something"
         return f"; it is what a run of {source} left: give that, or look at the run with `slam view {folder.name}`"
     return ""
 
 
 def sequences_near(folder: Path, format_of: Format) -> str:
     """Which sequences lie below a folder, or it is a part of; else how to name the two cameras in it."""
+    from slam.sequences.folders import is_side
+
     if run := of_run(folder):
         return run
     below = sorted(str(path.relative_to(folder)) for path in _below(folder, format_of))

@@ -22,7 +22,7 @@ from slam.sequences.faults import FaultLog
 from slam.sequences.images import Size, size_text
 from slam.sequences.names import stem
 from slam.sequences.options import Options
-from slam.sequences.pairs import image_names, image_pairs, listed, pair_up, told_times
+from slam.sequences.pairs import Times, image_names, image_pairs, listed, pair_up, told_times
 from slam.sequences.rigs import calibration_files, projection_offset, read_rig, rig_from_projections, rigid
 from slam.sequences.tables import date_time, numbers, read_rows, require_truth, shorten
 
@@ -75,11 +75,12 @@ def open_drive(folder: Path, options: Options, faults: FaultLog) -> RecordedSequ
 
 def _open(folder: Path, where: Layout, options: Options, faults: FaultLog) -> RecordedSequence:
     left, right = listed(where.folders, [image_names(images) for images in where.folders], faults)
-    origin, times = None, None
+    origin = None
     if where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options):
         dates = read_rows(where.times, date_time, faults)
         origin = next(date for date in dates if date is not None)
-        times = where.times, np.array([np.nan if date is None else (date - origin) * 1e-9 for date in dates])
+        seconds = np.array([np.nan if date is None else (date - origin) * 1e-9 for date in dates])
+        times: Times | None = Times(where.times, seconds, [])
     else:
         times = told_times(folder, options, faults, where.times)
     pairs = pair_up(left, right, options, faults, times, by_number=True)

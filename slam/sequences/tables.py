@@ -27,7 +27,8 @@ LARGEST = 4.1e7
 _ROTATION = 1e-2  # largest error of an element of RᵀR: files have six digits and more
 _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
 _SLOWEST = 100.0  # [s] between frames, at most, of times in a unit that nobody named
-_HEADING = re.compile(r"\D*(time|stamp)\D*", re.IGNORECASE)  # a first row that names the columns
+_HEADING = re.compile(r"\D*(time|stamp|\bt\b|\bsec|\b[num]s\b)\D*", re.IGNORECASE)  # a first row that names the columns
+_IMAGE = re.compile(r"\.(png|jpe?g|p[gp]m|bmp|tiff?|webp)$", re.IGNORECASE)
 _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
 
 
@@ -57,15 +58,21 @@ def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T
     return rows
 
 
-def read_times(path: Path, faults: FaultLog) -> Array:
-    """The times in a file by row [s], NaN for unreadable ones.
+def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
+    """The times in a file by row [s], NaN for unreadable ones, and the images that its rows name, if all do.
 
     A row's time is its first number, or a date with the time, whatever names stand beside it; the second number where
     the first ones count rows. Times since 1970 in a finer unit are known by their size, which is said.
 
     SequenceError where the file cannot be read, or a time is impossible.
     """
-    rows = read_rows(path, _numbers_in, faults)
+    names: list[str] = []
+
+    def row(text: str) -> list[float]:
+        names.extend(name for name in re.split(r"[,;\s/\\]+", text) if _IMAGE.search(name))
+        return _numbers_in(text)
+
+    rows = read_rows(path, row, faults)
     table = np.array([(*(row or ())[:2], np.nan, np.nan)[:2] for row in rows])
     times, second = table.T
     if len(table) > 1 and (np.diff(times) == 1).all() and (np.diff(second) > 0).all() and times[0] in (0, 1):
@@ -78,7 +85,7 @@ def read_times(path: Path, faults: FaultLog) -> Array:
             times = times / size
     if (np.abs(times) > _MOST_SECONDS).any():
         raise SequenceError(f"{path}: {times[np.abs(times) > _MOST_SECONDS][0]:g} is no possible time in seconds")
-    return np.asarray(times)
+    return np.asarray(times), names if len(set(names)) == len(rows) else []
 
 
 def _numbers_in(text: str) -> list[float]:

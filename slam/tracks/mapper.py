@@ -175,8 +175,8 @@ class Mapper:
         view = self._view(backend, step)  # type: ignore[arg-type]
         shown = np.flatnonzero(view.in_image)
         rows = unclaimed(view.uv_left[shown], landmarks.descriptors[shown], features, rows)
-        there = isin(matches.ids, landmarks.ids)
-        local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
+        in_map = isin(matches.ids, landmarks.ids)
+        local, stereo = view.local[landmarks.rows(matches.ids[in_map])], features.has_stereo[matches.rows[in_map]]
         P = frame_covariance(self.rig, local, stereo, sigma)
         with_depth, depths = depths_by_motion(
             self.rig, step.tracks, features, rows, T, P, step.index, sigma, self.config.max_depth_error
@@ -314,11 +314,11 @@ def redundant_landmarks(landmarks: LandmarkTable, positions: Array, config: MapC
         return out
     reach = config.spacing * np.linalg.norm(positions - landmarks.seen_from, axis=1)
     rank = np.lexsort((-np.arange(len(out)), landmarks.seen)).argsort()  # among equals, the older is better
-    for some in np.split(just, range(_BLOCK, len(just), _BLOCK)):
-        gap = positions[some][:, None] - positions[gone][None]
-        near = np.einsum("ijk,ijk->ij", gap, gap) < np.minimum(reach[some][:, None], reach[gone][None]) ** 2
-        first, second = np.nonzero(near & (some[:, None] != gone[None]))
-        one, other = some[first], gone[second]
+    for block in np.split(just, range(_BLOCK, len(just), _BLOCK)):
+        gap = positions[block][:, None] - positions[gone][None]
+        near = np.einsum("ijk,ijk->ij", gap, gap) < np.minimum(reach[block][:, None], reach[gone][None]) ** 2
+        first, second = np.nonzero(near & (block[:, None] != gone[None]))
+        one, other = block[first], gone[second]
         out[np.where(rank[one] < rank[other], one, other)] = True
     return out
 
@@ -359,15 +359,15 @@ def doubled_landmarks(view: MapView, landmarks: LandmarkTable, config: MapConfig
     """Which landmarks in view (N,) duplicate another one that was seen more often, or as often and is older."""
     out = np.zeros(len(landmarks), bool)
     shown = np.flatnonzero(view.in_image)
-    one, other = _near_landmarks(view.uv_left[shown], view)
-    one = shown[one]
-    less = (landmarks.seen[one] < landmarks.seen[other]) | (
-        (landmarks.seen[one] == landmarks.seen[other]) & (one > other)
+    row, rival = _near_landmarks(view.uv_left[shown], view)
+    row = shown[row]
+    less = (landmarks.seen[row] < landmarks.seen[rival]) | (
+        (landmarks.seen[row] == landmarks.seen[rival]) & (row > rival)
     )
-    one, other = one[less], other[less]
-    same = np.linalg.norm(view.positions[one] - view.positions[other], axis=1) < config.same_distance
-    same &= _alike(landmarks, one, landmarks.descriptors[other], landmarks.laplacian[other], config)
-    out[one[same]] = True
+    row, rival = row[less], rival[less]
+    same = np.linalg.norm(view.positions[row] - view.positions[rival], axis=1) < config.same_distance
+    same &= _alike(landmarks, row, landmarks.descriptors[rival], landmarks.laplacian[rival], config)
+    out[row[same]] = True
     return out
 
 

@@ -135,8 +135,8 @@ def depths_by_motion(
     """
     directions = _rays(rig, features.uv_left[rows]) @ T_world_left[:3, :3].T
     waiting = np.flatnonzero(tracks.waiting_since >= 0)
-    found = _followed(rig, tracks, waiting, features.select(rows), T_world_left)
-    at, seen = waiting[found.tracks], rows[found.features]
+    pairs = _followed(rig, tracks, waiting, features.select(rows), T_world_left)
+    at, seen = waiting[pairs.tracks], rows[pairs.features]
     then = tracks.first_pose[at]
     motion = adjoint(inverse(T_world_left) @ then)
     P = covariance + motion @ tracks.first_covariance[at] @ np.swapaxes(motion, 1, 2)
@@ -145,9 +145,9 @@ def depths_by_motion(
     good = depths.good(depth_error)
     goes_on = ~good & (depths.misfit < _MISFIT)
     tracks.row[at] = seen
-    tracks.look[at], tracks.direction[at] = features.descriptors[seen], directions[found.features]
+    tracks.look[at], tracks.direction[at] = features.descriptors[seen], directions[pairs.features]
     tracks.waiting_since[at[~(good | goes_on)]] = -1
-    new = np.delete(np.arange(len(rows)), found.features[good | goes_on])
+    new = np.delete(np.arange(len(rows)), pairs.features[good | goes_on])
     tracks.wait(frame, features, rows[new], directions[new], T_world_left, covariance)
     tracks.waiting_since[at[good]] = -1
     tracks.waiting_since[tracks.waiting_since <= frame - _KEPT] = -1
@@ -164,6 +164,6 @@ def _followed(
     expected = rig.left.project(tracks.direction[waiting] @ T_world_left[:3, :3])
     # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
     windows, square = Windows((2 * _RADIUS,), (_D_MATCH,), _RATIO), np.zeros((len(expected), 2, 2))
-    found = follow(expected, square, tracks.look[waiting], tracks.laplacian[waiting], features, windows)
-    gap = np.abs(features.uv_left[found.features] - expected[found.tracks])
-    return found.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))
+    pairs = follow(expected, square, tracks.look[waiting], tracks.laplacian[waiting], features, windows)
+    gap = np.abs(features.uv_left[pairs.features] - expected[pairs.tracks])
+    return pairs.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))

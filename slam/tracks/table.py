@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import Table, among
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array
 from slam.naming import count
 
 _ROOM = 1000  # cost: rows that a table begins with
@@ -89,10 +89,6 @@ class LandmarkTable(Table):
         successive = self.returning[rows] + 1
         self.returning[:] = 0
         self.returning[rows] = successive
-
-    def in_world(self, T: Array) -> LandmarkTable:
-        """The same in another world frame; `T` (4, 4) transforms coordinates to it."""
-        return replace(self, seen_from=transform(T, self.seen_from))
 
     def count_frame(
         self,

@@ -121,9 +121,7 @@ def simulate(
     noise = values["sigma"] * rng.standard_normal((len(rows), 3))
     uv_left = seen.uv_left[rows] + noise[:, :2]
     uv_right = np.full_like(uv_left, np.nan)
-    uv_right[matched] = _on_epipolar_line(
-        rig, seen.points[rows[matched]], uv_left[matched], seen.uv_right[rows[matched]], noise[matched]
-    )
+    uv_right[matched] = _on_epipolar_line(rig, uv_left[matched], seen.uv_right[rows[matched]], noise[matched])
     false_stereo = matched & (chance[rows, 2] < values["outliers"] / 2)
     if false_stereo.any():  # somewhere near the left pixel's line
         uv_right[false_stereo, 0] = rng.uniform(0, np.maximum(uv_left[false_stereo, 0], 1.0))
@@ -155,19 +153,18 @@ def simulate(
     return SimulatedFeatures(features, ids, objects, false_stereo)
 
 
-def _on_epipolar_line(rig: StereoRig, points: Array, uv_left: Array, uv_right: Array, noise: Array) -> Array:
+def _on_epipolar_line(rig: StereoRig, uv_left: Array, uv_right: Array, noise: Array) -> Array:
     """Right pixels (M, 2) whose x is the true one and its noise, and whose y lies on the noisy left pixel's line.
 
-    They are the projection of the point that is seen at exactly the noisy uL, vL and uR, found from the true one.
+    They are the projection of the point that is seen at exactly the noisy uL, vL and uR.
     """
     if rig.is_rectified:
         return np.stack([uv_right[:, 0] + noise[:, 2], uv_left[:, 1]], axis=1)
-    target = np.column_stack([uv_left, uv_right[:, 0] + noise[:, 2]])
-    for _ in range(4):
-        z, J = rig.project_stereo(points)
-        points = points + np.linalg.solve(J, (target - z)[:, :, None])[..., 0]
-    row = rig.right.project((points + rig.b) @ rig.R.T)[:, 1]
-    return np.column_stack([target[:, 2], np.where(np.isfinite(row), row, uv_left[:, 1])])
+    found = np.column_stack([uv_right[:, 0] + noise[:, 2], uv_right[:, 1]])
+    for _ in range(6):  # by a lens the depth depends on the row a little
+        row = rig.project(rig.triangulate(uv_left, found))[1][:, 1]
+        found[:, 1] = np.where(np.isfinite(row), row, uv_left[:, 1])
+    return found
 
 
 def _false_pixels(rig: StereoRig, count: int, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -66,17 +66,20 @@ def test_repeated_texture_gives_no_match():
     assert features.has_stereo.mean() < 0.05
 
 
+def grid(period, half, size, shift, noise, seed):
+    """Photograph of lines along and across the rows, shifted to the left [px]."""
+    v, u = np.mgrid[: size[1], : size[0]] * 1.0
+    lines = [np.abs((x / period + 0.5) % 1.0 - 0.5) * period - half for x in (u + shift, v)]
+    fine = 220 - 160 * np.clip(np.minimum(*lines) + 0.5, 0, 1)
+    return photograph(cv2.GaussianBlur(fine.astype(np.float32), (0, 0), 0.7), noise, seed)
+
+
 @pytest.mark.parametrize("noise", [0.5, 2.0])
-@pytest.mark.parametrize("period", [8.4, 13.0, 17.3, 24.8, 36.9])
-@pytest.mark.parametrize("disparity", [12.0, 20.13, 31.2])
+@pytest.mark.parametrize("period", [8.4, 17.3, 36.9])
+@pytest.mark.parametrize("disparity", [12.0, 20.13])
 def test_a_regular_grid_gives_no_match(period, disparity, noise):
     """Most of its wrong places are seen better at whole pixels than the true place between two."""
-    views = []
-    for side, shift in enumerate((0.0, disparity)):
-        v, u = np.mgrid[:240, :320] * 1.0
-        lines = [np.abs((x / period + 0.5) % 1.0 - 0.5) * period - 1.5 for x in (u + shift, v)]
-        fine = 220 - 160 * np.clip(np.minimum(*lines) + 0.5, 0, 1)
-        views.append(photograph(cv2.GaussianBlur(fine.astype(np.float32), (0, 0), 0.7), noise, side))
+    views = [grid(period, 1.5, (320, 240), shift, noise, side) for side, shift in enumerate((0.0, disparity))]
     features = SurfFrontend(RIG, features=200).extract(StereoFrame(0, 0.0, *views))
     assert len(features) > 60
     assert features.has_stereo.mean() < 0.05
@@ -88,12 +91,7 @@ def test_lines_far_apart_give_hardly_a_match(disparity):
 
     By noise alone the best of two equal places is now and then a fifth better than the other.
     """
-    views = []
-    for side, shift in enumerate((0.0, disparity)):
-        v, u = np.mgrid[:240, :640] * 1.0
-        lines = [np.abs((x / 69.3 + 0.5) % 1.0 - 0.5) * 69.3 - 3.5 for x in (u + shift, v)]
-        fine = 220 - 160 * np.clip(np.minimum(*lines) + 0.5, 0, 1)
-        views.append(photograph(cv2.GaussianBlur(fine.astype(np.float32), (0, 0), 0.7), 2.0, side))
+    views = [grid(69.3, 3.5, (640, 240), shift, 2.0, side) for side, shift in enumerate((0.0, disparity))]
     rig = StereoRig.rectified_pair(520.0, 320.0, 120.0, 0.12, 640, 240)
     features = SurfFrontend(rig, features=400).extract(StereoFrame(0, 0.0, *views))
     assert len(features) > 100

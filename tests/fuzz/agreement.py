@@ -95,23 +95,17 @@ class Play:
         roots = 0.02 * self.rng.standard_normal((len(points), 3, 3)) + 0.03 * np.eye(3)
         covariances = roots @ roots.transpose(0, 2, 1) + 1e-4 * np.eye(3)
         noise = np.linalg.cholesky(covariances) @ self.rng.standard_normal((len(points), 3, 1))
-        if local:
-            h = (self.points[points] - self.T[:3, 3]) @ self.T[:3, :3] + noise[..., 0]
-            self.backend.place(ids, h, covariances)
-            self.reference.place(ids, h, covariances)
-        else:
-            positions = self.points[points] + noise[..., 0]
-            self.backend.insert(ids, positions, covariances)
-            self.reference.insert(ids, positions, covariances)
+        at = (self.points[points] - self.T[:3, 3]) @ self.T[:3, :3] if local else self.points[points]
+        for one in (self.backend, self.reference):
+            (one.place if local else one.insert)(ids, at + noise[..., 0], covariances)
         self.of.update(zip(ids.tolist(), points.tolist()))
 
     def remove(self) -> None:
         """Some landmarks leave."""
         ids = self._some(sorted(self.of), max(0, min(4, len(self.of) - 8)))
-        self.backend.remove(ids)
-        self.reference.remove(ids)
-        for i in ids.tolist():
-            del self.of[i]
+        for one in (self.backend, self.reference):
+            one.remove(ids)
+        self.of = {i: point for i, point in self.of.items() if i not in ids}
 
     def count(self) -> None:
         """What the map holds, exactly."""
@@ -173,35 +167,30 @@ def _alike(what: str, change: Array, P: Array, expected: Array, deviations: floa
 
 def agree(rng: np.random.Generator, backend: Any, tolerance: tuple[float, float]) -> None:
     """A sequence of calls, counted after each and compared twice; none of them may be refused."""
-    try:
-        _play(rng, Play(rng, backend), tolerance)
-    except SlamError as error:
-        raise Broken(f"good data are refused: {error}") from error
-
-
-def _play(rng: np.random.Generator, play: Play, tolerance: tuple[float, float]) -> None:
-    play.predict()
-    play.add(least=10)
+    play = Play(rng, backend)
     calls = int(rng.integers(4, 14))
     half = int(rng.integers(2, calls))
-    for number in range(calls):
-        kind = int(rng.integers(12))
-        if kind < 7:
-            play.predict()
-            play.update()
-            play.add()
-        elif kind == 7:
-            play.predict()
-        elif kind == 8:
-            play.add()
-        elif kind == 9:
-            play.remove()
-        else:
-            play.insert(local=kind == 10)
-        play.count()
-        if number == half:
-            play.compare(*tolerance)
-    play.compare(*tolerance)
+    try:
+        play.predict()
+        play.add(least=10)
+        for number in range(calls):
+            kind = int(rng.integers(12))
+            if kind <= 7:
+                play.predict()
+            if kind < 7:
+                play.update()
+            if kind < 7 or kind == 8:
+                play.add()
+            elif kind == 9:
+                play.remove()
+            elif kind > 9:
+                play.insert(local=kind == 10)
+            play.count()
+            if number == half:
+                play.compare(*tolerance)
+        play.compare(*tolerance)
+    except SlamError as error:
+        raise Broken(f"good data are refused: {error}") from error
 
 
 def answers(name: str, rng: np.random.Generator, folder: Path) -> None:

@@ -59,7 +59,7 @@ class Books:
         self.stamp += 1.0 if kind == "late" else 0.05
         features = replace(self.frames[at], stamp=self.stamp)
         share = {"dark": 0.0, "dim": 0.1}.get(kind, 1.0)
-        features = _rows(features, self.rng.random(len(features)) < share)
+        features = features.select(self.rng.random(len(features)) < share)
         if kind == "one-eyed":
             features = replace(features, uv_right=np.full_like(features.uv_right, np.nan))
         if kind == "strange":
@@ -180,12 +180,6 @@ def keep_books(rng: np.random.Generator, folder: Path) -> None:
 
 def _set(ids: object) -> set[int]:
     return set(np.asarray(ids).tolist())
-
-
-def _rows(features: StereoFeatures, rows: np.ndarray) -> StereoFeatures:
-    """Some of the features."""
-    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
-    return replace(features, **{name: getattr(features, name)[rows] for name in names})
 
 
 #: More landmarks of a place than the map has room for; some that no result named; one placed behind the camera.

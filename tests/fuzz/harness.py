@@ -7,15 +7,14 @@ import resource
 import shutil
 import signal
 import tempfile
-import threading
 import time
 import traceback
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,10 +23,10 @@ from slam.errors import SlamError
 from slam.system import StereoSlam
 
 SECONDS = 10.0  # of processor time for any case
-BLOCKED = 30.0  # of wall time, in which a case that does next to nothing waits for something
-_AWAKE = 1e-3  # share of that time that the processor works for a case that does not wait
+BLOCKED = 120.0  # of wall time: a case that takes longer waits for something
 GIGABYTES = 3  # that a case may ask for, besides what the process has
 LONGEST_LINE = 700
+_PARTS = ("/slam/", "/backends/", "/frontends/")
 
 Case = Callable[[np.random.Generator, Path], None]
 
@@ -36,30 +35,25 @@ class Broken(AssertionError):  # noqa: N818 it says what it is
     """A promise that a case found broken."""
 
 
-@dataclass(frozen=True)
-class Subject:
-    """A class of inputs.
-
-    Attributes:
-        name: for the command line.
-        case: makes one of a random generator, in an empty folder, and gives it to the program.
-        quiet: whether Python's warnings count as broken promises.
-        short: number of cases in the tests.
-    """
-
-    name: str
-    case: Case
-    quiet: bool = True
-    short: int = 60
+class TimedOut(BaseException):
+    """Out of time; no handler of errors catches it."""
 
 
-@dataclass(frozen=True)
-class Failure:
-    """A case that failed: its number, and where and how in one line; `detail` is the traceback."""
+class Subject(NamedTuple):
+    """A class of inputs."""
+
+    name: str  # for the command line
+    case: Case  # makes one of a random generator, in an empty folder, and gives it to the program
+    quiet: bool = True  # whether Python's warnings count as broken promises
+    short: int = 60  # number of cases in the tests
+
+
+class Failure(NamedTuple):
+    """A case that failed."""
 
     number: int
-    signature: str
-    detail: str
+    signature: str  # where and how, in one line; the same for the same fault
+    detail: str  # the traceback
 
 
 def run_case(subject: Subject, seed: int, number: int) -> Failure | None:
@@ -77,7 +71,13 @@ def run_case(subject: Subject, seed: int, number: int) -> Failure | None:
         if time.process_time() - started > SECONDS:
             raise Broken(f"took more than {SECONDS:g} s")
     except (Exception, TimedOut) as error:  # noqa: BLE001 every kind is counted
-        return Failure(number, _signature(error), "".join(traceback.format_exception(error)))
+        ours = [
+            f" at {Path(place.filename).parent.name}/{Path(place.filename).name}:{place.name}"
+            for place in traceback.extract_tb(error.__traceback__)
+            if any(part in place.filename for part in _PARTS) and "site-packages" not in place.filename
+        ]
+        signature = f"{type(error).__name__}: {str(error).split(':')[0][:70]}{''.join(ours[-1:])}"
+        return Failure(number, signature, "".join(traceback.format_exception(error)))
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return None
@@ -101,46 +101,25 @@ def require_line(error: SlamError) -> None:
         raise Broken(f"{type(error).__name__} is no line of bounded length: {text[:80]!r}")
 
 
-class TimedOut(BaseException):
-    """Out of time; no handler of errors catches it."""
-
-
 @contextmanager
 def limits() -> Iterator[None]:
     """Stop what takes too long or waits for ever, and refuse memory beyond a bound."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() if _LINUX else 0
+    statm = Path("/proc/self/statm")
     handlers = {n: signal.signal(n, _out_of_time) for n in (signal.SIGALRM, signal.SIGPROF)}
-    if used:
+    if statm.exists():
+        used = int(statm.read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + GIGABYTES * 2**30, hard))
-    # To this very thread: a signal that another thread takes would not end a call that waits.
-    done = threading.Event()
-    clock = threading.Thread(target=_watch, args=(threading.get_ident(), done), daemon=True)
-    clock.start()
     signal.setitimer(signal.ITIMER_PROF, 1.2 * SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, BLOCKED)
     try:
         yield
     finally:
-        done.set()
-        clock.join()
         signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
         for n, handler in handlers.items():
             signal.signal(n, handler)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-_LINUX = Path("/proc/self/statm").exists()
-
-
-def _watch(thread: int, done: threading.Event) -> None:
-    """Interrupt a thread that waits; one that is only slow, as others have the processor, has used some of it."""
-    before = time.process_time()
-    while not done.wait(BLOCKED):
-        now = time.process_time()
-        if now - before < _AWAKE * BLOCKED:
-            signal.pthread_kill(thread, signal.SIGALRM)
-            return
-        before = now
 
 
 def _out_of_time(number: int, frame: object) -> None:
@@ -162,15 +141,3 @@ def nothing_printed() -> Iterator[None]:
         printed = aside.read(200)
     if printed:
         raise Broken(f"printed on standard error: {printed!r}")
-
-
-def _signature(error: BaseException) -> str:
-    """Type and place of an error, the same for the same fault."""
-    where = ""
-    for place in traceback.extract_tb(error.__traceback__):
-        if any(f"/{part}/" in place.filename for part in ("slam", "backends", "frontends")) and "site-packages" not in (
-            place.filename
-        ):
-            where = f" at {Path(place.filename).parent.name}/{Path(place.filename).name}:{place.name}"
-    text = str(error).split(":")[0][:70]
-    return f"{type(error).__name__}: {text}{where}"

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -19,75 +16,31 @@ _STEP = 1e-5  # of the differences [rad, m]
 _ITERATIONS = 20
 
 
-@dataclass(frozen=True)
-class Term:
-    """Something that is known of some poses and landmarks.
-
-    Attributes:
-        poses, points: numbers of those that it is about.
-        residuals: a function of these poses (K, 4, 4) and points (M, 3) that gives numbers of standard deviation one.
-    """
-
-    poses: tuple[int, ...]
-    points: tuple[int, ...]
-    residuals: Callable[[Array, Array], Array]
-
-    def linearised(self, T: Array, X: Array) -> tuple[Array, Array]:
-        """Residuals, and their derivatives by a change of its poses, then of its points."""
-        T, X = T[list(self.poses)], X[list(self.points)]
-        columns = [
-            (self.residuals(*moved(T, X, step)) - self.residuals(*moved(T, X, -step))) / (2 * _STEP)
-            for step in _STEP * np.eye(6 * len(T) + 3 * len(X))
-        ]
-        return self.residuals(T, X), np.array(columns).T
-
-
-@dataclass
 class Reference:
     """Everything that a back end was told, and what is most likely given that. For a rectified rig.
 
-    Attributes:
-        rig, models: as the back end's.
-        stamps: times (F) [s].
-        poses: where the search begins, T_world_left (F).
-        points: the same for the landmarks (N) [m], those that have left the map included.
-        known: number of the landmark of each id in the map.
-        terms: all that is known.
+    Pixels are rows of a pose's number, a landmark's number, and uL, vL, uR; places are rows of a pose's number (-1 for
+    one in the world), a landmark's number, a position (3), and the inverse of the root of its covariance (9).
     """
 
-    rig: StereoRig
-    models: EstimatorModels
-    stamps: list[float] = field(default_factory=list)
-    poses: list[Array] = field(default_factory=list)
-    points: list[Array] = field(default_factory=list)
-    known: dict[int, int] = field(default_factory=dict)
-    terms: list[Term] = field(default_factory=list)
+    def __init__(self, rig: StereoRig, models: EstimatorModels) -> None:
+        self.rig, self.models = rig, models
+        self.stamps: list[float] = []
+        self.poses: list[Array] = []  # where the search begins, T_world_left
+        self.points: list[Array] = []  # the same for the landmarks, those that have left the map included
+        self.known: dict[int, int] = {}  # number of the landmark of each id in the map
+        self.pixels: list[Array] = []
+        self.places: list[Array] = []
 
     def predict(self, stamp: float, near: Array) -> None:
         """A new pose, of constant velocity up to an impulse; the search begins at the pose `near` (4, 4)."""
-        m, k = self.models, len(self.stamps)
         self.stamps.append(stamp)
         self.poses.append(near)
-        if k == 0:
-            start = np.repeat([m.initial_rotation_sigma, m.initial_position_sigma], 3)
-            self.terms.append(Term((0,), (), lambda T, X: difference(m.initial_pose, T[0]) / start))
-            return
-        steps = np.diff(self.stamps[-3:])
-        variance = np.array(m.motion.velocity_variance(float(steps[-1])))
-        if k == 1:
-            variance += np.square([m.initial_velocity_sigma, m.initial_angular_velocity_sigma])
-        sigma = np.repeat(np.sqrt(variance), 3)
-
-        def impulse(T: Array, X: Array) -> Array:
-            velocities = [_velocity(*pair) for pair in zip(T, T[1:], steps)]
-            return (velocities[-1] - (velocities[0] if k > 1 else 0)) / sigma
-
-        self.terms.append(Term(tuple(range(k + 1))[-3:], (), impulse))
 
     def measure(self, seen: Observations) -> None:
         """Landmarks of the map, seen from the newest pose."""
-        for i, z in zip(seen.ids.tolist(), np.column_stack([seen.uv_left, seen.uv_right[:, 0]])):
-            self._know(i, lambda T, X, z=z: ((self._pixels(T[0], X[0]) - z) / self.models.pixel_sigma)[np.isfinite(z)])
+        for i, left, right in zip(seen.ids.tolist(), seen.uv_left, seen.uv_right):
+            self.pixels.append(np.array([len(self.poses) - 1, self.known[i], *left, right[0]]))
 
     def add(self, seen: Observations, near: Array) -> None:
         """New landmarks, seen for the first time; the search begins at `near` (N, 3) [m]."""
@@ -97,15 +50,13 @@ class Reference:
     def insert(self, ids: Array, positions: Array, covariances: Array) -> None:
         """New landmarks whose positions in the world are known."""
         self._join(ids, positions)
-        for i, position, L in zip(ids.tolist(), positions, np.linalg.cholesky(covariances)):
-            self._know(i, lambda T, X, at=position, L=L: np.linalg.solve(L, X[0] - at))
+        self._place(-1, ids, positions, covariances)
 
     def place(self, ids: Array, local: Array, covariances: Array) -> None:
         """New landmarks whose positions before the newest camera are known."""
         T = self.poses[-1]
         self._join(ids, local @ T[:3, :3].T + T[:3, 3])
-        for i, h, L in zip(ids.tolist(), local, np.linalg.cholesky(covariances)):
-            self._know(i, lambda T, X, h=h, L=L: np.linalg.solve(L, (X[0] - T[0, :3, 3]) @ T[0, :3, :3] - h))
+        self._place(len(self.poses) - 1, ids, local, covariances)
 
     def remove(self, ids: Array) -> None:
         """Landmarks leave the map; what they told about the poses stays known."""
@@ -116,57 +67,58 @@ class Reference:
     def solve(self) -> tuple[Array, Array, Array, Array]:
         """The newest pose (4, 4) and its covariance (6, 6), and those of the map's landmarks by ascending id."""
         T, X, J = np.array(self.poses), np.array(self.points).reshape(-1, 3), np.zeros((0, 0))
+        n = 6 * len(T)
         for _ in range(_ITERATIONS):
-            r, J = self._linearised(T, X)
-            change = -np.linalg.lstsq(J, r, rcond=None)[0]
+            steps = _STEP * np.eye(n + X.size)
+            J = np.array([(self._residuals(*moved(T, X, d)) - self._residuals(*moved(T, X, -d))) for d in steps]).T
+            J /= 2 * _STEP
+            change = -np.linalg.lstsq(J, self._residuals(T, X), rcond=None)[0]
             T, X = moved(T, X, change)
             if np.abs(change).max() < 1e-7:
                 break
         self.poses, self.points = list(T), list(X)
         root = np.linalg.inv(np.linalg.qr(J, mode="r"))
         P, rows = root @ root.T, [self.known[i] for i in sorted(self.known)]
-        blocks = [P[np.ix_(s, s)] for s in (list(_columns(len(T), (), (row,))) for row in rows)]
-        last = list(_columns(len(T), (len(T) - 1,), ()))
-        return T[-1], P[np.ix_(last, last)], X[rows], np.array(blocks).reshape(-1, 3, 3)
+        blocks = [P[n + 3 * row : n + 3 * row + 3, n + 3 * row : n + 3 * row + 3] for row in rows]
+        return T[-1], P[n - 6 : n, n - 6 : n], X[rows], np.array(blocks).reshape(-1, 3, 3)
 
     def _join(self, ids: Array, near: Array) -> None:
         self.known.update(zip(ids.tolist(), range(len(self.points), len(self.points) + len(ids))))
         self.points.extend(near)
 
-    def _know(self, i: int, residuals: Callable[[Array, Array], Array]) -> None:
-        """Something about the newest pose and a landmark."""
-        self.terms.append(Term((len(self.stamps) - 1,) if self.stamps else (), (self.known[i],), residuals))
+    def _place(self, pose: int, ids: Array, positions: Array, covariances: Array) -> None:
+        roots = np.linalg.inv(np.linalg.cholesky(covariances))
+        for i, position, root in zip(ids.tolist(), positions, roots):
+            self.places.append(np.array([pose, self.known[i], *position, *root.ravel()]))
 
-    def _pixels(self, T: Array, X: Array) -> Array:
-        """uL, vL and uR of a point (3,)."""
-        x, y, z = (X - T[:3, 3]) @ T[:3, :3]
-        c, b = self.rig.left, float(np.linalg.norm(self.rig.b))
-        return np.array([c.fu * x / z + c.u0, c.fv * y / z + c.v0, c.fu * (x - b) / z + c.u0])
-
-    def _linearised(self, T: Array, X: Array) -> tuple[Array, Array]:
-        """All residuals, and their derivatives by all that is sought."""
-        residuals, rows = [], []
-        for term in self.terms:
-            r, J = term.linearised(T, X)
-            row = np.zeros((len(r), 6 * len(T) + 3 * len(X)))
-            row[:, list(_columns(len(T), term.poses, term.points))] = J
-            residuals.append(r)
-            rows.append(row)
-        return np.concatenate(residuals), np.concatenate(rows)
-
-
-def _columns(frames: int, poses: Iterable[int], points: Iterable[int]) -> Iterable[int]:
-    """Of these poses and points in the derivatives by everything."""
-    for k in poses:
-        yield from range(6 * k, 6 * k + 6)
-    for i in points:
-        yield from range(6 * frames + 3 * i, 6 * frames + 3 * i + 3)
+    def _residuals(self, T: Array, X: Array) -> Array:
+        """Of everything that is known, in numbers of standard deviation one."""
+        m, dt = self.models, np.diff(self.stamps)
+        start = np.repeat([m.initial_rotation_sigma, m.initial_position_sigma], 3)
+        variances = np.array([m.motion.velocity_variance(float(d)) for d in dt]).reshape(-1, 2)
+        variances[:1] += np.square([m.initial_velocity_sigma, m.initial_angular_velocity_sigma])
+        ways = np.concatenate([T[1:, :3, 3] - T[:-1, :3, 3], difference(T[:-1], T[1:])[:, :3]], axis=1)
+        velocities = ways / dt[:, None]  # in the world, and the rate in the body's axes
+        impulses = np.diff(velocities, axis=0, prepend=0) / np.sqrt(variances).repeat(3, axis=1)
+        z = np.array(self.pixels).reshape(-1, 5)
+        x, y, depth = _before(T[z[:, 0].astype(int)], X[z[:, 1].astype(int)]).T
+        c, b = self.rig.left, self.rig.baseline
+        uv = np.stack([c.fu * x / depth + c.u0, c.fv * y / depth + c.v0, c.fu * (x - b) / depth + c.u0], axis=1)
+        off = ((uv - z[:, 2:]) / m.pixel_sigma)[np.isfinite(z[:, 2:])]
+        p = np.array(self.places).reshape(-1, 14)
+        of, at = p[:, :2].astype(int).T
+        local = np.where(of[:, None] < 0, X[at], _before(T[of], X[at])) - p[:, 2:5]
+        placed = np.einsum("nij,nj->ni", p[:, 5:].reshape(-1, 3, 3), local)
+        parts = difference(m.initial_pose, T[0]) / start, impulses, off, placed
+        return np.concatenate([part.ravel() for part in parts])
 
 
 def difference(T: Array, other: Array) -> Array:
-    """By how much a pose differs from another, in its own axes: a turn and a way (6,)."""
-    turn = Rotation.from_matrix(T[:3, :3].T @ other[:3, :3]).as_rotvec()
-    return np.concatenate([turn, T[:3, :3].T @ (other[:3, 3] - T[:3, 3])])
+    """By how much poses (..., 4, 4) differ from others, in their own axes: turns and ways (..., 6)."""
+    back = np.swapaxes(T[..., :3, :3], -1, -2)
+    turns = Rotation.from_matrix(np.reshape(back @ other[..., :3, :3], (-1, 3, 3))).as_rotvec()
+    ways = np.einsum("...ij,...j->...i", back, other[..., :3, 3] - T[..., :3, 3])
+    return np.concatenate([turns.reshape(ways.shape), ways], axis=-1)
 
 
 def moved(T: Array, X: Array, change: Array) -> tuple[Array, Array]:
@@ -177,6 +129,6 @@ def moved(T: Array, X: Array, change: Array) -> tuple[Array, Array]:
     return out, X + change[6 * len(T) :].reshape(-1, 3)
 
 
-def _velocity(T: Array, after: Array, dt: float) -> Array:
-    """Velocity in the world and rate in the body's axes (6,)."""
-    return np.concatenate([after[:3, 3] - T[:3, 3], difference(T, after)[:3]]) / dt
+def _before(T: Array, X: Array) -> Array:
+    """Points (N, 3) in the camera coordinates of a pose each (N, 4, 4)."""
+    return np.einsum("nji,nj->ni", T[:, :3, :3], X - T[:, :3, 3])

@@ -10,14 +10,13 @@ import signal
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from slam.atlas.map_io import load_map
 from slam.config import SystemConfig
-from slam.data import StereoFrame
+from slam.data import StereoFeatures, StereoFrame
 from slam.errors import SequenceError, SlamError
 from slam.files import lock_folder
 from slam.geometry.trajectory import Trajectory
@@ -47,30 +46,18 @@ class Scripted:
     def __len__(self) -> int:
         return FRAMES
 
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Numbered]:
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
         for k in range(FRAMES):
             if self._error is not None and k == self._at:
                 raise self._error
-            yield Numbered.of(k, self.features[k])
-
-
-@dataclass(frozen=True, eq=False)
-class Numbered(StereoFrame):
-    """A frame that holds its features already."""
-
-    features: object = None
-
-    @classmethod
-    def of(cls, index: int, features: object) -> Numbered:
-        """Without an image."""
-        return cls(index, 0.0, np.zeros((0, 0), np.uint8), None, features=features)
+            yield StereoFrame(k, 0.0, np.zeros((0, 0), np.uint8), None)
 
 
 class Features:
-    """Gives the features of a frame."""
+    """Gives the features of a frame by its number."""
 
-    def extract(self, frame: Numbered) -> object:
-        return frame.features
+    def extract(self, frame: StereoFrame) -> StereoFeatures:
+        return scene()[1][frame.index]
 
 
 class Interrupted(BaseException):
@@ -118,15 +105,11 @@ def _obstruct(rng: np.random.Generator, out: Path, record: Path, known: Path) ->
     """Something where a file is to be written."""
     path = choose(rng, (record, known, out, *(out / n for n in ("trajectory.txt", "summary.json", "landmarks.csv"))))
     path.parent.mkdir(exist_ok=True)
-    kind = int(rng.integers(4))
-    if kind == 0:
-        os.mkfifo(path)
-    elif kind == 1:
-        (path / "x").mkdir(parents=True)
-    elif kind == 2:
-        path.symlink_to("/dev/full")
-    else:
-        path.symlink_to("nowhere/at/all")
+    obstacles = (
+        lambda: os.mkfifo(path), lambda: (path / "x").mkdir(parents=True), lambda: path.symlink_to("/dev/full"),
+        lambda: path.symlink_to("nowhere/at/all"),
+    )  # fmt: skip
+    choose(rng, obstacles)()
 
 
 def _kind(path: Path) -> int | None:
@@ -157,26 +140,24 @@ def require_whole(folder: Path, out: Path) -> None:
     if any(p.name.endswith(".part") for p in folder.rglob("*")):
         raise Broken("a temporary file is left")
     readers = {
-        out / "summary.json": _json,
-        out / "config.json": _json,
-        folder / "a.npz": load_recording,
-        folder / "a.map": load_map,
+        "out/summary.json": lambda path: json.loads(path.read_text()),
+        "out/config.json": lambda path: json.loads(path.read_text()),
+        "out/trajectory.txt": Trajectory.read_tum,
+        "out/trajectory_final.txt": Trajectory.read_tum,
+        "out/frames.csv": _require_whole_rows,
+        "a.npz": load_recording,
+        "a.map": load_map,
     }
-    for path, read in readers.items():
-        if path.is_file():
+    for name, read in readers.items():
+        path = out / name.removeprefix("out/") if "/" in name else folder / name
+        if path.is_file() and (path.stat().st_size or path.suffix not in (".txt", ".csv")):
             read(path)
-    for name in ("trajectory.txt", "trajectory_final.txt"):
-        if (out / name).is_file() and (out / name).stat().st_size:
-            Trajectory.read_tum(out / name)
-    frames = out / "frames.csv"
-    if frames.is_file() and frames.stat().st_size:
-        with frames.open(newline="") as file:
-            if any(len(row) != len(FRAME_COLUMNS) for row in csv.reader(file)):
-                raise Broken("a row is there in part")
 
 
-def _json(path: Path) -> object:
-    return json.loads(path.read_text())
+def _require_whole_rows(path: Path) -> None:
+    with path.open(newline="") as file:
+        if any(len(row) != len(FRAME_COLUMNS) for row in csv.reader(file)):
+            raise Broken("a row is there in part")
 
 
 SUBJECTS = (Subject("files of a run", write_run, quiet=False, short=40),)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from slam.errors import SlamError
+from tests.fuzz.__main__ import SUBJECTS
 from tests.fuzz.bookkeeping import MENDED, keep_books
-from tests.fuzz.catalogue import SUBJECTS
 from tests.fuzz.harness import Broken, Subject, run_case, warm_up
 
 

@@ -66,21 +66,9 @@ def test_encrypted_odd_and_many_members(tmp_path, members):
     refused(tmp_path, packed({f"{k}": b"" for k in range(200)}), "200 members")
 
 
-def header(members, **more):
-    return json.dumps(json.loads(str(np.load(io.BytesIO(members["header.npy"])))) | more)
-
-
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        ({"version": 1.5}, "version 1.5"),
-        ({"version": [1]}, "version"),
-        ({"rig": 3}, ": "),
-        ({"kind": "flying"}, "flying"),
-    ],
-)
-def test_values_that_are_none(tmp_path, members, more, words):
-    refused(tmp_path, changed(members, header=header(members, **more)), words)
+def test_values_that_are_none(tmp_path, members):
+    header = json.loads(str(np.load(io.BytesIO(members["header.npy"])))) | {"version": 1.5}
+    refused(tmp_path, changed(members, header=json.dumps(header)), "version 1.5")
     refused(tmp_path, changed(members, stamps=[0.0, 1.0, 2.0, 1e300]), "beyond")
     refused(tmp_path, changed(members, header="[" * 5000), "JSON")
 

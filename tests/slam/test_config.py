@@ -9,10 +9,15 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from backends.ekf.filter import EkfConfig
+from backends.smoother.config import SmootherConfig
+from frontends.surf.config import SurfConfig
+from slam.bodies.config import ObjectsConfig
+from slam.calibration.config import SelfCalibrationConfig
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, one_line
-from slam.tracks.config import MapConfig
-from tests.fuzz.settings import CLASSES
+from slam.models import EstimatorModels, MotionModel, ObjectModels
+from slam.tracks.config import AssociationConfig, MapConfig
 
 
 def test_settings_reach_their_place():
@@ -79,6 +84,11 @@ def test_unknown_kind_and_unknown_key_in_a_file():
     with pytest.raises(ConfigurationError, match=r"map\.colour"):
         SystemConfig.from_json(tree)
 
+
+CLASSES = (
+    SurfConfig, EkfConfig, SmootherConfig, MapConfig, AssociationConfig, SelfCalibrationConfig, ObjectsConfig,
+    EstimatorModels, MotionModel, ObjectModels, SystemConfig,
+)  # fmt: skip
 
 HOSTILE = (None, "x", b"x", [], {}, 1j, 10**23, 10**400, 1e308, -1e308, np.nan, np.inf, -1, (1, 2, 3, 4), object())
 

@@ -15,7 +15,6 @@ from slam.errors import MeasurementError, SequenceError
 from slam.run.recording import load_recording, record, save_recording
 from slam.run.replay import replay
 from slam.system import StereoSlam
-from tests.backends.fixed_map import FixedMapBackend
 
 FRAMES = 12
 
@@ -91,13 +90,6 @@ def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkey
         np.testing.assert_array_equal(again[k].after.parameters, revisions[k].after.parameters)
     assert given[0][1][0, 2] == pytest.approx(180.3, abs=0.02)
     assert len(list(replay(recorded, StereoSlam(desk.rig, None, "ekf").backend))) == FRAMES
-
-
-def test_a_third_party_back_end_can_be_given_a_recording(recording, desk):
-    results = list(replay(recording, FixedMapBackend(recording.rig, recording.models)))
-    truth = desk.ground_truth.poses
-    expected = (np.linalg.inv(truth[0]) @ truth)[:, :3, 3]
-    np.testing.assert_allclose(online(results)[:, :3, 3], expected, atol=0.02)  # a fixed map of 0.7 px
 
 
 def test_a_file_holds_it_all(recording, tmp_path):

@@ -125,7 +125,7 @@ def test_images_in_two_formats_are_taken_once(two_folders: Path) -> None:
     [
         ("timestamp\n", "{s:.6f}", 1.7e9, 0.1),
         ("frame,timestamp\n", "{i},{s:.6f}", 1.7e9, 0.1),
-        ("Time Stamp [s];file\n", "{s:.6f};{i:06d}.png", 1.7e9, 0.1),
+        ("t [s];file\n", "{s:.6f};{i:06d}.png", 1.7e9, 0.1),
         ("", "{ns}", 1.7e9, 0.1),
         ("#id t exposure\n", "{ns} {s:.9f} 1.2", 1.7e9, 0.1),
         ("", "{i} {ns}", 1.7e9, 0.1),
@@ -140,6 +140,19 @@ def test_times_as_other_programs_write_them(two_folders: Path, heading, row, fir
     sequence = open_sequence(two_folders)
     assert np.allclose(sequence.stamps, first + step * np.arange(6), rtol=0, atol=1e-5) and len(sequence) == 6
     assert any("taken as nanoseconds" in line for line in sequence.warnings) == ("ns" in row)
+
+
+@pytest.mark.parametrize("row", ["{n:03d}.png,{t}", "{t} left/{n:03d}.png", "{t}"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_rows_of_times_belong_to_the_images_that_they_name_or_number(two_folders: Path, row: str, first: int) -> None:
+    for side in ("left", "right"):
+        rename(two_folders / side, lambda i: f"{i + first:03d}.png")
+        (two_folders / side / f"{2 + first:03d}.png").unlink()
+    rows = [row.format(n=i + first, t=7 + 0.3 * i) + "\n" for i in range(6)]
+    (two_folders / "times.txt").write_text("".join(rows))
+    sequence = open_sequence(two_folders)
+    assert np.allclose(sequence.stamps, 7 + 0.3 * np.array([0, 1, 3, 4, 5]))
+    assert [left for left, _ in seeds(sequence)] == [0, 1, 3, 4, 5]
 
 
 def test_one_camera_twice_is_refused(two_folders: Path, videos: Path) -> None:
