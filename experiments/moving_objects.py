@@ -37,10 +37,11 @@ from experiments.object_runs import (
 )  # fmt: skip
 from experiments.tables import picture
 from slam.data import FrameResult, StereoFeatures
-from slam.evaluation.objects import ObjectScore, absolute_pose_errors, body_alignment
+from slam.evaluation.metrics import PathErrors, error_sizes
+from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import inverse, rotation_angle
+from slam.geometry.se3 import Array, inverse, rotation_angle, so3_exp, so3_log
 from slam.object_data import MovingObject
 from slam.papers.procedure1 import ObjectDatabase, Procedure1Detector
 
@@ -64,6 +65,21 @@ ONE_FOR_ALL = ("back end", "cyclist", f"frames within {NEAR:.0f} m")  # cells th
 
 
 # ------------------------------------------------------------------------------------------- the parts
+
+
+def body_alignment(estimated: Array, true: Array) -> Array:
+    """The change D (4, 4) of body frame with ``T_true ≈ T_estimated D`` over all rows, in the mean."""
+    D = inverse(estimated) @ true
+    mean = D[0].copy()
+    for _ in range(5):
+        mean[:3, :3] = mean[:3, :3] @ so3_exp(so3_log(mean[:3, :3].T @ D[:, :3, :3]).mean(axis=0))
+    mean[:3, 3] = D[:, :3, 3].mean(axis=0)
+    return mean
+
+
+def absolute_pose_errors(estimated: Array, true: Array) -> PathErrors:
+    """Errors ``(T_estimated D)⁻¹ T_true`` of poses (N, 4, 4) after one change D of body frame for all."""
+    return error_sizes(inverse(estimated @ body_alignment(estimated, true)) @ true)
 
 
 def table1(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:

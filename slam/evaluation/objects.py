@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.metrics import PathErrors, error_sizes
 from slam.geometry.pnp import MINIMAL_POINTS
-from slam.geometry.se3 import Array, inverse, log, so3_exp, so3_log
+from slam.geometry.se3 import Array, inverse, log
 from slam.object_data import MovingObject
 
 _SINGULAR = 1e-9  # numerics: smallest eigenvalue of a matrix of correlations that counts
@@ -38,21 +38,6 @@ def _summed(errors: PathErrors) -> dict[str, float]:
             figures[f"{name} median [{unit}]"] = float(np.median(values))
             figures[f"{name} RMSE [{unit}]"] = float(np.sqrt(np.mean(values**2)))
     return figures
-
-
-def body_alignment(estimated: Array, true: Array) -> Array:
-    """The change D (4, 4) of body frame with ``T_true ≈ T_estimated D`` over all rows, in the mean."""
-    D = inverse(estimated) @ true
-    mean = D[0].copy()
-    for _ in range(5):
-        mean[:3, :3] = mean[:3, :3] @ so3_exp(so3_log(mean[:3, :3].T @ D[:, :3, :3]).mean(axis=0))
-    mean[:3, 3] = D[:, :3, 3].mean(axis=0)
-    return mean
-
-
-def absolute_pose_errors(estimated: Array, true: Array) -> PathErrors:
-    """Errors ``(T_estimated D)⁻¹ T_true`` of poses (N, 4, 4) after one change D of body frame for all."""
-    return error_sizes(inverse(estimated @ body_alignment(estimated, true)) @ true)
 
 
 def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
