@@ -11,15 +11,15 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 from tests import recordings
+from tests.fuzz.files import Files, mutate
 from tests.fuzz.harness import Subject
-from tests.fuzz.hostile import broken_bytes, choose
+from tests.fuzz.hostile import choose
 from tests.fuzz.readers import consume
+from tests.fuzz.readers import write as write_files
 
 _FRAMES, _START, _STEP = 5, 1_700_000_000_000_000_000, 50_000_000
 _IMAGE, _INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 KINDS = ("bag", "lz4", "mcap", "packed mcap", "message mcap", "db3", "packed db3", "message db3")
-
-Files = dict[str, bytes]
 
 
 @cache
@@ -72,40 +72,12 @@ def _messages(store, first: bool):
             yield stamp, f"/{side}/image_rect", types[_IMAGE](header, height, width, "mono8", 0, width, pixels)
 
 
-def wrong_numbers(rng: np.random.Generator, data: bytes) -> bytes:
-    """Data with other numbers in some places, as in an index: lengths, offsets, counts and times."""
-    out = bytearray(data)
-    for _ in range(int(rng.integers(1, 4))):
-        size = int(choose(rng, (1, 4, 8)))
-        if len(out) > size:
-            # Beginnings and ends hold the index; what is between is mostly pixels.
-            reach = min(len(out) - size, 2000)
-            places = rng.integers(reach), len(out) - size - rng.integers(reach), rng.integers(len(out) - size)
-            at = int(choose(rng, places))
-            value = choose(rng, (b"\0" * size, b"\xff" * size, b"\x7f" * size, rng.bytes(size)))
-            out[at : at + size] = value
-    return bytes(out)
-
-
 def read_bag(rng: np.random.Generator, folder: Path) -> None:
     """Write a damaged recording and read it to its end."""
     files = dict(_written(choose(rng, KINDS)))
-    name = choose(rng, sorted(files))
-    kind = int(rng.integers(8))
-    if kind == 0:
-        del files[name]
-    elif kind == 1:
-        files[name] = choose(rng, sorted(_written(choose(rng, KINDS)).values()))
-    elif kind == 2:
-        files[name] = files[name][: int(rng.integers(len(files[name])))]
-    elif kind < 6:
-        files[name] = wrong_numbers(rng, files[name])
-    else:
-        files[name] = broken_bytes(rng, files[name])
-    for path, data in files.items():
-        (folder / path).parent.mkdir(exist_ok=True)
-        (folder / path).write_bytes(data)
     whole = folder / ("walk.bag" if "walk.bag" in files else "walk")
+    mutate(rng, files)
+    write_files(files, folder)
     alone = sorted(path for path in whole.glob("*") if path.suffix != ".yaml") or [whole]
     consume(str(whole if rng.random() < 0.6 else alone[0]))
 
