@@ -125,7 +125,7 @@ def by_features(name: str, count: int, frames: int) -> Point:
     """Whole frames over SURF alone."""
     sequence = open_sequence(f"synthetic:desk?frames={frames}")
     config = SystemConfig.for_kind(sequence.kind).with_settings([f"frontend.features={count}"])
-    system, whole, surf = StereoSlam(sequence.rig, backend=name, kind=sequence.kind, config=config), [], []
+    system, whole, surf = StereoSlam(sequence.rig, backend=name, config=config), [], []
     for frame in sequence:
         start = time.process_time()
         features = system.frontend.extract(frame)  # type: ignore[union-attr]
@@ -141,7 +141,7 @@ def by_objects(name: str, cars: int, frames: int) -> Point:
     features, found = [sequence.observations(k) for k in range(frames)], []  # type: ignore[attr-defined]
     for mode in ("detect", "off"):
         config = SystemConfig.for_kind(sequence.kind, None).with_settings([f"objects.mode={mode}"])
-        system = StereoSlam(sequence.rig, None, name, kind=sequence.kind, config=config)
+        system = StereoSlam(sequence.rig, None, name, config=config)
         found.append(float(np.median(timed(system.process_features, features)[1][frames // 3 :])))
     return Point(OBJECTS, name, cars, *found)
 

@@ -53,8 +53,8 @@ class StereoSlam:
             given directly to `process_features`.
         backend: a name (see ``backends.names()``) or an object with `Backend`'s methods, which must have been made with
             ``rig.rectified.rig``: it is given pixels of the rectified pair, and its poses are of that left camera.
-        kind: kind of motion, ``"handheld"`` or ``"driving"``, which chooses the default settings.
-        config: all settings; overrides `kind`.
+        kind: kind of motion, ``"handheld"`` or ``"driving"``, which chooses the default settings; None for handheld.
+        config: all settings, in place of `kind`, see `SystemConfig.for_kind`.
         prior_map: a map to start in (see `slam.load_map`). World coordinates are then the map's. Frames have the status
             LOST until the camera is found in it. The back end must be given by name.
         rig_prior: errors of the rig as estimated from earlier recordings (see `slam.load_calibration`). They are
@@ -68,7 +68,7 @@ class StereoSlam:
     Raises:
         CalibrationError: `rig_prior` is of another rig.
         UnknownNameError: no front end or back end of this name.
-        ConfigurationError: a setting is unknown or out of range.
+        ConfigurationError: a setting is unknown or out of range, or `kind` and `config` are both given.
         SlamError: the map is of another front end.
 
     Examples:
@@ -85,7 +85,7 @@ class StereoSlam:
         frontend: str | Frontend | None = "surf",
         backend: str | Backend = "ekf",
         *,
-        kind: str = "handheld",
+        kind: str | None = None,
         config: SystemConfig | None = None,
         prior_map: SavedMap | None = None,
         rig_prior: SavedCalibration | None = None,
@@ -96,7 +96,11 @@ class StereoSlam:
                 raise ConfigurationError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
-        c = config or SystemConfig.for_kind(kind, names[0])
+        if config is not None and kind is not None:
+            raise ConfigurationError(
+                "kind does not go with config: settings of a kind of motion are already in it (SystemConfig.for_kind)"
+            )
+        c = config or SystemConfig.for_kind(kind or "handheld", names[0])
         if prior_map is not None and len(prior_map) > c.map.max_landmarks:  # all of it is kept
             c = replace(c, map=replace(c.map, max_landmarks=len(prior_map)))
         self.config = c

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Annotated, Any, TypeAlias
 
 import typer
@@ -138,7 +139,7 @@ def run_command(
 ) -> None:
     """Run one sequence through one back end."""
     from slam.commands.display import progress
-    from slam.commands.run import finish, frame_count, prepare, run_folder, title, watches
+    from slam.commands.run import finish, frame_count, prepare, run_folder, title
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
@@ -168,12 +169,16 @@ def run_command(
         tell = stack.enter_context(progress(*shown_as))
         if options.config.objects.mode != "off":
             compile_kernels(options.backend, options.frontend)
-        seen = watches(stack, opened, viewer, draw, draw_map)
+        watches = []
+        if viewer is not None:
+            watches.append(stack.enter_context(viewing.Viewer(viewer, opened.rig, opened.ground_truth)).show)
+        if draw is not None:
+            watches.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
         end_of_frame = stack.enter_context(whole_frames(tell, folder, until))
-        summary = run(opened, options, end_of_frame, watches=seen, until=until, record=gathered)
+        summary = run(opened, options, end_of_frame, watches=watches, until=until, record=gathered)
     finish(summary, written, picture, quiet)
 
 
@@ -228,9 +233,9 @@ def settings_command(
     section: Annotated[str | None, argument("A section, a setting, or a front end or back end.", "SECTION")] = None,
 ) -> None:
     """List all settings with default per kind of motion, unit and meaning."""
-    from slam.commands.settings import print_settings
+    from slam.run.settings_reference import listing
 
-    print_settings(section)
+    print("\n".join(listing(section, min(get_terminal_size().columns, 100))))
 
 
 @app.command("compare", short_help="Compare back ends on the same recordings.")

@@ -18,6 +18,7 @@ from slam.run.outputs import NAMES
 from slam.run.plots import PICTURE, plot
 from slam.run.run_data import RunData
 from slam.run.runner import run
+from slam.run.summary import RunRecord
 from slam.run.warm_up import compile_kernels
 from slam.sequences import open_sequence
 
@@ -51,6 +52,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
         )
     for backend in ONLINE:
         config = SystemConfig.for_kind(sequence.kind)
+        record = RunRecord()  # its time of compiling begins here
         with progress(len(sequence), f"aisle · {backend}", quiet) as tell:
             compile_kernels(ONLINE[-1])
 
@@ -58,7 +60,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
                 tell(result)
                 shown[any(thing.estimate.measured for thing in result.objects)] = result
 
-            summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
+            summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen, record=record))
     plot([RunData.read(out / backend, backend) for backend in ONLINE], out / PICTURE)
     last = shown.get(True, shown.get(False))
     if last is not None:

@@ -80,9 +80,9 @@ def print_conclusions(every: Sequence[Group], caution: str) -> None:
             _say(text)
         table = _table("", group.runs)
         for label, (first, *others) in (wording.row(group, metric) for metric in group.metrics if metric.main):
-            used |= {cell.verdict for cell in others if cell.direction}
-            cells = [f"{cell.mean} [{_COLOURS[cell.direction]}]{cell.badge}[/]" for cell in others]
-            table.add_row(escape(label), first.mean, *cells)
+            used |= {cell["verdict"] for cell in others if cell["direction"]}
+            cells = [f"{cell['mean']} [{_COLOURS[cell['direction']]}]{cell['badge']}[/]" for cell in others]
+            table.add_row(escape(label), first["mean"], *cells)
         _console.print(table, highlight=False)
         for text in wording.honesty(group):
             _say(text)

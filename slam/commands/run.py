@@ -7,7 +7,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -19,14 +19,11 @@ from slam.commands.display import print_summary
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
-from slam.run.drawing import FramePictures
 from slam.run.options import RunOptions, parse_frames
 from slam.run.outcome import nothing_tracked
 from slam.run.plots import leave_picture
 from slam.run.recording import Recording
 from slam.run.repeat import changed_versions, load, versions
-from slam.run.runner import Watch
-from slam.run.viewer import Viewer
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live, open_sequence
 from slam.settings import require_settable
@@ -86,18 +83,6 @@ def prepare(
         before, backend=backend, frontend=frontend, config=chosen, start=start, stop=stop, mono=mono, format=format,
         kind=kind, command=command_line(),
     )  # fmt: skip
-
-
-def watches(
-    stack: ExitStack, opened: StereoSequence, viewer: str | None, draw: Path | None, draw_map: bool
-) -> list[Watch]:
-    """What is shown of every frame: the viewer, and pictures in a folder or a video; the stack closes them."""
-    found: list[Watch] = []
-    if viewer is not None:
-        found.append(stack.enter_context(Viewer(viewer, opened.rig, opened.ground_truth)).show)
-    if draw is not None:
-        found.append(stack.enter_context(FramePictures(draw, draw_map)).show)
-    return found
 
 
 def title(sequence: StereoSequence | Recording, backend: str) -> str:

@@ -98,22 +98,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Trial:
-    """One run.
+    """One run."""
 
-    Attributes:
-        sequence: as the plan has it.
-        variant: front end and settings.
-        backend: name.
-        seed: of the recording of a synthetic world; 0 for recorded sequences.
-        mode: `CLOSED_LOOP` or `REPLAY`.
-        start, stop: range of frames.
-    """
-
-    sequence: str
+    sequence: str  # as the plan has it
     variant: Variant
     backend: str
-    seed: int
-    mode: str
+    seed: int  # of the recording of a synthetic world; 0 for recorded sequences
+    mode: str  # `CLOSED_LOOP` or `REPLAY`
     start: int = 0
     stop: int | None = None
 

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+import io
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slam.compare import figures, wording
-from slam.compare.plan import Plan
+from slam.compare import wording
+from slam.compare.plan import Plan, is_world
 from slam.compare.statistics import FEWEST, LEVEL, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import Group, count_tests, most_tests
 from slam.files import read_object, write_text
+from slam.run.plots import backend_colours, drawn
+from slam.run.results import BY_KEY
+from slam.run.run_data import RunData
 from slam.run.schema import STAGE_NAMES
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 TEMPLATES = Path(__file__).parent / "templates"
+
+_MOST_TICKS = 15
+_SHORT = 20  # letters of names that stand side by side
+_WIDTH = 5.2  # [in] about that of a phone: text stays readable where the picture fills the screen
 
 
 def write_report(
@@ -33,6 +44,7 @@ def write_report(
     timed = {stage for run in runs for stage in run.milliseconds}
     stages = {"total": "whole frame"} | {stage: name for stage, name in STAGE_NAMES.items() if stage in timed}
     environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
+    modes = [every[at : at + len(plan.modes)] for at in range(0, len(every), len(plan.modes))]  # of a section
     text = environment.get_template("report.html.j2").render(
         title=f"{' against '.join(plan.backends)}: a paired comparison",
         plan=plan,
@@ -44,7 +56,7 @@ def write_report(
         strengths={verdict.value: wording.STRENGTH[verdict] for verdict in (Verdict.CERTAIN, Verdict.LIKELY)},
         fewest=FEWEST,
         level=round(100 * LEVEL),
-        sections=[_section(plan, every[at : at + len(plan.modes)]) for at in range(0, len(every), len(plan.modes))],
+        sections=[(own, list(_pictures(own[0]))) for own in modes],
         workers=workers,
         stages=stages.values(),
         times=[_times(group, backend, stages) for group in every for backend in group.runs],
@@ -55,24 +67,64 @@ def write_report(
     return out / "report.html"
 
 
-def _section(plan: Plan, modes: Sequence[Group]) -> dict[str, Any]:
-    """A sequence and variant: its groups, whose tables are shown, and the pictures of the closed loop."""
-    first = modes[0]
-    pictures = [
-        {"title": title, "caption": caption, "source": base64.b64encode(svg.encode()).decode()}
-        for title, caption, svg in figures.pictures(first)
-    ]
-    return {
-        "title": first.sequence + ("" if len(plan.variants) == 1 else f" · {first.variant.name}"),
-        "modes": modes,
-        "pictures": pictures,
-        "given": wording.measurements(first.mode, plan.backends[0]),
-    }
-
-
 def _times(group: Group, backend: str, stages: dict[str, str]) -> tuple[str, ...]:
     """A row of medians."""
     own = group.runs[backend]
     values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in stages)
     cells = (f"{np.median(each):.2f}" if each else "–" for each in values)
     return (group.sequence, group.variant.name, group.mode, backend, *cells)
+
+
+def _pictures(group: Group) -> Iterator[tuple[str, str, str]]:
+    """Title, caption and SVG of a group's pictures, as far as there is truth; none where every run failed.
+
+    Shown is the first trial that every back end completed; else the first completed of each.
+    """
+    together = (runs for runs in zip(*group.runs.values()) if all(run.completed for run in runs))
+    firsts = [next((run for run in runs if run.completed), None) for runs in group.runs.values()]
+    shown = next(together, [run for run in firsts if run is not None])
+    if not shown:
+        return
+    trial, known = shown[0].trial, {metric.key for metric in group.metrics}
+    runs = [RunData.read(run.folder, run.trial.backend) for run in shown]
+    of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
+    if "ate_online_m" in known and group.trials > 1:
+        label = BY_KEY["ate_online_m"].label
+        yield label, f"{label}, of every trial; lines join runs on the same recording.", _svg(_pairs(group))
+    yield "Paths from above", f"Paths from above{of_seed}.", _svg(drawn(runs, "path"))
+    if "nees_per_dof" in known:
+        text = f"Error of the pose{of_seed} (solid), and the σ that each back end claims (dashed)."
+        yield "Error over time", text, _svg(drawn(runs, "errors"))
+
+
+def _pairs(group: Group) -> Figure:
+    """Each trial's errors, those of the back ends side by side and joined: whether differences are of one sign."""
+    from matplotlib.figure import Figure
+
+    metric = BY_KEY["ate_online_m"]
+    figure = Figure((_WIDTH, 2.6), layout="constrained")
+    axis = figure.subplots()
+    values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
+    backends, trials = values.shape
+    x = np.arange(trials) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
+    axis.plot(x, values, color="0.7", lw=1, zorder=1)
+    for at, value, name, colour in zip(x, values, group.runs, backend_colours(list(group.runs))):
+        axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
+    axis.set(xlim=(-0.5, trials - 0.5), xticks=range(0, trials, -(-trials // _MOST_TICKS)))
+    axis.set(xlabel="seed", ylabel=metric.title)
+    axis.spines[["top", "right"]].set_visible(False)
+    low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
+    axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
+    above = {"loc": "lower left", "bbox_to_anchor": (0, 1.0)}  # where it hides nothing
+    axis.legend(frameon=False, fontsize=8, ncols=3 if max(map(len, group.runs)) < _SHORT else 2, **above)
+    return figure
+
+
+def _svg(figure: Figure) -> str:
+    """A picture as SVG, the same for the same data, as text for a link."""
+    from matplotlib import rc_context
+
+    text = io.BytesIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "slam"}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    return base64.b64encode(text.getvalue()).decode()

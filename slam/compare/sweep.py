@@ -43,21 +43,13 @@ _Job = tuple[Trial, Path, Path | None]  # arguments of `run_trial`
 
 @dataclass(frozen=True)
 class Run:
-    """A trial that has ended.
-
-    Attributes:
-        trial: what was run.
-        outcome: ``"completed"``, or ``"failed: …"`` with the reason.
-        metrics: figures by key of `slam.run.results.METRICS`; none where it failed.
-        milliseconds: median per stage.
-        folder: its files.
-    """
+    """A trial that has ended."""
 
     trial: Trial
-    outcome: str
-    metrics: dict[str, float]
-    milliseconds: dict[str, float]
-    folder: Path
+    outcome: str  # ``"completed"``, or ``"failed: …"`` with the reason
+    metrics: dict[str, float]  # figures by key of `slam.run.results.METRICS`; none where it failed
+    milliseconds: dict[str, float]  # median per stage
+    folder: Path  # its files
 
     @property
     def completed(self) -> bool:
@@ -143,8 +135,7 @@ def _run_in_pool(jobs: deque[_Job], workers: int, told: Callable[[Trial], None])
 def run_alone(trial: Trial, folder: Path, recording: Path | None = None) -> None:
     """`run_trial` in a process of its own; where that dies, the trial is kept as failed.
 
-    Raises:
-        SlamError: no process can be started.
+    Raises SlamError where no process can be started.
     """
     with _processes(1) as pool:
         try:
@@ -174,7 +165,10 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _begin_worker() -> None:
-    """Leave interrupts to the parent, and end when it is gone, however it went."""
+    """Leave interrupts to the parent, end when it is gone, however it went, and do not compete with the others."""
+    import cv2
+
+    cv2.setNumThreads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
@@ -189,16 +183,7 @@ def _begin_worker() -> None:
 def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
     """Try every sequence, front end, back end and setting once, and whether the files can be written.
 
-    Args:
-        plan: what to run.
-        out: folder.
-        overwrite: whether files that are there may be replaced.
-
-    Returns:
-        number of frames of a run, by sequence.
-
-    Raises:
-        SlamError: something cannot work.
+    Returns the number of frames of a run, by sequence. Raises SlamError where something cannot work.
     """
     frames: dict[str, int] = {}
     with noting_inputs() as inputs:
@@ -228,11 +213,7 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
 
 
 def read_run(trial: Trial, out: Path) -> Run:
-    """A trial's outcome from its folder.
-
-    Raises:
-        SlamError: it is not there, or cannot be read.
-    """
+    """A trial's outcome from its folder; raises SlamError where it is not there, or cannot be read."""
     folder = out / RUNS / trial.folder
     result = read_object(folder / RESULT)
     if not isinstance(result.get("outcome"), str):

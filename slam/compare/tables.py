@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -15,7 +15,7 @@ from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
 from slam.run.outputs import csv_rows
-from slam.run.results import BY_KEY, COMPLETED, METRICS, Metric
+from slam.run.results import COMPARED, COMPLETED, Metric
 
 DIFFERENCE_COLUMNS = (
     "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
@@ -49,7 +49,7 @@ class Group:
     def metrics(self) -> list[Metric]:
         """Share of the runs completed, then the figures that at least one run has."""
         keys = {key for runs in self.runs.values() for run in runs for key in run.metrics}
-        return [COMPLETED, *(metric for metric in METRICS if metric.key in keys)]
+        return [COMPLETED, *(metric for metric in COMPARED if metric.key in keys)]
 
     def values(self, backend: str, key: str) -> Array:
         """A figure by trial (N,), NaN where the run failed or has none."""
@@ -92,31 +92,24 @@ def count_tests(every: Sequence[Group]) -> int:
 
 def most_tests(plan: Plan) -> int:
     """Tests of a plan if all figures that have a better are known, and vary: its trials should be enough for them."""
-    figures = sum(bool(metric.better) for metric in (COMPLETED, *METRICS))
+    figures = sum(bool(metric.better) for metric in (COMPLETED, *COMPARED))
     return len(plan.sequences) * len(plan.variants) * len(plan.modes) * (len(plan.backends) - 1) * figures
 
 
 def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None:
     """Write runs.csv and differences.csv; times, in which no two runs agree, are in each run's ``summary.json``."""
-    differences = [row for group in every for row in _difference_rows(group)]
-    write_text(out / "runs.csv", csv_rows([(*RUN_COLUMNS, *BY_KEY), *map(_row, runs)]))
-    write_text(out / "differences.csv", csv_rows([DIFFERENCE_COLUMNS, *differences]))
-
-
-def _row(run: Run) -> tuple[object, ...]:
-    """Cells of `RUN_COLUMNS`, and figures by their keys."""
-    t = run.trial
-    head = t.sequence, t.variant.name, t.variant.frontend, t.mode, t.seed, t.backend, run.outcome
-    return *head, *(_number(run.metrics.get(key, np.nan)) for key in BY_KEY)
-
-
-def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:
-    first = next(iter(group.runs))
-    for metric in group.metrics:
+    lines: list[tuple[object, ...]] = [(*RUN_COLUMNS, *(metric.key for metric in COMPARED))]
+    for run in runs:
+        t, values = run.trial, (_number(run.metrics.get(metric.key, np.nan)) for metric in COMPARED)
+        lines.append((t.sequence, t.variant.name, t.variant.frontend, t.mode, t.seed, t.backend, run.outcome, *values))
+    write_text(out / "runs.csv", csv_rows(lines))
+    lines = [DIFFERENCE_COLUMNS]
+    for group, metric in ((one, metric) for one in every for metric in one.metrics):
         for other, d in group.differences(metric).items():
-            head = (group.sequence, group.variant.name, group.mode, metric.key, first, other, d.pairs, d.missing)
-            figures = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p, d.p_holm))
-            yield (*head, *figures, d.lower, d.higher, d.verdict.value)
+            head = group.sequence, group.variant.name, group.mode, metric.key, next(iter(group.runs)), other
+            numbers = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p, d.p_holm))
+            lines.append((*head, d.pairs, d.missing, *numbers, d.lower, d.higher, d.verdict.value))
+    write_text(out / "differences.csv", csv_rows(lines))
 
 
 def mean_and_sd(values: Array) -> tuple[float, float]:

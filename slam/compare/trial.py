@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from slam.files import read_text, remove_file
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.geometry.stamps import frame_range, pair
 from slam.geometry.trajectory import Trajectory
-from slam.interfaces import Frontend
 from slam.run.options import RunOptions
 from slam.run.outputs import naming_folder, write_json
 from slam.run.recording import load_recording
@@ -47,7 +45,7 @@ _SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
 
 
 def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None:
-    """Run a trial on one thread; its files are left in `folder`, `RESULT` last: what is there then is whole.
+    """Run a trial; its files are left in `folder`, `RESULT` last: what is there then is whole.
 
     Bad input, failures of the estimator and defects of a program are an outcome, kept with the frames done so far.
 
@@ -57,11 +55,10 @@ def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None
         recording: for a replay, the measurements of the run that is replayed; a closed loop leaves them as `RECORDING`.
     """
     remove_file(folder / RESULT)
-    with one_thread():
-        try:
-            keep_result(trial, folder, COMPLETED, *_run(trial, recording, folder))
-        except Exception as error:  # noqa: BLE001 (not every exception gets from a worker to the parent)
-            keep_result(trial, folder, error)
+    try:
+        keep_result(trial, folder, COMPLETED, *_run(trial, recording, folder))
+    except Exception as error:  # noqa: BLE001 (not every exception gets from a worker to the parent)
+        keep_result(trial, folder, error)
 
 
 def keep_result(
@@ -90,48 +87,29 @@ def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
     return SystemConfig.for_kind(sequence.kind, name).with_settings(settings)
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One thread for linear algebra and images: trials in parallel must not compete, and sums keep their order."""
-    import cv2
-    from threadpoolctl import threadpool_limits
+class _Simulated:
+    """A world's recording without images, and the front end that takes features straight from the world's landmarks.
 
-    before = cv2.getNumThreads()
-    with ExitStack() as stack:
-        stack.enter_context(threadpool_limits(1))
-        cv2.setNumThreads(1)
-        stack.callback(cv2.setNumThreads, before)
-        yield
+    They have the world's noise, misses and outliers. All else is that of the recording.
+    """
 
+    def __init__(self, world: WorldSequence) -> None:
+        self._world = world
 
-@dataclass(frozen=True)
-class SimulatedFrontend:
-    """A `Frontend` that takes features straight from a world's landmarks, with its noise, misses and outliers."""
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._world, name)
 
-    world: WorldSequence
+    def __len__(self) -> int:
+        return len(self._world)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
+        """Numbers and stamps of frames; their images are one black pixel."""
+        for k in range(*frame_range(start, stop, len(self))):
+            yield StereoFrame(k, float(self._world.stamps[k]), np.zeros((1, 1), np.uint8), None)
 
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         """Features of the frame of this number; its images are not looked at."""
-        return self.world.observations(frame.index)
-
-
-class WithoutImages:
-    """A world's recording whose frames have images of one black pixel; all else is that of the recording."""
-
-    def __init__(self, recording: WorldSequence) -> None:
-        self._recording = recording
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._recording, name)
-
-    def __len__(self) -> int:
-        return len(self._recording)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
-        """Numbers and stamps of frames."""
-        nothing = np.zeros((1, 1), np.uint8)
-        for k in range(*frame_range(start, stop, len(self))):
-            yield StereoFrame(k, float(self._recording.stamps[k]), nothing, None)
+        return self._world.observations(frame.index)
 
 
 def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, float], dict[str, float]]:
@@ -149,13 +127,9 @@ def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, flo
     if recording is not None:
         summary = run_recording(load_recording(recording), RunOptions(*names), collected.add, record)
     else:
-        frontend: Frontend | None = None
-        shown: Any = sequence
-        if trial.variant.frontend == SIMULATED:
-            assert isinstance(sequence, WorldSequence)  # `Plan` takes nothing else
-            frontend, shown = SimulatedFrontend(sequence), WithoutImages(sequence)
+        simulated = _Simulated(sequence) if trial.variant.frontend == SIMULATED else None  # type: ignore[arg-type]
         options = RunOptions(*names, trial.start, trial.stop, out / RECORDING)
-        summary = run(shown, options, collected.add, frontend, record=record)
+        summary = run(sequence if simulated is None else simulated, options, collected.add, simulated, record=record)
     if not summary["frames"]:
         raise SlamError("the run has no frame")
     metrics = figures(summary) | collected.figures(record, out)

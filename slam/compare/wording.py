@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,48 +22,39 @@ STRENGTH = {
 _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One back end in one figure, in words: the mean over its trials, and how it lies against the reference."""
+def row(group: Group, metric: Metric) -> tuple[str, list[dict[str, Any]]]:
+    """A row of a group's table: its label, and a cell for each back end, the reference first.
 
-    mean: str
-    sd: str
-    failed: int  # runs, where the figure counts them
-    verdict: str = ""  # how sure; this and what follows is empty for the reference
-    direction: str = ""  # "better", "worse"; empty where neither
-    difference: str = ""
-    interval: str = ""
-    p: str = ""
-    p_holm: str = ""
-
-    @property
-    def badge(self) -> str:
-        """Direction and strength in two words."""
-        return f"{self.direction}: {self.verdict}" if self.direction else self.verdict
-
-
-def row(group: Group, metric: Metric) -> tuple[str, list[Cell]]:
-    """A row of a group's table: its label, and a cell for each back end, the reference first."""
-    against = group.differences(metric)
-    label = metric.label if metric is COMPLETED else metric.title
-    return label, [Cell(*_mean(group, backend, metric), *_verdict(against.get(backend))) for backend in group.runs]
+    A cell has texts: ``mean`` and ``sd`` of its trials; ``verdict``, ``direction`` and ``badge``, how it lies against
+    the reference and how sure that is; ``difference``, ``interval``, ``p`` and ``p_holm``. ``failed`` counts runs.
+    """
+    cells: list[dict[str, Any]] = []
+    for backend in group.runs:
+        d = group.differences(metric).get(backend)
+        if metric is COMPLETED:
+            failed = group.failures(backend)
+            cell = {"mean": f"{group.trials - failed} of {group.trials}", "sd": "", "failed": failed}
+        else:
+            mean, sd = (metric.scale * value for value in mean_and_sd(group.finite(backend, metric.key)))
+            known = np.isfinite(mean + sd)
+            cell = {"mean": shown(mean), "sd": f"± {shown(sd, mean)}" if known else "", "failed": 0}
+        cells.append(cell | ({"badge": "", "direction": ""} if d is None else _against(d)))
+    return metric.label if metric is COMPLETED else metric.title, cells
 
 
-def _mean(group: Group, backend: str, metric: Metric) -> tuple[str, str, int]:
-    if metric is COMPLETED:
-        failed = group.failures(backend)
-        return f"{group.trials - failed} of {group.trials}", "", failed
-    mean, sd = (metric.scale * value for value in mean_and_sd(group.finite(backend, metric.key)))
-    return shown(mean), f"± {shown(sd, mean)}" if np.isfinite(mean + sd) else "", 0
-
-
-def _verdict(d: Difference | None) -> tuple[str, ...]:
-    if d is None:
-        return ()
+def _against(d: Difference) -> dict[str, Any]:
+    """How a back end lies against the reference, in words."""
     direction = "" if d.better is None or d.verdict not in STRENGTH else "better" if d.better else "worse"
+    word = d.verdict.value
+    if direction and _is_trifle(d):
+        word, direction = "less than 1 %", ""
+    badge = f"{direction}: {word}" if direction else word
     p, p_holm = (shown_p(p) if d.varies else "–" for p in (d.p, d.p_holm))
-    said = ("less than 1 %", "") if direction and _is_trifle(d) else (d.verdict.value, direction)
-    return *said, *_difference(d), p, p_holm
+    difference, interval = _difference(d)
+    return {
+        "verdict": word, "direction": direction, "badge": badge, "difference": difference, "interval": interval,
+        "p": p, "p_holm": p_holm,
+    }  # fmt: skip
 
 
 def sentences(group: Group) -> list[str]:

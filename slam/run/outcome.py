@@ -16,7 +16,7 @@ from slam.models import MotionModel
 from slam.run.summary import RunRecord
 from slam.tracks.state import ENOUGH_FEATURES, HIDDEN
 
-_TRACKED = "tracked"
+_TRACKED, _STARTED = "tracked", "started"
 
 #: guard: So many times the expected change of velocity in the median says that times or the kind of motion are wrong.
 #: The median over the recordings and worlds at hand is .02 to .4; of times ten times too short it is 30 times as large.
@@ -69,10 +69,17 @@ def outcome(
         were = "a frame was" if dropped == 1 else f"{dropped} frames were"
         cheaper = "make a frame cheaper (smaller images, --set objects.mode=off), or move more slowly"
         causes.append(f"{were} dropped, and the frames about them are far apart: {cheaper}")
-    few, word = (frames - missed, "tracked") if 2 * missed > frames else (missed, "not tracked")
-    counted = f"{few} of {frames} frames {'was' if few == 1 else 'were'} {word}"
-    counted = "no frame was tracked" if missed == frames else f"only {counted}" if word == _TRACKED else counted
-    return f"{counted}; likely cause: {'; and '.join(causes)}"
+    return f"{_counted(record.statuses, missed)}; likely cause: {'; and '.join(causes)}"
+
+
+def _counted(statuses: Sequence[str], missed: int) -> str:
+    """How many frames were tracked, counted as in a run's table: the first one is one of them where it began a map."""
+    every, first = len(statuses), statuses[0] == _STARTED
+    if missed == every - 1:
+        return "no frame after the first was tracked" if first else "no frame was tracked"
+    if 2 * missed <= every - 1:
+        return f"{missed + (not first)} of {every} frames were not tracked"
+    return f"only {every - missed - (not first)} of {every} frames were tracked"
 
 
 def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:

@@ -1,6 +1,7 @@
 """``slam plot`` and the picture of a run: path, map, errors and times, of one run or of several of one sequence.
 
-Drawn without pyplot: there is no state to share, and it is loaded faster.
+Drawn without pyplot: there is no state to share, and it is loaded faster. Landmarks are told apart by how light they
+are: dark where they are seen now, light where they have left the map.
 """
 
 from __future__ import annotations
@@ -9,16 +10,20 @@ import logging
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from slam.errors import ConfigurationError, SlamError
-from slam.files import noting_inputs, whole_file
+from slam.files import noting_inputs, reason, whole_file
+from slam.geometry.se3 import Array, inverse, transform
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
-from slam.run.panels import draw_errors, draw_maps, draw_paths, draw_times
 from slam.run.results import facts
-from slam.run.run_data import RunData
+from slam.run.run_data import RunData, place_of_truth, pose_errors, well_known
+from slam.run.schema import STAGE_NAMES, body_colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,6 +48,17 @@ _METADATA: dict[str, dict[str, Any]] = {
     ".pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     ".svg": {"Date": None},
 }
+
+#: Dark below, light above: ekf and window often coincide, and both should be seen.
+_BACKENDS = {"ekf": "#0d47a1", "smoother": "#ef6c00", "batch": "#6a1b9a", "window": "#26c6da", "iekf": "#ad1457"}
+_OTHERS = ("#2e7d32", "#c62828", "#5d4037", "#9e9d24")
+_TRUTH, _BEFORE, _NOT_NOW, _NOW = "0.3", "0.8", "#9fa8da", "#283593"
+_LOOPS = ("o", "k", "loops closed"), ("x", "#c62828", "loops refused")
+_STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
+_NAME = 2.0  # [in] room for a mark and its name
+_SIGMAS = 2.0  # size of ellipses
+_DECADES = 2.5  # of errors, at most: smaller ones are where an error changes its sign
+_LEAST_SHARE = 0.002  # of the longest time: a stage below it is not seen, and not named
 
 
 def plot_folders(folders: Sequence[Path], out: Path | None, kind: str, overwrite: bool = False) -> Path:
@@ -107,7 +123,7 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
             metadata = {"Title": _title(runs), **_METADATA[suffix]}
             figure.savefig(file, format=suffix[1:], dpi=110, metadata=metadata)
     except OSError as error:
-        raise SlamError(f"cannot write to {path}: {error.strerror or error}") from error
+        raise SlamError(f"cannot write to {path}: {reason(error)}") from error
 
 
 def drawn(runs: Sequence[RunData], kind: str) -> Figure:
@@ -157,3 +173,185 @@ def _title(runs: Sequence[RunData]) -> str:
     frames = ", ".join(dict.fromkeys(f"{len(run.status)} frames" for run in runs))
     frames += "".join(f"; {name}: {count} not tracked" for name, count in lost.items() if count)
     return f"{runs[0].sequence}: {frames}"
+
+
+# ------------------------------------------------------------------------------------------------ path and map
+
+
+def backend_colours(backends: Sequence[str]) -> list[str]:
+    """A colour for each of the runs in a picture, by the names of their back ends.
+
+    A built-in back end has the same colour in all pictures, in whatever order. Others, and further runs of the same
+    back end, have the next colour that is left.
+    """
+    left = cycle([*_OTHERS, *(colour for name, colour in _BACKENDS.items() if name not in backends)])
+    own = dict(_BACKENDS)
+    return [own.pop(name) if name in own else next(left) for name in backends]
+
+
+def _coloured(runs: Sequence[RunData]) -> list[tuple[RunData, str, float]]:
+    """Runs with their colours and widths of lines: where lines coincide, each is seen beside the one drawn over it."""
+    colours = backend_colours([run.backend for run in runs])
+    return list(zip(runs, colours, 1.2 + 1.2 * np.arange(len(runs))[::-1]))
+
+
+def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
+    """The paths from above, in the world of the first run that has a truth, and the true one."""
+    first = next((run for run in runs if run.truth is not None), None)
+    paths: dict[str, list[Array]] = {}
+    to_first = np.eye(4) if first is None else place_of_truth(first)
+    truth = None if first is None or first.truth is None else (to_first @ first.truth.poses)[:, [0, 2], 3]
+    for run in runs:
+        T = np.eye(4) if run.truth is None or run is first else to_first @ inverse(place_of_truth(run))
+        paths[run.name] = [(T @ path.poses)[:, [0, 2], 3] for path in (run.online, run.final)]
+    every = np.concatenate([*(online for online, _ in paths.values()), *([] if truth is None else [truth])])
+    factor, unit = _unit(float(np.ptp(every, axis=0).max()))
+    if truth is not None:
+        axis.plot(*factor * truth.T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
+    for run, colour, width in _coloured(runs):
+        online, final = (factor * points for points in paths[run.name])
+        axis.plot(*np.where(run.measured[:, None], online, np.nan).T, color=colour, lw=1.2 * width, alpha=0.75,
+                  label=run.name)  # fmt: skip
+        if not run.measured.all():
+            axis.plot(*online.T, ":", color=colour, lw=1, alpha=0.75, label=f"{run.name}, not tracked")
+        axis.plot(*online[:1].T, "o", color=colour, ms=4)
+        if not (len(final) == len(online) and np.allclose(final, online, rtol=0, atol=1e-6 * factor)):
+            axis.plot(*final.T, ":", color=colour, lw=1.5, label=f"{run.name}, final")
+    axis.set(title="Path from above, online (dot: start)", xlabel=f"right [{unit}]", ylabel=f"forward [{unit}]")
+    if not _stretch(axis, factor * every):
+        axis.set_aspect("equal", adjustable="datalim")
+    axis.legend(framealpha=0.8)
+    axis.locator_params(axis="x", nbins=6)
+    axis.grid(color="0.9", lw=0.5)
+
+
+def _unit(largest: float) -> tuple[float, str]:
+    """A unit for lengths up to `largest` [m], and what metres are multiplied by."""
+    return (1.0, "m") if largest > 1 else (100.0, "cm") if largest > 0.01 else (1000.0, "mm")
+
+
+def draw_maps(axes: Sequence[Axes], runs: Sequence[RunData], key: Axes) -> None:
+    """Each run's map from above; in the panel `key` what the marks are."""
+    names: dict[str, Any] = {}
+    for axis, (run, colour, _) in zip(axes, _coloured(runs)):
+        _draw_map(axis, run, colour)
+        handles, labels = axis.get_legend_handles_labels()
+        names |= dict(zip(labels, handles))
+    key.axis("off")
+    columns = max(1, int(key.get_figure(root=True).get_figwidth() / _NAME))  # type: ignore[union-attr]
+    key.legend(list(names.values()), list(names), loc="center", ncols=columns, frameon=False, markerscale=1.5)
+
+
+def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
+    """One map, in limits that hold the path and the well-known landmarks with their ellipses."""
+    from matplotlib.collections import EllipseCollection
+
+    known, plane = well_known(run), run.covariances[:, [0, 2]][:, :, [0, 2]]
+    values, vectors = np.linalg.eigh(plane.reshape(-1, 2, 2))
+    width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    if len(run.old):
+        axis.plot(*run.old[:, [0, 2]].T, ".", ms=2, color=_BEFORE, label="landmarks that have left")
+    for rows, shade, label in ((~run.seen_last, _NOT_NOW, "not seen now"), (run.seen_last, _NOW, "seen now")):
+        sure = known[rows[known]]
+        axis.add_collection(EllipseCollection(
+            width[sure, 1], width[sure, 0], angle[sure], units="xy", offsets=run.positions[sure][:, [0, 2]],
+            offset_transform=axis.transData, facecolors="none", edgecolors=shade, linewidths=0.8,
+        ))  # fmt: skip
+        axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=4, color=shade, label=f"landmarks {label}")
+    final = run.final.positions[:, [0, 2]]
+    axis.plot(*final.T, color=colour, lw=2, label=f"path of {run.name}, final")
+    for rows, (mark, shade, label) in zip((run.loops, run.refused), _LOOPS):
+        if len(rows):
+            axis.plot(*final[rows[:, 0]].T, mark, ms=6, mfc="none", color=shade, label=label)
+    for body, positions in run.bodies.items():
+        rgb = np.array(body_colour(int(body))) / 255
+        axis.plot(*positions[:, [0, 2]].T, "-s", ms=5, lw=1.5, markevery=[-1], color=rgb, label=f"body {body}")
+    if run.truth is not None:
+        axis.plot(*transform(place_of_truth(run), run.truth.positions)[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0,
+                  label="true path")  # fmt: skip
+    near = np.linalg.norm(run.old - run.centre, axis=1) < run.reach
+    points = np.concatenate([run.positions[known], run.online.positions, run.final.positions, run.old[near]])[:, [0, 2]]
+    around = np.zeros_like(points)
+    around[: len(known)] = _SIGMAS * np.sqrt(np.diagonal(run.covariances[known], axis1=1, axis2=2)[:, [0, 2]])
+    low, high = (points - around).min(axis=0), (points + around).max(axis=0)
+    half = 0.55 * float((high - low).max()) + 0.1
+    (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
+    sure = "" if len(known) == len(run.positions) else f" of {len(known)}"  # the others would cover these
+    title = f"{run.name}: {len(run.positions)} landmarks, 2σ ellipses{sure}"
+    axis.set(title=title, xlabel="right [m]", ylabel="forward [m]", aspect="equal", xlim=(left, right))
+    axis.set_ylim(bottom, top)
+
+
+def _stretch(axis: Axes, points: Array) -> bool:
+    """Give each axis a scale of its own where points (N, 2) lie nearly in a line along one; whether it did."""
+    extent = np.ptp(points, axis=0)
+    narrow = int(np.argmin(extent))
+    if not extent[narrow] * _STRAIGHT < extent[1 - narrow]:
+        return False
+    half = 0.6 * max(float(extent[narrow]), 0.01 * float(extent[1 - narrow]))  # what is straight is not blown up
+    middle = float(points[:, narrow].max() + points[:, narrow].min()) / 2
+    name, label = "xy"[narrow], (axis.get_xlabel, axis.get_ylabel)[narrow]()
+    axis.set(**{f"{name}lim": (middle - half, middle + half), f"{name}label": f"{label}, on a scale of its own"})
+    return True
+
+
+# --------------------------------------------------------------------------------------------- errors and times
+
+
+def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
+    """Errors of position and rotation, and the σ that is claimed; that alone where no true path is known."""
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import LogLocator
+
+    series = [pose_errors(run) for run in runs]
+    known = any(run.truth is not None for run in runs)
+    largest = max(float(np.nanmax(both[:, 0], initial=0.0)) for _, *pair in series for both in pair)
+    factor, unit = _unit(largest)
+    for k, (axis, name, times) in enumerate(zip(axes, (f"position [{unit}]", "rotation [deg]"), (factor, 1.0))):
+        tops = [0.0]
+        for (run, colour, width), (time, error, sigma) in zip(_coloured(runs), series):
+            for values, style in ((error if run.truth is not None else None, "-"), (sigma, "--")):
+                if values is not None:
+                    axis.plot(time, times * values[:, k], style, color=colour, lw=0.7 * width)
+                    tops.append(float(np.nanmax(times * values[:, k], initial=0.0)))
+            lost = (run.online.stamps - run.online.stamps[:1])[~run.measured]
+            for start in lost:
+                axis.axvspan(start, start, color=colour, alpha=0.2)
+        if max(tops) > 0:
+            axis.set_yscale("log")
+            values = np.concatenate([line.get_ydata() for line in axis.lines])
+            top = (2.0 if k or len(runs) == 1 else 6.0) * max(tops)
+            bottom = max(0.7 * float(values[values > 0].min()), top * 10.0**-_DECADES)
+            axis.set_ylim(bottom, top)
+            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top < 100 * bottom else (1,)))
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_formatter("")
+        axis.set_ylabel(name)
+        axis.grid(color="0.9", lw=0.5)
+        end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
+        axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
+    axes[0].tick_params(labelbottom=False)
+    title = "Error of the online pose (solid), claimed σ (dashed)"
+    axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
+    axes[-1].set_xlabel("time [s]")
+    if len(runs) > 1:  # in the room above all lines
+        colours = [Line2D([], [], color=colour) for _, colour, _ in _coloured(runs)]
+        axes[0].legend(colours, [run.name for run in runs], framealpha=0.8, ncols=3, loc="upper left")
+
+
+def draw_times(axis: Axes, runs: Sequence[RunData]) -> None:
+    """Median time of each stage of a frame, but for the first frame, which may wait for compilers."""
+    later = [{name: ms[1:] if len(ms) > 1 else ms for name, ms in run.milliseconds.items()} for run in runs]
+    totals = [float(np.median(np.sum(list(times.values()), axis=0))) for times in later]
+    medians = {stage: [float(np.median(times[stage])) for times in later] for stage in STAGE_NAMES if stage in later[0]}
+    stages = [stage for stage, values in medians.items() if max(values) > _LEAST_SHARE * max(*totals, 1e-9)]
+    high = 0.8 / len(runs)
+    for i, ((run, colour, _), total) in enumerate(zip(_coloured(runs), totals)):
+        at = np.arange(len(stages)) + (i - (len(runs) - 1) / 2) * high
+        name = f"{run.name}: {total:.0f} ms" if total >= 100 else f"{run.name}: {total:.3g} ms"
+        axis.barh(at, [medians[stage][i] for stage in stages], height=high, color=colour, label=name)
+    axis.set_yticks(range(len(stages)), [STAGE_NAMES[stage] for stage in stages])
+    axis.invert_yaxis()
+    axis.set(title="Median time of a frame", xlabel="time [ms]")
+    axis.legend(framealpha=0.8, loc="lower right")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ class RunData:
     loops: np.ndarray  # rows of `final` whose places are the same (L, 2), the later one first
     refused: np.ndarray  # rows of `final` whose places only looked alike (L, 2), the later one first
     old: Array  # landmarks that had left the map before the end (M, 3) [m]
-    bodies: Mapping[str, Array]  # where moving bodies were measured (B, 3) [m], by id
+    objects: Sequence[tuple[float, str, Array]]  # stamp [s], id and position (3,) [m] of each body in each frame
     summary: Mapping[str, Any]  # of the run; empty where there is none
 
     @classmethod
@@ -77,9 +77,6 @@ class RunData:
             rows = np.searchsorted(final.stamps, np.array(found, float).reshape(-1, 2) - 1e-9)
             return rows.clip(0, max(len(final) - 1, 0))
 
-        bodies: dict[str, list[list[float]]] = {}
-        for _, body, position in read_objects(folder):
-            bodies.setdefault(body, []).append(position)
         truth, old, path = folder / "truth.txt", folder / OLD_LANDMARKS, folder / "summary.json"
         summary = read_object(path) if path.exists() else {}
         noise: dict[str, Any] = {key: float(value) for key, value in summary.get("truth", {}).items()}
@@ -103,9 +100,18 @@ class RunData:
             loops=pairs("loop"),
             refused=pairs("refused"),
             old=_numbers(_rows(old) if old.exists() else [], ("x", "y", "z")),
-            bodies={body: np.array(positions) for body, positions in bodies.items()},
+            objects=[
+                (float(row["stamp"]), row["id"], np.array([float(row[axis]) for axis in "xyz"]))
+                for row in _rows(folder / "objects.csv")
+            ],
             summary=summary,
         )
+
+    @property
+    def bodies(self) -> dict[str, Array]:
+        """Where moving bodies were measured (B, 3) [m], by id."""
+        ids = dict.fromkeys(body for _, body, _ in self.objects)
+        return {body: np.array([place for _, own, place in self.objects if own == body]) for body in ids}
 
     @property
     def centre(self) -> Array:
@@ -123,15 +129,6 @@ class RunData:
     def reach(self) -> float:
         """Distance from the middle of the path up to which landmarks are shown [m]."""
         return 2.0 * self.extent + 3.0
-
-
-def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
-    """Stamp [s], id and position [m] of every row of objects.csv; raises SlamError: the file is missing or damaged."""
-    path = folder / "objects.csv"
-    try:
-        return [(float(row["stamp"]), row["id"], [float(row[c]) for c in "xyz"]) for row in _rows(path)]
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
-        raise SlamError(f"{path}: no list of objects: {error}") from error
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

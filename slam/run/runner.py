@@ -6,7 +6,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -176,22 +175,20 @@ class _Run:
         Raises:
             SlamError: a file cannot be written; all others are.
         """
-        record, out, score = self.record, self.options.out, score_for(self.sequence)
-        ended, stopped_by = "completed", None
-        frontend, backend = getattr(self.system, "frontend", None), self.system.backend
+        record, out, options, score = self.record, self.options.out, self.options, score_for(self.sequence)
         names = {"sequence": self.sequence.name, "format": self.sequence.format}
-        names |= {"frontend": self.options.frontend, "backend": self.options.backend}
+        names |= {"frontend": options.frontend, "backend": options.backend}
+        ended, stopped_by = "completed", None
         with RunFiles(out) as files:
-            write_json(out / "config.json", origin(self.options) | names | self._config(frontend, backend))
-            with self._each():
-                write_json(out / "schema.json", schema())
+            write_json(out / "config.json", origin(options) | names | self._config())
+            self._try(lambda: write_json(out / "schema.json", schema()))
             try:
                 for number, result in results:
                     record.add(number, result)
                     files.write_frame(number, result, self._place(result.loop), self._place(result.refused_loop))
                     if score is not None:
                         score.add(number, result, labels_in_images(self.sequence, number, result.features))
-                    if self.options.record is not None:
+                    if options.record is not None:
                         self.tape.append(RecordedFrame.of(result, number))
                     if on_frame is not None:
                         on_frame(result)
@@ -202,42 +199,30 @@ class _Run:
                 if self.live is not None and self.live.ended_early and stopped_by is None:
                     ended = "ended by the user"
                 summary = names | {"ended": ended} | self._tracking()
-                if record.stamps:
-                    self._write_last(files, summary, score)
-                summary["seed"] = getattr(self.sequence, "values", {}).get("seed", 0)  # nothing else is random
-                summary |= {"configuration": self.options.config.to_json(), "versions": versions()}
-                with self._each():
-                    write_json(out / "summary.json", summary)
-                self._write_copies()
-                if self.failures:
-                    summary["failures"] = list(map(_said, self.failures))
-                    with self._each():
-                        write_json(out / "summary.json", summary)
+                self._write_last(files, summary, score)
                 self._raise_failures(stopped_by)
         return summary
 
-    def _config(self, frontend: object, backend: object) -> dict[str, Any]:
+    def _config(self) -> dict[str, Any]:
         """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
-        parts = {"frontend": in_force(frontend), "backend": in_force(backend)}
+        parts = {"frontend": getattr(self.system, "frontend", None), "backend": self.system.backend}
+        options = {name: in_force(part) for name, part in parts.items()}
         return {
             "frames": [self.options.start, self.options.stop],
             "settings": portable(self.options.config.to_json()),
-            "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
+            "in_force": {name: portable(found) for name, found in options.items() if found is not None},
             "versions": versions(),
         }
 
     def _place(self, step: int | None) -> int | str:
         """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
-        if step is None:
-            return ""
-        return self.record.numbers[step] if step >= 0 else "map"
+        return "" if step is None else self.record.numbers[step] if step >= 0 else "map"
 
-    @contextmanager
-    def _each(self) -> Iterator[None]:
-        """One of the last files: it is written although another one failed."""
+    def _try(self, write: Callable[[], None]) -> None:
+        """Write one of the last files, although another one failed; `_raise_failures` raises what goes wrong."""
         try:
-            yield
-        except Exception as error:  # noqa: BLE001 `_raise_failures` raises it
+            write()
+        except Exception as error:  # noqa: BLE001
             self.failures.append(error)
 
     def _raise_failures(self, stopped_by: BaseException | None) -> None:
@@ -248,52 +233,52 @@ class _Run:
             Exception: a defect of the program, as it is.
         """
         lines = list(dict.fromkeys(map(_said, self.failures)))
-        if not lines:
-            return
-        if stopped_by is None:
-            for error in self.failures:
-                if not isinstance(error, SlamError):
-                    raise error
-            raise SlamError("; ".join(lines))
-        if isinstance(stopped_by, SlamError):
+        if isinstance(stopped_by, SlamError) and lines:
             raise type(stopped_by)("; ".join(dict.fromkeys([str(stopped_by), *lines]))) from stopped_by
-        for line in lines:
-            logger.warning("%s", line)
+        if stopped_by is not None:
+            for line in lines:
+                logger.warning("%s", line)
+        elif lines:
+            defects = (error for error in self.failures if not isinstance(error, SlamError))
+            raise next(defects, SlamError("; ".join(lines)))
 
     def _write_last(self, files: RunFiles, summary: dict[str, Any], score: Any) -> None:
-        """Write the files that are made at the end but the summary, and add to that how good the run was."""
-        system, record, sequence = self.system, self.record, self.sequence
+        """Write the files that are made at the end; the summary is the last, and says how good the run was."""
+        system, record, sequence, options = self.system, self.record, self.sequence, self.options
         final = Trajectory.empty()
-        with self._each():
-            final = system.trajectory()
-            write_trajectory(self.options.out / "trajectory_final.txt", final)
-        with self._each():
-            pairs = with_truth(record.trajectory, sequence)
-            if pairs is not None:
-                write_trajectory(self.options.out / "truth.txt", pairs[1])
-        with self._each():
-            files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
-        if isinstance(system, StereoSlam) and system.landmarks is not None:
-            with self._each():
-                files.write_old_landmarks(system.atlas, system.landmarks.ids)
-        with self._each():
-            summary |= results_of(sequence, system, record, final, score)
 
-    def _write_copies(self) -> None:
-        """The recording and the map, where they were asked for."""
-        if self.options.record is not None:
-            with self._each():
-                save_recording(self._recording(), self.options.record)
-        if self.options.save_map is not None and self.record.stamps and isinstance(self.system, StereoSlam):
-            with self._each():
-                save_map(self.options.save_map, self.system)
+        def write_final() -> None:
+            nonlocal final
+            final = system.trajectory()
+            write_trajectory(options.out / "trajectory_final.txt", final)
+
+        def write_truth() -> None:
+            if (pairs := with_truth(record.trajectory, sequence)) is not None:
+                write_trajectory(options.out / "truth.txt", pairs[1])
+
+        def write_summary() -> None:
+            write_json(options.out / "summary.json", summary)
+
+        if record.stamps:
+            self._try(write_final)
+            self._try(write_truth)
+            self._try(lambda: files.write_landmarks(system.estimate(), system.landmarks, record.numbers))
+            if isinstance(system, StereoSlam) and (landmarks := system.landmarks) is not None:
+                self._try(lambda: files.write_old_landmarks(system.atlas, landmarks.ids))
+            self._try(lambda: summary.update(results_of(sequence, system, record, final, score)))
+        summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # nothing else is random
+        summary |= {"configuration": options.config.to_json(), "versions": versions()}
+        self._try(write_summary)
+        if (path := options.record) is not None:
+            self._try(lambda: save_recording(self._recording(), path))
+        if (place := options.save_map) is not None and record.stamps and isinstance(system, StereoSlam):
+            self._try(lambda: save_map(place, system))
+        if self.failures:
+            summary["failures"] = list(map(_said, self.failures))
+            self._try(write_summary)
 
     def _recording(self) -> Recording:
-        """What was given to the back end of a run.
-
-        Raises:
-            SlamError: it was given to more than one.
-        """
+        """What was given to the back end of a run; raises SlamError where it was given to more than one."""
         options, sequence = self.options, self.sequence
         if isinstance(self.system, StereoSlam) and self.system.restarted:
             raise SlamError(
@@ -306,8 +291,7 @@ class _Run:
     def _tracking(self) -> dict[str, Any]:
         """The part of the summary on the tracking, which is known of every run."""
         options, record, rig = self.options, self.record, self.sequence.rig
-        warnings = getattr(self.system, "warnings", ())
-        driving = options.kind == "driving"
+        warnings, driving = getattr(self.system, "warnings", ()), options.kind == "driving"
         doubt = scale_doubt(record, rig, driving) or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
         tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from inspect import cleandoc
+from textwrap import wrap
 from typing import Any
 
 from slam import registry
 from slam.config import SystemConfig
+from slam.errors import UnknownNameError
 from slam.geometry.rig import StereoRig
 from slam.models import KINDS
+from slam.naming import unknown
 from slam.settings import can_be_set
 
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
@@ -40,15 +44,11 @@ def settings() -> Iterator[Setting]:
             yield from (s for s in _of_class(parts, f.name) if can_be_set(s.key))
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
-            yield from options_of(section, name)
+            yield from _options_of(section, name)
 
 
-def options_of(section: str, name: str) -> Iterator[Setting]:
-    """Options that a user can set of a front end (`section` is ``"frontend"``) or back end by its name.
-
-    Raises:
-        UnknownNameError: it cannot be loaded.
-    """
+def _options_of(section: str, name: str) -> Iterator[Setting]:
+    """Options that a user can set of a front end (`section` is ``"frontend"``) or back end by its name."""
     known = registry.options_of(registry.resolve(f"{section}s", name), _RIG) or {}
     for option, (default, described) in known.items():
         key = f"{section}.{option}"
@@ -68,6 +68,47 @@ def _of_class(configs: dict[str, Any], section: str) -> Iterator[Setting]:
             yield from _of_class(values, key)
         else:
             yield Setting(key, "", values, *texts.get(f.name, ("", "")))
+
+
+def listing(wanted: str | None, width: int) -> Iterator[str]:
+    """Lines of at most `width` characters on all settings, or those of a section, front end or back end, or one.
+
+    Raises:
+        UnknownNameError: there is no such section or setting, or a class of one's own has no options.
+    """
+    if wanted is not None and ":" in wanted:  # a class of one's own
+        part = registry.resolve("backends", wanted)
+        chosen = list(_options_of("frontend" if hasattr(part, "extract") else "backend", wanted))
+        if not chosen:
+            raise UnknownNameError(
+                f"{wanted} names no options: neither its constructor has any, nor a dataclass in its `config`"
+            )
+    else:
+        every = list(settings())
+        chosen = [s for s in every if wanted is None or wanted in (s.key, s.owner) or s.key.startswith(f"{wanted}.")]
+        if not chosen:
+            names = dict.fromkeys(name for s in every for name in (s.key.partition(".")[0], s.owner) if name)
+            same = dict.fromkeys(s.key for s in every if s.key.rpartition(".")[2] == wanted)
+            line = unknown("section or setting", wanted or "", names)
+            raise UnknownNameError(f"{line}; there is {', '.join(same)}" if same else line)
+    before = ""
+    for setting in chosen:
+        section = setting.key.partition(".")[0]
+        what = f"options of {setting.owner}" if setting.owner else documented(SystemConfig)[section][1]
+        if (title := f"{section}: {what}") != before:
+            yield from ([""] if before else [])
+            yield from wrap(title, width)
+            before = title
+        (_, first), *others = setting.defaults.items()
+        line = f"  {setting.key} = {_typed(first)}{setting.unit and f' {setting.unit}'}"
+        yield line + "".join(f"; {kind}: {_typed(value)}" for kind, value in others if value != first)
+        yield from wrap(setting.text, width, initial_indent="      ", subsequent_indent="      ")
+    yield from ("", "Change one with --set KEY=VALUE.")
+
+
+def _typed(value: Any) -> str:
+    """A value as it can be typed."""
+    return (value or '""') if isinstance(value, str) else json.dumps(value)
 
 
 def documented(kind: Any) -> dict[str, tuple[str, str]]:

@@ -21,7 +21,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, quaternion
 from slam.geometry.trajectory import Trajectory
 from slam.outputs import Output, require_outputs
-from slam.run.run_data import RunData, read_objects
+from slam.run.run_data import RunData
 from slam.run.schema import body_colour
 from slam.system import StereoSlam
 
@@ -48,7 +48,7 @@ class Viewer:
             raise SlamError("the viewer needs Rerun: pip install 'surf-stereo-slam[viewer]'") from error
         self._target, self._rig, self._truth = target, rig, truth
         self._recording = _open(self.rr, target)
-        self._start: float | None = None
+        self._stamps: list[float] = []
         self._path: list[Array] = []
         self.log("", self.rr.ViewCoordinates.RDF, static=True)
 
@@ -80,17 +80,14 @@ class Viewer:
             ("moving", result.moving_features, _MOVING),
         ):
             self.log(f"/camera/image/{name}", rr.Points2D(pixels[rows], colors=colour, radii=2.0))
-        for moving in result.objects:
-            place, box = f"/objects/{moving.id}", moving.extent
-            self.log(place, self._transform(moving.estimate.T_world_object))
-            boxes = rr.Boxes3D(
-                centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=body_colour(moving.id)
-            )
-            self.log(f"{place}/box", boxes)
-        loops = [(loop.first, loop.second) for loop in system.atlas.loops]
-        if loops and result.keyframe:
-            ends = system.atlas.poses_in_map[np.array(loops), :3, 3]
-            self.log("/loops", rr.LineStrips3D(ends, colors=_CLOSED))
+        for body in result.objects:
+            T, box = body.estimate.T_world_object, {"centers": [body.extent.mean(axis=0)]}
+            self.log(f"/objects/{body.id}", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+            box["half_sizes"] = [np.ptp(body.extent, axis=0) / 2]
+            self.log(f"/objects/{body.id}/box", rr.Boxes3D(**box, colors=body_colour(body.id)))
+        if result.keyframe and system.atlas.loops:
+            ends = np.array([(loop.first, loop.second) for loop in system.atlas.loops])
+            self.log("/loops", rr.LineStrips3D(system.atlas.poses_in_map[ends, :3, 3], colors=_CLOSED))
         if result.index % _MAP_EVERY == 0:
             whole = system.estimate()
             self.show_map(whole.positions, whole.covariances, np.isin(whole.ids, result.matched))
@@ -107,19 +104,16 @@ class Viewer:
     def show_pose(self, number: int, stamp: float, T_world_left: Array) -> None:
         """The camera alone."""
         rr = self.rr
-        self._start = stamp if self._start is None else self._start
-        self._recording.set_time("frame", sequence=number)
-        self._recording.set_time("time", duration=stamp - self._start)
+        self._stamps.append(stamp)
         self._path.append(T_world_left[:3, 3])
-        self.log("/camera", self._transform(T_world_left))
+        self._recording.set_time("frame", sequence=number)
+        self._recording.set_time("time", duration=stamp - self._stamps[0])
+        self.log("/camera", rr.Transform3D(translation=T_world_left[:3, 3], mat3x3=T_world_left[:3, :3]))
         if self._rig is not None:
             left = self._rig.left
             size = {"resolution": [left.width, left.height], "image_plane_distance": 0.2}
             self.log("/camera/image", rr.Pinhole(image_from_camera=left.K, **size))
         self.log("/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
-
-    def _transform(self, T: Array) -> Any:
-        return self.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
 
     def log(self, path: str, what: Any, static: bool = False) -> None:
         """Show something at its place below the world."""
@@ -137,12 +131,12 @@ def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
     Raises SlamError where the folder does not hold a finished run, and as `Viewer` does.
     """
     with noting_inputs() as inputs:
-        run, objects = RunData.read(folder, folder.name), read_objects(folder)
+        run = RunData.read(folder, folder.name)
     require_outputs(outputs(target, "--to"), inputs, overwrite)
     with Viewer(target) as viewer:
         for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):
             viewer.show_pose(number, float(stamp), pose)
-            for seen, name, position in objects:
+            for seen, name, position in run.objects:
                 if abs(seen - stamp) < 1e-6:
                     mark = viewer.rr.Points3D([position], colors=body_colour(int(name)), radii=0.03)
                     viewer.log(f"/objects/{name}", mark)
@@ -161,10 +155,9 @@ def _open(rr: Any, target: str) -> Any:
         if target == LIVE:
             recording.spawn()
         else:
-            path = Path(target)
-            require_utf8(path)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            recording.save(str(path))
+            require_utf8(Path(target))
+            Path(target).parent.mkdir(parents=True, exist_ok=True)
+            recording.save(target)
     except (OSError, RuntimeError) as error:
         raise SlamError(f"viewer {target}: {_first_line(error)}") from error
     return recording

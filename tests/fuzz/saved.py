@@ -21,7 +21,7 @@ from slam.geometry.rig_numbers import rig_numbers
 from slam.papers.procedure1 import ObjectDatabase
 from slam.run.options import RunOptions
 from slam.run.recording import load_recording, record, save_recording
-from slam.run.run_data import RunData, read_objects
+from slam.run.run_data import RunData
 from slam.run.runner import run_recording
 from slam.system import StereoSlam
 from tests.fuzz.files import changed
@@ -85,7 +85,6 @@ def _use_calibration(path: Path, backend: str) -> None:
 
 def _use_run(path: Path, backend: str) -> None:
     RunData.read(path.parent, "run")
-    read_objects(path.parent)
 
 
 #: By the file that is changed: who uses it.

@@ -8,10 +8,9 @@ import pytest
 
 import slam
 from slam import registry
-from slam.commands.settings import listing
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
-from slam.run.settings_reference import settings
+from slam.run.settings_reference import listing, settings
 from slam.settings import SETTABLE, can_be_set, leaves, require_settable
 
 RIG = slam.StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
@@ -25,7 +24,7 @@ def every():
 @pytest.fixture
 def read(every, monkeypatch):
     """The settings are read once for all tests of their listing."""
-    monkeypatch.setattr("slam.commands.settings.settings", lambda: every)
+    monkeypatch.setattr("slam.run.settings_reference.settings", lambda: every)
 
 
 def test_what_can_be_set_is_there_with_its_defaults(every):

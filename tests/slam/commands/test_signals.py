@@ -18,7 +18,7 @@ WORLD = "synthetic:desk?frames=3"
             "; trials done so far are kept: the same command continues",
         ),
         (["run", WORLD, "--out", "one"], "slam.run.runner.run", "; no frame was done yet"),
-        (["settings"], "slam.commands.settings.print_settings", ""),
+        (["settings"], "slam.run.settings_reference.listing", ""),
     ],
 )
 def test_a_signal_ends_a_command_with_what_it_leaves(monkeypatch, tmp_path, capsys, arguments, function, left):

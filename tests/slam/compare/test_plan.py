@@ -77,25 +77,6 @@ def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     assert command._seconds(plan.every, frames) is None
 
 
-@pytest.mark.slow
-def test_the_time_told_is_that_of_what_is_left_at_once(monkeypatch, tmp_path, capsys):
-    """Two runs on eight workers take the time of one; a finished comparison tries nothing and tells no time."""
-    tried, seconds = [], 40.0
-    monkeypatch.setattr(command, "_seconds", lambda left, frames: tried.append(len(left)) or seconds)
-    plan = Plan(("synthetic:desk?frames=2&width=160&height=120",), ("ekf", "iekf"), trials=1, replay=False)
-    compare(plan, tmp_path, workers=8)
-    assert "2 runs, 4 frames in all, 8 at a time on this machine: about 20 s, by the first" in capsys.readouterr().out
-    (tmp_path / "runs" / next(iter(plan.every)).folder / "result.json").unlink()
-    compare(plan, tmp_path, workers=8)
-    said = capsys.readouterr().out
-    assert "2 runs, 1 of them done before, 4 frames in all, 8 at a time on this machine: about 40 s" in said
-    compare(plan, tmp_path, workers=8)
-    assert "2 of them done before" in (said := capsys.readouterr().out) and "about" not in said and tried == [2, 1]
-    seconds = None
-    compare(plan, tmp_path, workers=8, overwrite=True)
-    assert "about" not in capsys.readouterr().out and tried == [2, 1, 2]
-
-
 def test_variants():
     few = ("frontend.descriptor=16", "map.max_landmarks=100")
     assert parse_variant(f"small:surf:{':'.join(few)}") == Variant("small", "surf", few)

@@ -11,6 +11,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.models import MotionModel
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
+from slam.run.results import rows
 from slam.run.summary import RunRecord
 from tests.slam.scene import RIG as SCENE_RIG
 from tests.slam.scene import Cloud
@@ -26,13 +27,21 @@ def record(tracked: int, frames: int = 21, features: tuple[int, int] = (200, 150
 @pytest.mark.parametrize(
     ("tracked", "words"),
     [
-        (20, ""), (18, ""), (17, "3 of 20 frames were not tracked"), (10, "10 of 20 frames were not tracked"),
-        (9, "only 9 of 20 frames were tracked"), (1, "only 1 of 20 frames was"), (0, "no frame was"),
+        (20, ""), (18, ""), (17, "3 of 21 frames were not tracked"), (10, "10 of 21 frames were not tracked"),
+        (9, "only 10 of 21 frames were tracked"), (1, "only 2 of 21"), (0, "no frame after the first was tracked"),
     ],
 )  # fmt: skip
-def test_where_more_than_one_in_ten_is_not_tracked_it_is_told(tracked, words):
-    said = outcome(record(tracked), RIG)
+def test_where_more_than_one_in_ten_is_not_tracked_it_is_told_with_the_numbers_of_the_table(tracked, words):
+    """It said "no frame was tracked" below a table with "frames tracked 1 of 20"."""
+    run = record(tracked)
+    said = outcome(run, RIG)
     assert said.startswith(words) and bool(said) == bool(words)
+    status = {name: run.statuses.count(name) for name in set(run.statuses)}
+    ((label, (text,)),) = rows([{"frames": 21, "status": status}])
+    assert label == "frames tracked" and text.startswith(f"{1 + tracked} of 21")
+    if not tracked:
+        run.statuses[0] = "lost"
+        assert outcome(run, RIG).startswith("no frame was tracked;")
 
 
 AGAIN = "features are found in both images, but not again in the next frame"
@@ -54,7 +63,8 @@ AGAIN = "features are found in both images, but not again in the next frame"
 )
 def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, more, words):
     rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, baseline, 320, 240)
-    assert outcome(record(0, features=features), rig, **more).startswith(f"no frame was tracked; likely cause: {words}")
+    said = outcome(record(0, features=features), rig, **more)
+    assert said.startswith(f"no frame after the first was tracked; likely cause: {words}")
 
 
 def test_a_baseline_that_no_hand_carries_is_the_cause_unless_it_is_a_vehicle_s():
