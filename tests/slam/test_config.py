@@ -19,7 +19,6 @@ from slam.errors import ConfigurationError, SlamError, one_line
 from slam.models import EstimatorModels, MotionModel, ObjectModels
 from slam.system import StereoSlam
 from slam.tracks.config import AssociationConfig, MapConfig
-from tests.fuzz.settings import CLASSES
 from tests.slam.scene import RIG
 
 
