@@ -44,7 +44,7 @@ from slam.evaluation.metrics import absolute_errors, associate
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.registry import ONLINE
-from slam.runtime import stages
+from slam.runtime import compilation
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
@@ -135,12 +135,12 @@ def ways(size: Size) -> Iterable[list[str]]:
     """Of each back end, medians over the frames that count: CPU time by stage, and the way through the code."""
     sequence, last = open_sequence(size.sequence), size.skipped + size.counted
     for name in ONLINE:
-        clock, stages.working_time = stages.working_time, time.process_time
+        clock, compilation.working_time = compilation.working_time, time.process_time
         try:
             system = StereoSlam(sequence.rig, backend=name, kind=sequence.kind)
             spent = [system.process(frame).milliseconds for frame in sequence.frames(0, last)][size.skipped :]
         finally:
-            stages.working_time = clock
+            compilation.working_time = clock
         way = np.median([w.summary() for w in ways_of(sequence, name, size.skipped, last)], axis=0)
         by_stage = (np.median([s.get(stage, 0.0) for s in spent]) for stage in STAGES)
         yield [size.name, name, *(f"{x:.1f}" for x in by_stage), *(f"{x:.0f}" for x in way)]

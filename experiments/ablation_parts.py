@@ -15,10 +15,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import path_of, recordings
 from slam.config import SystemConfig
-from slam.data import FrameResult
+from slam.data import CommonError, FrameResult
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.trajectory import Trajectory
-from slam.rig_error import CommonError
 from slam.sequences import Sequence, open_sequence
 
 

@@ -33,7 +33,7 @@ from experiments.tables import resumed, show
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
-from slam.runtime import stages
+from slam.runtime import compilation
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
@@ -196,7 +196,7 @@ def main() -> int:
     if given.quick:
         cases = [Case("desk", "synthetic:desk?frames=12", 12)]
     file = given.out / ("quick.csv" if given.quick else "knee.csv")
-    stages.working_time = time.process_time
+    compilation.working_time = time.process_time
     trials = 1 if given.quick else given.trials
     rows = resumed(file, HEADER, KEYS, lambda done: runs(cases, trials, done))
     tables = {kind: table(rows, kind) for kind in USUAL}

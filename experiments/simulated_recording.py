@@ -11,7 +11,7 @@ from slam.data import IdArray, Observations
 from slam.models import EstimatorModels, models_for
 from slam.run.recording import RecordedFrame, Recording
 from slam.tracks.config import MapConfig
-from slam.tracks.management import new_landmarks
+from slam.tracks.mapper import new_landmarks
 from slam.worlds.observe import SimulatedFeatures
 from slam.worlds.sequence import WorldSequence
 

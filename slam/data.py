@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,6 @@ from slam.geometry.arrays import IdArray as IdArray
 from slam.geometry.arrays import IndexArray as IndexArray
 from slam.naming import count, of_shapes, point
 from slam.object_data import MovingObject
-from slam.rig_error import CommonError, Revision
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ class StereoFeatures:
         pairs = f"{int(self.has_stereo.sum())} with a right pixel, {self.descriptors.shape[1]}-D"
         return f"StereoFeatures({count(len(self), 'feature')}, {pairs}, {self.stamp:.3f} s)"
 
-    @property
+    @cached_property
     def has_stereo(self) -> BoolArray:
         """Which features have a right pixel (N,)."""
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
@@ -283,6 +284,38 @@ class Estimate:
         R, t = self.T_world_left[:3, :3], self.T_world_left[:3, 3]
         where = f"camera at {point(t)} ± {point(np.sqrt(np.diag(R @ self.covariance[3:, 3:] @ R.T).clip(min=0)))} m"
         return f"Estimate({self.stamp:.3f} s, {where}, {count(len(self.ids), 'landmark')})"
+
+
+@dataclass(frozen=True, eq=False)
+class CommonError:
+    """Error of poses due to the rig's error: ``jacobian @ root @ c``, with the same c for all poses.
+
+    If the correction has changed since a pose was estimated, the pose still contains the difference. It is one column
+    of `root`: its effect on the pose is only known from a model of the estimator, so it counts as an error, too.
+    """
+
+    jacobian: Array = field(default_factory=lambda: np.zeros((6, 0)))  # of the pose by the m shared errors (6, m)
+    root: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of these by c (m, n), which has unit variance
+
+    @property
+    def covariance(self) -> Array:
+        """What it adds to the pose's covariance (6, 6)."""
+        S = self.jacobian @ self.root
+        return np.asarray(S @ S.T)
+
+
+class Revision(Protocol):
+    """A change of the rig's correction during a run, for measurements that have the earlier correction."""
+
+    def rows(self, z: Array) -> Array:
+        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected again."""
+
+
+class Correction(Revision, Protocol):
+    """A correction of measurements by the present estimate of the rig's error."""
+
+    def undone(self, z: Array) -> Array:
+        """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
 
 
 class FrameStatus(StrEnum):

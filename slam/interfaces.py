@@ -33,7 +33,6 @@ class Frontend(Protocol):
         Raises:
             SequenceError: the images are not of the rig's size or of an unusable type.
         """
-        ...
 
 
 @runtime_checkable
@@ -45,7 +44,6 @@ class AligningFrontend(Protocol):
 
     def patches(self, images: ImagePair, uv_left: Array, size: Array) -> Patches:
         """Patches of the left image around pixels (N, 2), for features of some size (N,) [px]."""
-        ...
 
     def align(
         self, images: ImagePair, patches: Patches, warps: Array, uv_left: Array, uv_right: Array
@@ -55,7 +53,6 @@ class AligningFrontend(Protocol):
         `warps` (N, 2, 2) map pixel offsets in the later image to offsets in the patch; the search starts at `uv_left`
         and `uv_right` (N, 2) [px]. May be called while `Frontend.extract` processes another frame.
         """
-        ...
 
 
 @runtime_checkable
@@ -79,7 +76,6 @@ class Backend(Protocol):
         Raises:
             MeasurementError: `stamp` is not finite or not later than the last one.
         """
-        ...
 
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """Correct the belief with landmarks seen at the predicted time. Zero rows are legal: the report is EMPTY.
@@ -94,7 +90,6 @@ class Backend(Protocol):
             MeasurementError: before the first `predict`; an id is not in the map; or the time of the last `predict` has
                 had its update, or landmarks were added or measurements revised at it: these rest on the pose as it was.
         """
-        ...
 
     def add(self, observations: Observations) -> None:
         """Add new landmarks at their first sight; depth comes from the stereo pair (paper A, Eqs. 8 and 10).
@@ -103,7 +98,6 @@ class Backend(Protocol):
             MeasurementError: before the first `predict`; an id is in the map already, or a row has no right pixel or no
                 positive depth.
         """
-        ...
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """Take landmarks out of the map.
@@ -111,7 +105,6 @@ class Backend(Protocol):
         Raises:
             MeasurementError: an id is not in the map.
         """
-        ...
 
     def estimate(self, landmarks: bool = True) -> Estimate:
         """The belief after the last call: pose, landmarks, covariances.
@@ -120,7 +113,6 @@ class Backend(Protocol):
         A smoother may solve further for the whole estimate and for `trajectory`; the pose alone is then the online one,
         which differs by little of its standard deviation.
         """
-        ...
 
     def positions(self, ids: IdArray) -> Array:
         """Current positions (M, 3) [m] of landmarks in world coordinates, in the order of `ids`; no covariance.
@@ -128,11 +120,9 @@ class Backend(Protocol):
         Raises:
             MeasurementError: an id is not in the map.
         """
-        ...
 
     def trajectory(self) -> Trajectory:
         """The left camera's pose at every stamp predicted so far; a smoother's is revised, a filter's is not."""
-        ...
 
 
 @runtime_checkable
@@ -141,7 +131,6 @@ class RestingBackend(Protocol):
 
     def predict_at_rest(self, stamp: float) -> Prediction:
         """As `Backend.predict`, but the camera has not moved since the last stamp, and its velocity is zero."""
-        ...
 
 
 @runtime_checkable
@@ -161,7 +150,6 @@ class RecentBackend(Protocol):
         Raises:
             MeasurementError: before the first `predict`, or n is less than one.
         """
-        ...
 
 
 @runtime_checkable
@@ -186,7 +174,6 @@ class ConsideringBackend(Protocol):
         Raises:
             MeasurementError: after the first `Backend.predict`, or with landmarks in the map.
         """
-        ...
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """J (6, m) of the newest pose, perturbed on the right, and L (N, 3, m) of landmarks, in world coordinates.
@@ -194,7 +181,6 @@ class ConsideringBackend(Protocol):
         Raises:
             MeasurementError: before the first `Backend.predict`; an id is not in the map.
         """
-        ...
 
 
 @runtime_checkable
@@ -217,7 +203,6 @@ class RevisingBackend(Protocol):
         Raises:
             MeasurementError: a corrected measurement is not finite.
         """
-        ...
 
 
 @runtime_checkable
@@ -236,7 +221,6 @@ class MapBackend(Protocol):
         Raises:
             MeasurementError: an id is in the map already, or a covariance is not symmetric and positive definite.
         """
-        ...
 
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """Add landmarks at `local` (N, 3) [m] in the newest camera's coordinates, with covariances (N, 3, 3) [m²].
@@ -248,4 +232,3 @@ class MapBackend(Protocol):
             MeasurementError: before the first `predict`; an id is in the map already, a landmark is not in front of
                 the camera, or a covariance is not symmetric and positive definite.
         """
-        ...

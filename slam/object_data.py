@@ -7,7 +7,7 @@ coordinates does not depend on that choice: it takes a point of the body from it
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +120,3 @@ class MotionLabels:
     moving: NDArray[np.intp]  # rows of features that move, or lie on a moving body (V,)
     undecided: NDArray[np.intp]  # rows of features not seen for long enough to be classified, or in doubt (U,)
     landmarks: IdArray  # ids of landmarks that turned out to move (L,)
-
-    def with_undecided(self, rows: NDArray[np.intp]) -> MotionLabels:
-        """The labels with other features undecided as well, unless they move."""
-        return replace(self, undecided=np.setdiff1d(np.union1d(self.undecided, rows), self.moving))

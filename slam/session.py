@@ -1,25 +1,22 @@
 """Around the step: a prior map, a kidnapped camera and a new map replace the back end, between frames.
 
-`State` is all that a step starts from and leaves behind. A step builds a new one beside it, which takes its place at
-the end, so that a step has happened or has not. If a step finds that the camera is elsewhere, it ends without a state;
-`Session` then gives one with another back end, and the step is made again as a whole.
+If a step finds that the camera is elsewhere, it ends without a state; `Session` then gives one with another back end,
+and the step is made again as a whole.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from slam import registry
 from slam.atlas.atlas import Atlas, TrackingGap
-from slam.atlas.loop_closer import Found, LoopCloser
 from slam.atlas.map_io import SavedMap
-from slam.calibration import RemainingRigError, SelfCalibration
 from slam.checks import definite
-from slam.config import SystemConfig
 from slam.data import (
+    CommonError,
     Estimate,
     FrameResult,
     FrameStatus,
@@ -27,18 +24,13 @@ from slam.data import (
     StereoFeatures,
     UpdateReport,
     UpdateStatus,
-)
+)  # fmt: skip
 from slam.errors import ConfigurationError, SlamError
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, MapBackend
-from slam.rig_error import CommonError
-from slam.tracks.localizer import Localizer, nowhere
-from slam.tracks.mapper import Mapper
-from slam.tracks.monocular import FirstViews
+from slam.tracker import Elsewhere, State, Tracker
+from slam.tracks.localizer import nowhere
 from slam.tracks.standing import Standing
-from slam.tracks.state import TrackingState
 from slam.tracks.step import Step
 from slam.tracks.table import Tracks
 
@@ -47,87 +39,18 @@ from slam.tracks.table import Tracks
 POSITION_SIGMA, ROTATION_SIGMA = 1.0, 0.2
 
 NOT_FOUND = "the camera has not been found in the map yet"
-NEW_MAP = "the place is not in the map: a new map begins"
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end."""
-
-    backend: Backend  # holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`.
-    tracks: Tracks | None = None  # the table of all that is followed or in the map; None before the first frame
-    atlas: Atlas = field(default_factory=Atlas)  # keyframes and loops
-    index: int = -1  # of the last frame
-    stamp: float = -np.inf  # its time [s]
-    tracking: TrackingState = field(default_factory=TrackingState)  # how localization has gone
-    standing: Standing = field(default_factory=Standing)  # whether the camera stands
-    dimensions: int | None = None  # length of the descriptors; None before the first feature
-    mapped: bool = False  # whether there ever was a landmark
-    measured_at: float = -np.inf  # time of the last frame whose pose was measured, or in which a new map began [s]
-    checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
-    # in which the camera has not been found yet; None without one, or once it is found
-    prior_map: SavedMap | None = None
-    views: FirstViews | None = None  # features without depth that are followed until two views give it
-    past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
-    restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
-
-    def begins_at(self, index: int) -> bool:
-        """Whether the back end takes over in this frame."""
-        return index in self.restarted[-1:]
-
-    def after(self, step: Step, atlas: Atlas, checksum: tuple[int, int] | None) -> State:
-        """The state after one more frame."""
-        located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
-        return replace(
-            self, tracks=step.tracks, views=step.views, atlas=atlas, index=step.index,
-            stamp=step.features.stamp, tracking=step.tracking,
-            standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
-            checksum=checksum, mapped=self.mapped or len(step.added) > 0,
-            dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
-            measured_at=step.features.stamp if located else self.measured_at,
-        )  # fmt: skip
-
-    def path(self) -> Trajectory:
-        """The path by all back ends so far, in their frame."""
-        return Trajectory.joined([*self.past, self.backend.trajectory()])
-
-
-@dataclass(frozen=True, eq=False)
-class Elsewhere:
-    """Why a step ended early: the camera is not where the back end has it, so that another one must take over."""
-
-    # the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins
-    T_world_left: Array | None
-    # the place of the atlas by which it was found; None if it was found by the map's landmarks
-    place: Found | None = None
 
 
 class Session:
-    """Makes the parts of a system, and replaces its back end between frames.
+    """Replaces a tracker's back end between frames.
 
     Args:
-        rig: the rectified pair.
-        config: settings for it.
+        tracker: with the parts of the system.
         backend: name of the back ends; None if the first one was given as an object, so that no other can be made.
-        first: the first back end.
-        calibration: of the rig's error.
-
-    Attributes:
-        rig, config, calibration: as given.
-        rig_error: what it adds to the estimate.
-        localizer: finds landmarks; mapper: adds and erases them; loop_closer: finds places.
     """
 
-    def __init__(
-        self, rig: StereoRig, config: SystemConfig, backend: str | None, first: Backend, calibration: SelfCalibration
-    ) -> None:
-        c = config
-        self.rig, self.config, self.calibration = rig, c, calibration
-        self._models, self._backend = c.models, backend
-        self.rig_error = RemainingRigError(self.calibration)
-        self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
-        self.mapper = Mapper(rig, c.map, self.localizer, first)
-        self.loop_closer = LoopCloser(rig, c.atlas.enabled, c.association, c.models, c.map.max_depth_error)
+    def __init__(self, tracker: Tracker, backend: str | None) -> None:
+        self._tracker, self._config, self._backend = tracker, tracker.config, backend
 
     def begin(self, first: Backend, prior_map: SavedMap | None) -> State:
         """The state before the first frame.
@@ -136,7 +59,7 @@ class Session:
             ConfigurationError: there is a prior map, but the back end was not given by name, or cannot start in one.
             SlamError: the map is empty, or too large for the back end.
         """
-        self.rig_error.follow(first)
+        self._tracker.rig_error.follow(first)
         if prior_map is None:
             return State(first)
         if self._backend is None:
@@ -149,19 +72,6 @@ class Session:
         tracks = Tracks.empty(prior_map.descriptors.shape[1]).with_landmarks(prior_map.rows)
         return State(first, tracks, atlas, dimensions=dimensions, mapped=mapped, prior_map=prior_map)
 
-    def can_restart(self, state: State) -> bool:
-        """Whether another back end can take over."""
-        return self._backend is not None and isinstance(state.backend, MapBackend)
-
-    def may_begin_new_map(self, state: State, tracking: TrackingState) -> bool:
-        """Whether the camera is in an unknown place, and a new back end can begin a map there."""
-        unknown = tracking.in_unknown_place(self.config.map.restart_after)
-        return unknown and self.config.atlas.enabled and len(state.atlas) > 0 and self.can_restart(state)
-
-    def find(self, state: State, features: StereoFeatures) -> Found | None:
-        """The camera's pose by the keyframes of the atlas."""
-        return self.loop_closer.find(state.atlas, features, self.calibration.applied, state.index + 1)
-
     def found_in_prior_map(self, state: State, features: StereoFeatures) -> State | None:
         """The state with a back end at the pose at which the camera is found in the prior map; None if it is not.
 
@@ -171,20 +81,20 @@ class Session:
         saved = state.prior_map
         assert saved is not None
         saved.require_fits("", features.descriptors.shape[1])
-        prediction, place = nowhere(features.stamp, self._models.initial_pose), None
-        matches = self.localizer.match(prediction, saved.rows, saved.positions, features, state.index + 1)
-        T = matches.T_world_left if len(matches) >= self.localizer.config.minimum_consistent else None
+        prediction, place = nowhere(features.stamp, self._config.models.initial_pose), None
+        matches = self._tracker.localizer.match(prediction, saved.rows, saved.positions, features, state.index + 1)
+        T = matches.T_world_left if len(matches) >= self._tracker.localizer.config.minimum_consistent else None
         if T is None:
-            place = self.find(state, features)
+            place = self._tracker.find(state, features)
             if place is None:
                 return None
             T = place.T_odom_left
         new, tracks = self._start(T), state.tracks
         _fill(new, saved)
-        self.mapper.next_id = saved.next_id
+        self._tracker.mapper.next_id = saved.next_id
         if place is not None:
             assert tracks is not None
-            tracks = self.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
+            tracks = self._tracker.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
         return replace(state, backend=new, tracks=tracks, prior_map=None)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
@@ -201,7 +111,7 @@ class Session:
 
     def map_estimate(self, state: State, stamp: float) -> Estimate:
         """The prior map, with a guess as the pose; its covariance is so large that the pose means nothing."""
-        k, none = state.prior_map, nowhere(stamp, self._models.initial_pose)
+        k, none = state.prior_map, nowhere(stamp, self._config.models.initial_pose)
         assert k is not None
         return Estimate(stamp, none.T_world_left, none.covariance, k.ids, k.positions, k.covariances)
 
@@ -221,26 +131,27 @@ class Session:
         old, T, stamp = state.backend, elsewhere.T_world_left, features.stamp
         tracks = None
         if T is None:
-            before = self.rig_error.added_to(old, old.estimate(landmarks=False))
-            T, standing, common = before.T_world_left, Standing(), self.rig_error.common(old, as_reported=False)
+            before = self._tracker.rig_error.added_to(old, old.estimate(landmarks=False))
+            T, standing = before.T_world_left, Standing()
+            common = self._tracker.rig_error.common(old, as_reported=False)
             new = self._new(common, T_world_left=T.tolist())
             prediction = new.predict(stamp)
             after = new.estimate(landmarks=False)
-            atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
+            atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._config.models)
         else:
             new, seen_at, tracks = self._start(T), None, state.tracks
-            whole = self.rig_error.added_to(old, old.estimate())
+            whole = self._tracker.rig_error.added_to(old, old.estimate())
             new.insert(whole.ids, whole.positions, definite(whole.covariances))  # type: ignore[attr-defined]
             if elsewhere.place is not None:
                 assert tracks is not None
                 place = elsewhere.place
-                tracks = self.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
+                tracks = self._tracker.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
                 seen_at = place.stamp
             prediction = new.predict(stamp)
-            standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
+            standing = state.standing.after(self._tracker.rig, self._config.models.pixel_sigma, features).moving()
             atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), seen_at)
         path = old.trajectory().select(slice(None, -1))
-        hidden = elsewhere.T_world_left is None and state.tracking.stood and self._models.motion.wheels
+        hidden = elsewhere.T_world_left is None and state.tracking.stood and self._config.models.motion.wheels
         state = replace(
             state, backend=new, tracks=tracks, atlas=atlas, standing=standing,
             tracking=state.tracking.believing(T, stamp, T if hidden else None), past=(*state.past, path),
@@ -254,7 +165,7 @@ class Session:
         `before` is the state after the last frame; `begun` that in which the step began, without landmarks where a new
         map did.
         """
-        if before.tracks is None or begun is before:
+        if before.tracks is None:
             return step
         if begun.tracks is None:
             gone = before.tracks.landmarks().ids
@@ -270,9 +181,9 @@ class Session:
     def _new(self, common: CommonError, **models: Any) -> Backend:
         """Another back end of the same kind; `common` is the error by the rig that its first pose has."""
         assert self._backend is not None
-        changed = replace(self._models, **models)
-        backend: Backend = registry.create("backends", self._backend, self.rig, models=changed, **self.config.backend)
-        self.rig_error.follow(backend, common.jacobian if common.jacobian.size else None)
+        options = {"models": replace(self._config.models, **models), **self._config.backend}
+        backend: Backend = registry.create("backends", self._backend, self._tracker.rig, **options)
+        self._tracker.rig_error.follow(backend, common.jacobian if common.jacobian.size else None)
         return backend
 
 

@@ -18,21 +18,21 @@ from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import transform
 from slam.geometry.trajectory import Trajectory
 from slam.input.extraction import Extracted, Extractor, as_frame
-from slam.input.features import documented, following
-from slam.input.rectification import Rectification
+from slam.input.features import Rectification, documented, following
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
 from slam.models import EstimatorModels
 from slam.naming import count
 from slam.papers.procedure1 import Procedure1Detector
+from slam.runtime.compilation import Stages
 from slam.runtime.memory import keep_freed_memory
-from slam.runtime.stages import Stages
 from slam.runtime.threads import OneThread, one_blas_thread, prefetch
-from slam.session import Elsewhere, Session, State
+from slam.session import Session
 from slam.third_party import named_failures
-from slam.tracker import Tracker, frame_result
+from slam.tracker import Elsewhere, State, Tracker, frame_result
 from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
 
@@ -118,8 +118,9 @@ class StereoSlam:
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
         inside.require_fits(first)
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
-        self._session = Session(inside.rig, inner, names[1], first, self.calibration)
-        self._tracker = Tracker(self._session, _detector_for(inside.rig, c.objects, inner.models), self.frontend)
+        detector, restarts = _detector_for(inside.rig, c.objects, inner.models), names[1] is not None
+        self._tracker = Tracker(inside.rig, inner, self.calibration, first, restarts, detector, self.frontend)
+        self._session = Session(self._tracker, names[1])
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
@@ -226,7 +227,7 @@ class StereoSlam:
         with self._named(f"frame {extracted.frame.index}"):
             result = self._process(extracted.features, extracted.checksum)
         if result.reason == REPEATED:
-            self._extractor.warn_of_repeated(extracted.frame.index)
+            self._extractor.input_warnings.note_repeated(extracted.frame.index)
         return replace(result, milliseconds={**extracted.milliseconds, **result.milliseconds})
 
     def _named(self, place: str) -> AbstractContextManager[None]:
@@ -245,11 +246,11 @@ class StereoSlam:
             standing, prediction = (state.standing, begun) if begun else t.predict(state, features)
         with stage("associate"):  # correct features, find landmarks (paper A, IV): `slam.tracks.localizer`
             step = t.associate(state, features, standing, prediction)
-            if isinstance(step, Elsewhere):  # the camera was found somewhere else in the map
+            if isinstance(step, Elsewhere):  # a kidnapped camera, found elsewhere in the map: `slam.session`
                 return step
         with stage("update"):  # the landmarks' pixels correct pose and map
             step = t.update(state, step)
-            if isinstance(step, Elsewhere):  # the place is unknown: a new map begins
+            if isinstance(step, Elsewhere):  # the place is unknown: a new map begins, see `slam.session`
                 return step
         with stage("estimate"):  # the pose; the calibration learns from it
             step = t.estimate(state, step)
@@ -287,8 +288,10 @@ class StereoSlam:
             done = self._step(state, features, begun)
             assert not isinstance(done, Elsewhere)  # a back end that takes over is believed
         step, atlas = done
-        step = replace(session.with_takeover(self._state, state, step), repeated=repeated)
-        common = session.rig_error.common(state.backend, as_reported=True)
+        if state is not self._state:
+            step = session.with_takeover(self._state, state, step)
+        step = replace(step, repeated=repeated)
+        common = tracker.rig_error.common(state.backend, as_reported=True)
         result = frame_result(step, atlas, state.mapped, revision, self._stages.milliseconds, common)
         self._state, self._stages = state.after(step, atlas, checksum), Stages()
         return out(result)
@@ -316,7 +319,7 @@ class StereoSlam:
         if self._state.prior_map is not None:
             return self._session.map_estimate(self._state, float("nan"))
         estimate = self._tracker.whole_estimate(self._state)
-        common = self._session.rig_error.common(self.backend, as_reported=False)
+        common = self._tracker.rig_error.common(self.backend, as_reported=False)
         return self.atlas.estimate(estimate, common, not of_map)
 
     @one_blas_thread
@@ -332,15 +335,17 @@ class StereoSlam:
             if self._state.tracks is None:
                 raise SlamError("there is no map yet: no frame was processed")
             estimate = self._estimate(of_map=True)
-            rows = self._state.tracks.landmarks().in_world(self.atlas.T_map_odom)
-            keyframes = (k.corrected(self.calibration.applied, self._session.rig) for k in self.atlas.keyframes)
+            rows = self._state.tracks.landmarks()
+            rows = replace(rows, seen_from=transform(self.atlas.T_map_odom, rows.seen_from))
+            keyframes = (k.corrected(self.calibration.applied, self._tracker.rig) for k in self.atlas.keyframes)
             atlas = replace(self.atlas, keyframes=tuple(keyframes))
             return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, atlas, self.rig)
 
     @property
     def warnings(self) -> list[str]:
         """Warnings about images, stamps or baseline, one line each (see `slam.input.warnings`)."""
-        return self._extractor.warnings
+        said = self._extractor.input_warnings
+        return [*said.lines, *filter(None, [said.repeated])]
 
     def __getstate__(self) -> dict[str, object]:
         """State for copying and pickling; refused while another thread is in a step."""

@@ -1,69 +1,153 @@
-"""The stages of a step, each a function of the frame in work; `slam.system` puts them in order."""
+"""The parts of a system and the stages of a step, each a function of the frame in work; `slam.system` orders them.
+
+`State` is all that a step starts from and leaves behind. A step builds a new one beside it, which takes its place at
+the end, so that a step has happened or has not.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from slam.atlas.atlas import Atlas
+from slam.atlas.loop_closer import Found, LoopCloser
+from slam.atlas.map_io import SavedMap
 from slam.bodies.detector import ObjectDetector
+from slam.calibration import RemainingRigError, SelfCalibration
+from slam.config import SystemConfig
 from slam.data import (
+    CommonError,
     Estimate,
     FrameResult,
     FrameStatus,
     IdArray,
     Prediction,
+    Revision,
     StereoFeatures,
     UpdateReport,
     UpdateStatus,
-)
+)  # fmt: skip
 from slam.geometry.arrays import Array, isin
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse
+from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
-from slam.interfaces import AligningFrontend, Frontend, RestingBackend
+from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, RestingBackend
 from slam.object_data import MovingObject
-from slam.rig_error import CommonError, Revision
-from slam.session import NEW_MAP, Elsewhere, Session, State
 from slam.third_party import checked
 from slam.tracks.alignment import align, take_patches
-from slam.tracks.localizer import LandmarkMatches, Search
+from slam.tracks.localizer import Localizer, Search
+from slam.tracks.mapper import Mapper
 from slam.tracks.standing import Standing
-from slam.tracks.state import HIDDEN
-from slam.tracks.step import Step
+from slam.tracks.step import HIDDEN, LandmarkMatches, Step, TrackingState
 from slam.tracks.table import Tracks
+
+NEW_MAP = "the place is not in the map: a new map begins"
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end."""
+
+    backend: Backend  # holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`.
+    tracks: Tracks | None = None  # the table of all that is followed or in the map; None before the first frame
+    atlas: Atlas = field(default_factory=Atlas)  # keyframes and loops
+    index: int = -1  # of the last frame
+    stamp: float = -np.inf  # its time [s]
+    tracking: TrackingState = field(default_factory=TrackingState)  # how localization has gone
+    standing: Standing = field(default_factory=Standing)  # whether the camera stands
+    dimensions: int | None = None  # length of the descriptors; None before the first feature
+    mapped: bool = False  # whether there ever was a landmark
+    measured_at: float = -np.inf  # time of the last frame whose pose was measured, or in which a new map began [s]
+    checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
+    # in which the camera has not been found yet; None without one, or once it is found
+    prior_map: SavedMap | None = None
+    past: tuple[Trajectory, ...] = ()  # the paths of all back ends before the present one
+    restarted: tuple[int, ...] = ()  # indices of the frames in which another back end took over
+
+    def begins_at(self, index: int) -> bool:
+        """Whether the back end takes over in this frame."""
+        return index in self.restarted[-1:]
+
+    def after(self, step: Step, atlas: Atlas, checksum: tuple[int, int] | None) -> State:
+        """The state after one more frame."""
+        located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
+        return replace(
+            self, tracks=step.tracks, atlas=atlas, index=step.index,
+            stamp=step.features.stamp, tracking=step.tracking,
+            standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
+            checksum=checksum, mapped=self.mapped or len(step.added) > 0,
+            dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
+            measured_at=step.features.stamp if located else self.measured_at,
+        )  # fmt: skip
+
+    def path(self) -> Trajectory:
+        """The path by all back ends so far, in their frame."""
+        return Trajectory.joined([*self.past, self.backend.trajectory()])
+
+
+@dataclass(frozen=True, eq=False)
+class Elsewhere:
+    """Why a step ended early: the camera is not where the back end has it, so that another one must take over."""
+
+    # the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins
+    T_world_left: Array | None
+    # the place of the atlas by which it was found; None if it was found by the map's landmarks
+    place: Found | None = None
 
 
 class Tracker:
-    """The stages of a step.
+    """The parts of a system, and the stages of a step.
 
     Args:
-        session: with the parts of the system, and the back ends.
+        rig: the rectified pair.
+        config: settings for it.
+        calibration: of the rig's error.
+        backend: the first one.
+        restarts: whether another one of its kind can take over.
         objects: detects what moves.
         frontend: made the features; those of landmarks are aligned with earlier images if it can do that.
 
     Attributes:
+        rig_error: what the calibration's error adds to the estimate.
+        localizer: finds landmarks; mapper: adds and erases them; loop_closer: finds places.
         advanced: stamp to which a back end was last advanced [s]; an interrupted step counts.
     """
 
-    def __init__(self, session: Session, objects: ObjectDetector, frontend: Frontend | None) -> None:
-        self.objects = objects
-        self.advanced = -np.inf
-        self._session = session
-        aligns = session.config.association.align and isinstance(frontend, AligningFrontend)
+    def __init__(
+        self, rig: StereoRig, config: SystemConfig, calibration: SelfCalibration, backend: Backend, restarts: bool,
+        objects: ObjectDetector, frontend: Frontend | None,
+    ) -> None:  # fmt: skip
+        c = config
+        self.rig, self.config, self.calibration, self.objects = rig, c, calibration, objects
+        self.rig_error = RemainingRigError(calibration)
+        self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
+        self.mapper = Mapper(rig, c.map, self.localizer, backend)
+        self.loop_closer = LoopCloser(rig, c.atlas.enabled, c.association, c.models, c.map.max_depth_error)
+        self.advanced, self._restarts = -np.inf, restarts
+        aligns = c.association.align and isinstance(frontend, AligningFrontend)
         self._aligning: AligningFrontend | None = frontend if aligns else None  # type: ignore[assignment]
+
+    def find(self, state: State, features: StereoFeatures) -> Found | None:
+        """The camera's pose by the keyframes of the atlas."""
+        return self.loop_closer.find(state.atlas, features, self.calibration.applied, state.index + 1)
+
+    def _can_restart(self, state: State) -> bool:
+        """Whether another back end can take over."""
+        return self._restarts and isinstance(state.backend, MapBackend)
 
     def revise(self, state: State) -> Revision | None:
         """Apply the present estimate of the rig's error, also to earlier measurements if the back end can."""
-        change = self._session.rig_error.apply(state.backend)
+        change = self.rig_error.apply(state.backend)
         if change is not None and state.tracks is not None:
             self.objects.revise(state.tracks, change.rows)
-        return self._session.rig_error.revise(state.backend, restarted=bool(state.past))
+        return self.rig_error.revise(state.backend, restarted=bool(state.past))
 
     def predict(self, state: State, features: StereoFeatures) -> tuple[Standing, Prediction]:
         """Whether the camera stands, and the back end's prediction for the time of the features."""
-        standing = state.standing.after(self._session.rig, self._session.config.models.pixel_sigma, features)
+        standing = state.standing.after(self.rig, self.config.models.pixel_sigma, features)
         at_rest = standing.stands and isinstance(state.backend, RestingBackend)
         ask = state.backend.predict_at_rest if at_rest else state.backend.predict  # type: ignore[attr-defined]
         prediction: Prediction = checked(state.backend, "predict", ask(features.stamp))
@@ -74,7 +158,7 @@ class Tracker:
         self, state: State, features: StereoFeatures, standing: Standing, prediction: Prediction
     ) -> Step | Elsewhere:
         """Match landmarks with features, and align the features with earlier images."""
-        corrected, place = self._session.calibration.correct(features), None
+        corrected, place = self.calibration.correct(features), None
         tracks = state.tracks
         if tracks is None or (tracks.descriptors.shape[1] != features.descriptors.shape[1] and not len(tracks.mapped)):
             tracks = Tracks.empty(features.descriptors.shape[1])
@@ -84,29 +168,26 @@ class Tracker:
 
         def elsewhere() -> Array | None:
             nonlocal place
-            place = self._session.find(state, corrected)
+            place = self.find(state, corrected)
             return None if place is None else place.T_odom_left
 
-        localizer, index, tracking = self._session.localizer, state.index + 1, state.tracking
+        localizer, index, tracking = self.localizer, state.index + 1, state.tracking
         search = Search(localizer, prediction, landmarks, positions, corrected, index)
         if state.begins_at(index):
             matches = search.match()
         else:
             matches, tracking, standing = search.follow(tracking, standing, elsewhere)
         if matches.kidnapped:
-            if self._session.can_restart(state):
+            if self._can_restart(state):
                 return Elsewhere(matches.T_world_left, place)
             matches = LandmarkMatches.nothing()
         tracks.count_returning(matches.returning)
         aligned = features
         if self._aligning is not None:
-            aligned = align(self._session.rig, self._aligning, features, matches, tracks, backend.positions)
+            aligned = align(self.rig, self._aligning, features, matches, tracks, backend.positions)
         if aligned is not features:
             corrected = _shifted_as(corrected, features, aligned)
-        step = Step(
-            index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking,
-            state.views,
-        )  # fmt: skip
+        step = Step(index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking)
         suspects = self._suspects(step)
         moving = isin(matches.ids, suspects)
         matches, withheld = matches.select(~moving), matches.select(moving)
@@ -127,18 +208,21 @@ class Tracker:
         matches, standing = step.matches, step.standing
         answer = state.backend.update(matches.observations(step.features), matches.T_world_left)
         report: UpdateReport = checked(state.backend, "update", answer)
-        tracking = self._session.localizer.state_after(
+        tracking = self.localizer.state_after(
             step.tracking, step.prediction, step.features, matches, report, standing.stands
         )
         if state.begins_at(step.index):
             report = replace(report, reason=report.reason if len(step.tracks.mapped) else NEW_MAP)
-        elif not standing.holds(tracking.lost) and self._session.may_begin_new_map(state, tracking):
+        elif (
+            tracking.in_unknown_place(self.config.map.restart_after) and not standing.holds(tracking.lost)
+            and self.config.atlas.enabled and len(state.atlas) > 0 and self._can_restart(state)
+        ):  # fmt: skip
             return Elsewhere(None)
         return replace(step, report=report, tracking=tracking)
 
     def estimate(self, state: State, step: Step) -> Step:
         """The camera's pose after an update; the rig's calibration learns from the frame."""
-        self._session.calibration.observe(replace(step.measured, images=None), step.pose)
+        self.calibration.observe(replace(step.measured, images=None), step.pose)
         estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
         return replace(step, estimate=estimate)
 
@@ -146,12 +230,15 @@ class Tracker:
         """Which features move, and the moving bodies."""
         features, standing = step.features, step.standing
         labels, objects = self.objects.step(state.backend, step.tracks, features, step.estimate, standing.witnesses)
-        labels = labels.with_undecided(standing.leaving(len(features)))
+        if standing.stands:  # a feature that does not stay is undecided, unless it moves
+            leaving = np.setdiff1d(np.arange(len(features)), standing.witnesses)
+            undecided = np.setdiff1d(np.union1d(labels.undecided, leaving), labels.moving)
+            labels = replace(labels, undecided=undecided)
         return replace(step, labels=labels, objects=objects)
 
     def manage(self, state: State, step: Step) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
-        step = self._session.mapper.update(state.backend, step)
+        step = self.mapper.update(state.backend, step)
         if self._aligning is not None:
             seen, T = step.matches.joined(step.added), step.estimate.T_world_left
             take_patches(self._aligning, step.measured, seen, step.tracks, T)
@@ -162,22 +249,22 @@ class Tracker:
 
         The frame becomes a keyframe where its view differs; a loop corrects the path.
         """
-        session, rig_error, backend = self._session, self._session.rig_error, state.backend
+        rig_error, backend = self.rig_error, state.backend
         estimate, common = rig_error.added_to(backend, step.estimate), rig_error.common(backend, as_reported=False)
-        step = replace(step, estimate=estimate, common=common, correction=session.calibration.applied)
-        return step, session.loop_closer.update(state.atlas, step, state.path)
+        step = replace(step, estimate=estimate, common=common, correction=self.calibration.applied)
+        return step, self.loop_closer.update(state.atlas, step, state.path)
 
     def roll_back(self, state: State) -> State:
         """The state after an interrupted step: what that did to the back end's map is undone, bodies are forgotten."""
         self.objects.restart()
         if state.prior_map is not None or not np.isfinite(self.advanced):  # that back end has not begun
             return state
-        return replace(state, tracks=self._session.mapper.reconcile(state.backend, state.tracks))
+        return replace(state, tracks=self.mapper.reconcile(state.backend, state.tracks))
 
     def whole_estimate(self, state: State) -> Estimate:
         """Pose and map of the back end, with the rig's uncertainty."""
         estimate = checked(state.backend, "estimate", state.backend.estimate())
-        return self._session.rig_error.added_to(state.backend, estimate)
+        return self.rig_error.added_to(state.backend, estimate)
 
 
 def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:

@@ -18,11 +18,10 @@ from scipy.linalg import block_diag
 from slam.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.atlas.places import PlaceIndex
 from slam.atlas.pose_graph import Chain, PoseGraph, between_keyframes
-from slam.data import Estimate
+from slam.data import CommonError, Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import ANYWHERE, EstimatorModels
-from slam.rig_error import CommonError
 
 _ACTIVE = 200  # cost: loops in the pose graph at most: each makes the next one slower
 _INACTIVE = 200  # cost: loops outside the pose graph that are kept
@@ -41,7 +40,7 @@ class MapAnchor:
     # in the map: joint covariance (6 + n, 6 + n) of the pose, perturbing on the right, and of the common errors
     covariance: Array
     common: Array  # estimate of the common errors (n,), in units of their prior standard deviations
-    rig: CommonError  # what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`
+    rig: CommonError  # what the common errors stand for and how they move the pose, see `slam.data.CommonError`
 
     def belief(self, rig: CommonError) -> tuple[Array, Array]:
         """The common errors (n,) in units of `rig`, as the rig's posterior has changed since, and their covariance.
@@ -53,16 +52,14 @@ class MapAnchor:
         return np.linalg.lstsq(rig.root, self.rig.root @ self.common, rcond=None)[0], self.covariance[6:, 6:]
 
     def later(self, back: Array, shares: Array) -> Array:
-        """Covariance (6, 6) of a later pose, without the noise since.
+        """Covariance (6, 6) of a later pose, without the noise since; the anchor's pose there has the adjoint `back`.
 
-        The path since the anchor is not corrected by the common errors, so their estimate counts as an error too.
-
-        `back` (6, 6) is the adjoint of the anchor's pose in the later one's coordinates, `shares` (6, m) the derivative
-        of the motion since by the rig's errors.
+        The path since is not corrected by the common errors, so their estimate counts as an error too, by `shares`
+        (6, m), the derivative of the motion since.
         """
         J = np.concatenate([back, shares @ self.rig.root], axis=1)
-        found = shares @ self.rig.root @ self.common
-        return np.asarray(J @ self.covariance @ J.T + np.outer(found, found))
+        shared = shares @ self.rig.root @ self.common
+        return np.asarray(J @ self.covariance @ J.T + np.outer(shared, shared))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +149,8 @@ class Atlas:
         Keyframes of a prior map are included, and also counted separately as ``known``.
         """
         closed = sum(loop.second >= self.prior_count for loop in self.loops)
-        known = {"known": self.prior_count} if self.prior_count else {}
-        return {"keyframes": len(self), **known, "closed": closed + self.dropped, "refused": len(self.refused)}
+        prior = {"known": self.prior_count} if self.prior_count else {}
+        return {"keyframes": len(self), **prior, "closed": closed + self.dropped, "refused": len(self.refused)}
 
     def with_loop(self, loop: Loop) -> Atlas:
         """A copy with one more loop; of too many, the one whose neighbours on the path are closest is dropped."""
@@ -169,18 +166,18 @@ class Atlas:
         """A copy with one more loop outside the pose graph."""
         return replace(self, inactive_loops=(*self.inactive_loops, loop)[-_INACTIVE:])
 
-    def with_loops(self, held: Sequence[Loop], believed: Sequence[Loop]) -> Atlas:
+    def with_loops(self, chosen: Sequence[Loop], believed: Sequence[Loop]) -> Atlas:
         """A copy with other loops in the pose graph; previous ones that are not `believed` any more become refused.
 
         `held` and `believed` are in order of their second keyframes.
         """
-        good, kept = {x.pair for x in believed}, {x.pair for x in held}
-        out = [x for x in self.loops if x.pair not in kept]
+        good, in_graph = {x.pair for x in believed}, {x.pair for x in chosen}
+        out = [x for x in self.loops if x.pair not in in_graph]
         refused = [pair for pair in self.refused if pair not in good]
         refused += [x.pair for x in out if x.pair not in good]
-        spare = [x for x in (*self.inactive_loops, *out) if x.pair not in kept][-_INACTIVE:]
+        spare = [x for x in (*self.inactive_loops, *out) if x.pair not in in_graph][-_INACTIVE:]
         return replace(
-            self, loops=tuple(held), inactive_loops=tuple(spare), refused=tuple(refused), pending=held[-1],
+            self, loops=tuple(chosen), inactive_loops=tuple(spare), refused=tuple(refused), pending=chosen[-1],
             confirmed=True,
         )  # fmt: skip
 
@@ -209,14 +206,13 @@ class Atlas:
     ) -> Atlas:
         """A copy with a new back end from here on, which takes its first pose for exact; in the map it is uncertain.
 
-        `since` [s] is the time of the last measured pose; `before` the earlier back end's last estimate, with the rig's
-        uncertainty, `after` the new one's first, at the same pose; `common` the part of the pose's error that other
-        frames share.
+        The last pose was measured at `since` [s]. `before` is the earlier back end's last estimate, with the rig's
+        uncertainty, of which `common` is a part; `after` is the new one's first, at the same pose.
         """
         n = common.root.shape[1]
-        error, known = (np.zeros(n), np.eye(n)) if self.anchor is None else self.anchor.belief(common)
+        error, error_covariance = (np.zeros(n), np.eye(n)) if self.anchor is None else self.anchor.belief(common)
         P = covariance_after_unseen_motion(self.estimate(before, common).covariance, after.stamp - since, models)
-        anchor = MapAnchor(after.T_world_left, after.covariance, block_diag(P, known), error, common)
+        anchor = MapAnchor(after.T_world_left, after.covariance, block_diag(P, error_covariance), error, common)
         return replace(self, gaps=(*self.gaps, TrackingGap(since, after.stamp, P, anchor)), anchor=anchor)
 
     def partners(self, frame: int) -> tuple[int | None, int | None]:
@@ -230,8 +226,7 @@ class Atlas:
     def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as estimated at the time, or as revised in `path`.
 
-        `rig` says what the common errors stand for now. Without a path the poses are as they were estimated at the
-        time.
+        `rig` says what the common errors stand for now.
         """
         poses, count, m = self.poses.copy(), len(self), len(rig.root)
         if path is not None:
@@ -273,11 +268,13 @@ class Atlas:
         if self.solved is None or not len(path):
             return path
         chain = self.chain(self.solved.rig, path)
-        moved = self.in_map(chain.poses)
+        corrected = self.in_map(chain.poses)
         with suppress(np.linalg.LinAlgError):  # then the keyframes stay as the last loop left them
-            moved = PoseGraph.solved(chain, self.loops, moved).keyframe_poses()
+            corrected = PoseGraph.solved(chain, self.loops, corrected).keyframe_poses()
         stamps = self.stamps[self.prior_count :]
-        return Trajectory(path.stamps, between_keyframes(path, stamps, moved[self.prior_count :], self._unseen_time))
+        return Trajectory(
+            path.stamps, between_keyframes(path, stamps, corrected[self.prior_count :], self._unseen_time)
+        )
 
     def _unseen_time(self, stamps: Array) -> Array:
         """Total duration (N,) [s] of gaps before each of `stamps` (N,) [s]."""
@@ -291,9 +288,7 @@ def covariance_after_unseen_motion(covariance: Array, duration: float, models: E
 
     The motion model takes changes of velocity for white noise, which bends and stops in a long gap are not. So the
     motion model's initial velocity uncertainty acts throughout the gap as well, up to a wholly unknown direction and
-    position.
-
-    `covariance` (6, 6) is by the motion model, `duration` [s] that of the gap.
+    position. `covariance` (6, 6) is by the motion model, `duration` [s] that of the gap.
     """
     speeds = np.array([models.initial_angular_velocity_sigma, models.initial_velocity_sigma])
     most = np.array([_UNKNOWN_DIRECTION, ANYWHERE])
@@ -313,6 +308,6 @@ def landmarks_by_pose(estimate: Estimate, covariance: Array, may_grow: bool = Fa
     T, P = estimate.T_world_left, estimate.covariances
     J = T[:3, :3] @ points_by_pose(transform(inverse(T), estimate.positions))
     before, after = (J @ pose @ np.swapaxes(J, 1, 2) for pose in (estimate.covariance, covariance))
-    moved = covariance_growth(P, before) + after
-    surer = np.trace(moved, axis1=1, axis2=2) < np.trace(P, axis1=1, axis2=2)
-    return np.where((surer | may_grow)[:, None, None], moved, P)
+    exchanged = covariance_growth(P, before) + after
+    surer = np.trace(exchanged, axis1=1, axis2=2) < np.trace(P, axis1=1, axis2=2)
+    return np.where((surer | may_grow)[:, None, None], exchanged, P)

@@ -12,9 +12,9 @@ from slam.atlas.atlas import Atlas
 from slam.atlas.config import AtlasConfig
 from slam.atlas.keyframes import Loop, distance
 from slam.atlas.pose_graph import Chain, PoseGraph
+from slam.data import CommonError
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.rig_error import CommonError
 
 _DIMENSIONS = 6  # fixed: mean of χ² of a pose
 _LIMIT = AtlasConfig.gate_sigmas**2  # largest squared Mahalanobis distance of a loop from the pose graph

@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.atlas.config import AtlasConfig
-from slam.data import IdArray
+from slam.data import Correction, IdArray
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, log, transform
-from slam.rig_error import Correction
+from slam.geometry.se3 import Array, adjoint, inverse, log
 
 _ROUNDING = 1e-14  # numerics: variances below this share of the largest are rounding
 
@@ -26,7 +24,7 @@ class Keyframe:
     covariance: Array  # of that pose (6, 6), without the common errors
     # covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the right
     step_covariance: Array
-    # derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`
+    # derivative (6, m) of the pose by the errors that all poses share, see `slam.data.CommonError`
     jacobian: Array
     travelled: float  # length of the path up to here [m]
     depth: float  # median depth of the features [m]
@@ -71,17 +69,6 @@ def distance(expected: Array, found: Array, covariance: Array) -> float:
     """Squared Mahalanobis distance of two poses (4, 4)."""
     xi = log(inverse(expected) @ found)
     return float(xi @ np.linalg.solve(covariance, xi))
-
-
-def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig) -> bool:
-    """Whether a camera's view differs enough from a keyframe's for a new one: other features, or another viewpoint.
-
-    `motion` is the camera's pose (4, 4) in the keyframe's coordinates.
-    """
-    if np.linalg.norm(motion[:3, 3]) > AtlasConfig.keyframe_distance * keyframe.depth:
-        return True
-    uv = rig.left.project(transform(inverse(motion), keyframe.points.astype(float)))
-    return bool(rig.left.in_image(uv).mean() < AtlasConfig.keyframe_share)
 
 
 def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> Array:

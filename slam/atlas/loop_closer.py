@@ -11,20 +11,18 @@ from numpy.typing import NDArray
 from slam.atlas.atlas import Atlas
 from slam.atlas.closing import close
 from slam.atlas.config import AtlasConfig
-from slam.atlas.keyframes import Keyframe, Loop, step_covariance, view_has_changed
+from slam.atlas.keyframes import Keyframe, Loop, step_covariance
 from slam.atlas.verification import keyframe_landmarks, verify
-from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.data import BoolArray, Correction, IdArray, StereoFeatures
 from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.rig_error import Correction
-from slam.runtime.threads import one_blas_thread
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import match_everywhere
 from slam.tracks.localizer import Localizer
-from slam.tracks.management import depth_is_known
+from slam.tracks.mapper import depth_is_known
 from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
 
@@ -68,7 +66,6 @@ class LoopCloser:
         association = replace(association, wide_hypotheses=_HYPOTHESES, consistency_sigmas=lax)
         self._localizer = Localizer(self._rig, association, models)
 
-    @one_blas_thread
     def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> Atlas:
         """The atlas after a frame; `path` returns the path in odom so far."""
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
@@ -94,7 +91,6 @@ class LoopCloser:
         same = self._is_same_view(atlas, loop, step.features)
         return close(atlas, loop, step.common, path, same)
 
-    @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
         """Find a camera that may be anywhere by the keyframes; None if no place fits or several do.
 
@@ -231,3 +227,14 @@ class LoopCloser:
         """Whether two verified loops put the camera at positions closer together than the scene's depth."""
         T, U = (atlas.poses_in_map[loop.first] @ loop.T_first_second for loop in (one, other))
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
+
+
+def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig) -> bool:
+    """Whether a camera's view differs enough from a keyframe's for a new one: other features, or another viewpoint.
+
+    `motion` is the camera's pose (4, 4) in the keyframe's coordinates.
+    """
+    if np.linalg.norm(motion[:3, 3]) > AtlasConfig.keyframe_distance * keyframe.depth:
+        return True
+    uv = rig.left.project(transform(inverse(motion), keyframe.points.astype(float)))
+    return bool(rig.left.in_image(uv).mean() < AtlasConfig.keyframe_share)

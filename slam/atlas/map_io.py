@@ -19,13 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.archives import array, json_text, unpack
 from slam.atlas.atlas import Atlas
 from slam.atlas.keyframes import Keyframe, Loop
 from slam.checks import FARTHEST_POSITION, MOST_ID, definite, require_known
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
-from slam.files import read_bytes, whole_file
+from slam.files import array, json_text, read_bytes, unpack, whole_file
 from slam.geometry.rig import StereoRig
 from slam.geometry.rig_numbers import rig_difference, rig_numbers
 from slam.geometry.se3 import Array, nearest_rotation

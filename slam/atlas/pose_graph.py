@@ -85,12 +85,10 @@ class Chain:
 
 
 def spread(chain: Chain, ends: NDArray[np.intp], propagated: tuple[Array, Array], moved: Array, common: Array) -> Array:
-    """Poses (K, 4, 4) of all keyframes, from those that bound stretches: each stretch's change is distributed.
+    """Poses (K, 4, 4) of all keyframes, where those (M,) that bound stretches have `moved` to poses (M, 4, 4).
 
-    Each motion gets its part by the common errors; the rest is distributed in proportion to the noise.
-
-    `ends` (M,) are the keyframes that bound stretches, `moved` (M, 4, 4) their new poses, `common` (m,) the common
-    errors; for `propagated` see `Chain.propagated`.
+    Of a stretch's change each motion gets its part by the `common` errors (m,); the rest is distributed in proportion
+    to the noise, see `Chain.propagated`.
     """
     number = np.arange(len(chain.poses))
     at = np.maximum(np.searchsorted(ends, number), 1) - 1  # row of each keyframe's stretch
@@ -108,13 +106,9 @@ def spread(chain: Chain, ends: NDArray[np.intp], propagated: tuple[Array, Array]
 
 
 def spread_over(begin: Array, motion: Array, rest: Array, change: Array) -> Array:
-    """Poses (N, 4, 4) on stretches whose ends move.
+    """Poses (N, 4, 4) on stretches that begin at moved poses, by the estimated `motion` from there to the poses.
 
-    Args:
-        begin: the moved poses (N, 4, 4) at which their stretches begin.
-        motion: estimated motion from there to the poses (N, 4, 4).
-        rest: estimated motion from the poses to the ends of their stretches (N, 4, 4).
-        change: of the motions (N, 6), perturbing the poses at the stretches' ends on the right.
+    The `change` (N, 6) of the motions perturbs the stretches' ends on the right, to which the path goes by `rest`.
     """
     return np.asarray(begin @ motion @ exp((adjoint(rest) @ change[:, :, None])[:, :, 0]))
 
@@ -122,8 +116,7 @@ def spread_over(begin: Array, motion: Array, rest: Array, change: Array) -> Arra
 def between_keyframes(path: Trajectory, stamps: Array, moved: Array, unseen_time: Callable[[Array], Array]) -> Array:
     """Poses (N, 4, 4) of a path whose keyframes, at `stamps` (K,) [s], are moved to other poses (K, 4, 4).
 
-    Between two keyframes the change is interpolated in time; if there was a gap between them, all
-    of it is put into the gap, of which `unseen_time` gives the duration.
+    Between two keyframes the change is interpolated in time; with a gap between them, over its `unseen_time` alone.
     """
     rows = np.searchsorted(path.stamps, stamps)
     odom = path.poses[rows]
@@ -157,17 +150,10 @@ class PoseGraph:
     def solved(
         cls, chain: Chain, loops: Sequence[Loop], start: Array, also: Sequence[int] = (), common: Array | None = None
     ) -> PoseGraph:
-        """The graph of a path and loops, solved.
+        """The graph of a path and loops, solved from poses (K, 4, 4) of all keyframes and the common errors (m,).
 
-        Args:
-            chain: the path.
-            loops: in the graph.
-            start: poses (K, 4, 4) of all keyframes, at which the graph is first linearised.
-            also: further keyframes whose poses are variables, besides those at which loops end.
-            common: the common errors (m,) to start from; zero by default.
-
-        Raises:
-            LinAlgError: the equations are singular to working precision.
+        Keyframes `also` are variables besides those at which loops end. Raises LinAlgError where the equations are
+        singular to working precision.
         """
         ends = np.unique([0, len(chain.poses) - 1, *also, *(k for x in loops for k in x.pair)]).astype(np.intp)
         common = np.zeros(chain.common.shape[2]) if common is None else common

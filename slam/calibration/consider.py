@@ -23,11 +23,10 @@ import numpy as np
 
 from slam.calibration.estimator import SelfCalibration
 from slam.calibration.model import Revision, RigModel
-from slam.data import Estimate
+from slam.data import CommonError, Estimate
 from slam.geometry.arrays import Array
 from slam.geometry.se3 import adjoint
 from slam.interfaces import Backend, ConsideringBackend, RevisingBackend
-from slam.rig_error import CommonError
 
 #: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
 _SIGNIFICANT = 0.5

@@ -19,12 +19,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from slam.data import CommonError
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.evaluation.truth_error import RowArray, doubtful, interpolated, truth_covariances
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.se3 import adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.rig_error import CommonError
 
 #: Lengths of the stretches over which relative poses are compared [m].
 STRETCHES = (1.0, 10.0, 100.0)

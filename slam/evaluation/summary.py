@@ -9,12 +9,12 @@ from typing import Protocol
 
 import numpy as np
 
+from slam.data import CommonError
 from slam.errors import TrajectoryError
 from slam.evaluation.consistency import consistency_figures
 from slam.evaluation.metrics import absolute_errors, associate, relative_errors, segment_errors
 from slam.geometry.se3 import Array, inverse, so3_log
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.rig_error import CommonError
 
 logger = logging.getLogger("slam.evaluation")
 

@@ -14,7 +14,7 @@ from slam.input.features import documented, outside_masks
 from slam.input.warnings import InputWarnings, shows_something
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
-from slam.runtime.stages import Stages
+from slam.runtime.compilation import Stages
 from slam.runtime.threads import OneThread, one_blas_thread
 from slam.third_party import named_failures
 
@@ -65,21 +65,15 @@ class Extractor:
         frontend: to use; its settings give the largest row difference of left and right features.
         rig: the cameras.
         models: noise of the features.
+
+    Attributes:
+        input_warnings: about the images so far.
     """
 
     def __init__(self, frontend: Frontend | None, rig: StereoRig, models: EstimatorModels) -> None:
         rows = getattr(getattr(frontend, "config", None), "epipolar", _ROWS)
-        self._rig, self._warnings = rig, InputWarnings(rig, models, rows)
+        self._rig, self.input_warnings = rig, InputWarnings(rig, models, rows)
         self._extracting = OneThread("this system's front end")
-
-    @property
-    def warnings(self) -> list[str]:
-        """Warnings about the images so far, one line each (see `slam.input.warnings`)."""
-        return [*self._warnings.lines, *filter(None, [self._warnings.repeated])]
-
-    def warn_of_repeated(self, number: int) -> None:
-        """Warn, the first time only, of a frame, by its number in its sequence, with the images of the one before."""
-        self._warnings.note_repeated(number)
 
     @one_blas_thread
     def extract(self, frontend: Frontend | None, frame: StereoFrame) -> Extracted:
@@ -97,10 +91,10 @@ class Extractor:
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
         with self._extracting:
-            checksum, copy = self._warnings.copied(frame, checksum_of(frame))
+            checksum, copy = self.input_warnings.copied(frame, checksum_of(frame))
             used = replace(frame, right=None) if copy else frame
             with stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
                 features = outside_masks(documented(frontend.extract(used), self._rig), used, self._rig)
-            self._warnings.look(used, features)
-            self._warnings.used(frame, checksum, copy)
+            self.input_warnings.look(used, features)
+            self.input_warnings.used(frame, checksum, copy)
         return Extracted(used, features, stages.milliseconds, checksum)

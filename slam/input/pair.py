@@ -125,9 +125,9 @@ def _shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right
     plain = StereoRig(own, other, rig.R, rig.b)
     a, b = (uv[:, None].astype(np.float32) for uv in (uv_left, uv_right))
     size, flags = (15, 15), cv2.OPTFLOW_USE_INITIAL_FLOW
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(left, right, a, b, winSize=size, maxLevel=0, flags=flags)
-    kept = (found[:, 0] > 0) & (np.abs(moved[:, 0] - uv_right).max(axis=1) < _TOLERANCE)
-    a, b = uv_left[kept], moved[kept, 0].astype(float)
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(left, right, a, b, winSize=size, maxLevel=0, flags=flags)
+    good = (status[:, 0] > 0) & (np.abs(tracked[:, 0] - uv_right).max(axis=1) < _TOLERANCE)
+    a, b = uv_left[good], tracked[good, 0].astype(float)
     rectified, believed = _offsets(rig, a, b)[1], _SHOWN_PLAIN if plain.is_rectified else _SHOWN
     return min(_share(before, rectified, believed) for before in (b[:, 1] - a[:, 1], _offsets(plain, a, b)[1]))
 

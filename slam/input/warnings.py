@@ -14,7 +14,7 @@ from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
 from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of
 from slam.models import EstimatorModels
-from slam.tracks.state import ENOUGH_FEATURES
+from slam.tracks.step import ENOUGH_FEATURES
 
 logger = logging.getLogger("slam.input")
 
@@ -79,8 +79,13 @@ class InputWarnings:
                 the other way round, and hardly any has a right match as it is. Nothing is changed then.
         """
         own, images = None, _Images(frame, self._rig)
-        if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK:  # a power of two
-            own = self._own_geometry(images, 10 * int(features.has_stereo.sum()) < len(features))
+        if (
+            self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK and not self._pair_is_named
+        ):  # 0, 1, 2, 4 …
+            own = self._geometry(images, images)
+            unpaired = 10 * int(features.has_stereo.sum()) < len(features)
+            if own is not None and not self._pair_is_known and own.swapped and unpaired:
+                raise SequenceError(_swapped(own))
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
@@ -127,27 +132,32 @@ class InputWarnings:
         if self._unpaired < _POOR:
             return
         self._partners_are_known = True
-        alike = look_alikes(features)
-        cause = ": check that the images are of two cameras at one moment, the left one first, and that the "
-        cause += "calibration is theirs"
-        if 2 * alike > len(features):
-            cause = f", because the view is a repeated pattern: {alike} of them have a look-alike in the same image, "
-            cause += "so that which belong together cannot be told; let the view show other things too"
-        found = f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image"
-        self._warn(found + cause)
-
-    def _own_geometry(self, images: _Images, unpaired: bool) -> PairGeometry | None:
-        """How left and right image fit, None where that is not asked; SequenceError where they are exchanged."""
-        own = None if self._pair_is_named else self._geometry(images, images)
-        if own is not None and not self._pair_is_known and own.swapped and unpaired:
-            raise SequenceError(_swapped(own))
-        return own
+        alike = features.descriptors @ features.descriptors.T > 1 - 0.5 * _ALIKE**2
+        apart = np.abs(features.uv_left[:, None] - features.uv_left[None]).max(axis=2) > features.scale[:, None]
+        doubles = int((alike & apart).any(axis=1).sum())
+        cause = (
+            ": check that the images are of two cameras at one moment, the left one first, and that the calibration is "
+            "theirs"
+        )
+        if 2 * doubles > len(features):
+            cause = (
+                f", because the view is a repeated pattern: {doubles} of them have a look-alike in the same image, so "
+                "that which belong together cannot be told; let the view show other things too"
+            )
+        self._warn(
+            f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image{cause}"
+        )
 
     def _check_pair(self, images: _Images, own: PairGeometry) -> None:
         """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
         if not self._pair_is_known and (own.swapped or own.same):
             self._pair_is_named = True
-            self._warn(_swapped(own) if own.swapped else _the_same(own, self._rig))
+            horizon = self._rig.rectified.rig.left.fu * self._rig.baseline / NO_DISPARITY
+            same = (
+                f"left and right image show the same: {own.at_same_place} of {own.matches} features have no "
+                f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
+            )
+            self._warn(_swapped(own) if own.swapped else same)
         elif not self._pair_is_known and self._before is not None and own.shown < 1:
             self._pair_is_named = True  # hardly a feature fits then, and of another moment's some may by chance
             self._warn(_rows_differ(own, self._rig))
@@ -239,25 +249,10 @@ class InputWarnings:
         logger.warning("%s", line)
 
 
-def look_alikes(features: StereoFeatures) -> int:
-    """How many features have nearly the same descriptor as another one elsewhere in the image."""
-    alike = features.descriptors @ features.descriptors.T > 1 - 0.5 * _ALIKE**2
-    apart = np.abs(features.uv_left[:, None] - features.uv_left[None]).max(axis=2) > features.scale[:, None]
-    return int((alike & apart).any(axis=1).sum())
-
-
 def _swapped(found: PairGeometry) -> str:
     return (
         f"left and right look swapped: {found.as_swapped} of {found.matches} features fit the cameras when the images "
         f"are exchanged, {found.as_given} as they are; exchange them with the option swap=yes, or leave it out"
-    )
-
-
-def _the_same(found: PairGeometry, rig: StereoRig) -> str:
-    horizon = rig.rectified.rig.left.fu * rig.baseline / NO_DISPARITY
-    return (
-        f"left and right image show the same: {found.at_same_place} of {found.matches} features have no "
-        f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
     )
 
 
@@ -312,7 +307,7 @@ class _Images:
     """
 
     def __init__(self, frame: StereoFrame, rig: StereoRig) -> None:
-        self._frame, self._rig = frame, rig
+        self._frame, self._size = frame, (rig.height, rig.width)
 
     @cached_property
     def left(self) -> Points | None:
@@ -322,18 +317,14 @@ class _Images:
     def right(self) -> Points | None:
         return self._points(self._frame.right)
 
-    def _points(self, image: object) -> Points | None:
+    def _points(self, image: np.ndarray | None) -> Points | None:
+        import cv2
+
         if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
             return None
-        if image.shape[:2] != (self._rig.height, self._rig.width) or image.shape[2:] not in ((), (1,), (3,), (4,)):
+        if image.shape[:2] != self._size or image.shape[2:] not in ((), (1,), (3,), (4,)):
             return None
-        return points_of(_eight_bits(image))
-
-
-def _eight_bits(image: np.ndarray) -> np.ndarray:
-    """Any image that a front end takes, as grey (H, W) uint8."""
-    import cv2
-
-    if image.ndim == 3:
-        image = image[:, :, 0] if image.shape[2] == 1 else np.asarray(cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY))
-    return np.ascontiguousarray(eight_bits(image))
+        if image.ndim == 3:
+            one = image.shape[2] == 1
+            image = image[:, :, 0] if one else np.asarray(cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY))
+        return points_of(np.ascontiguousarray(eight_bits(image)))

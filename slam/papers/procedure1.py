@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.archives import array, unpack
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.detector import ObjectDetector
 from slam.data import Estimate, StereoFeatures
 from slam.errors import ConfigurationError
-from slam.files import read_bytes, whole_file
+from slam.files import array, read_bytes, unpack, whole_file
 from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, angles, inverse, log, pose, transform

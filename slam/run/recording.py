@@ -21,12 +21,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from slam.archives import array, json_text, unpack
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.checks import FARTHEST_PIXEL, LATEST_STAMP, MOST_ID
 from slam.data import FrameResult, IdArray, Observations
 from slam.errors import MeasurementError, SequenceError, SlamError
-from slam.files import read_bytes, whole_file
+from slam.files import array, json_text, read_bytes, unpack, whole_file
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
-from slam.input.rectification import Rectification
+from slam.input.features import Rectification
 from slam.interfaces import Backend, RevisingBackend
 from slam.run.recording import RecordedFrame, Recording
 from slam.third_party import checked, named_failures

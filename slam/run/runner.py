@@ -17,7 +17,7 @@ from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
 from slam.geometry.trajectory import Trajectory
-from slam.input.rectification import Rectification
+from slam.input.features import Rectification
 from slam.interfaces import Frontend
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions

@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import Estimate, FrameResult
+from slam.data import CommonError, Estimate, FrameResult
 from slam.evaluation.consistency import EXACT
 from slam.evaluation.objects import ObjectScore
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.input.rectification import Rectification
+from slam.input.features import Rectification
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend
-from slam.rig_error import CommonError
 from slam.run.recording import Recording
 from slam.run.schema import STAGES
 from slam.runtime.compilation import compile_clock, working_time
@@ -24,7 +23,7 @@ from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
 from slam.third_party import checked, named_failures
-from slam.tracks.state import HIDDEN
+from slam.tracks.step import HIDDEN
 from slam.tracks.table import LandmarkTable
 
 

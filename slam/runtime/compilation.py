@@ -21,6 +21,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from threading import RLock
 from types import CodeType, SimpleNamespace
@@ -249,3 +250,24 @@ def _is_own(event: Any) -> bool:
 
 
 event.register("numba:compile", _Notice())
+
+
+class Stages:
+    """Stages of one step, entered one after the other.
+
+    Attributes:
+        begun: whether one has been entered.
+        milliseconds: wall time of each stage that was completed [ms], without that in which kernels were compiled.
+    """
+
+    def __init__(self) -> None:
+        self.begun = False
+        self.milliseconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Enter a stage; its time is taken where no exception ends it."""
+        self.begun = True
+        start = working_time()
+        yield
+        self.milliseconds[name] = 1e3 * (working_time() - start)

@@ -18,7 +18,7 @@ from slam.geometry.arrays import Array, isin
 from slam.geometry.rig import StereoRig
 from slam.interfaces import AligningFrontend
 from slam.third_party import checked
-from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.step import LandmarkMatches
 from slam.tracks.table import LandmarkTable, Patch
 
 _LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more
@@ -32,15 +32,8 @@ def align(
 ) -> StereoFeatures:  # fmt: skip
     """Move landmarks' features to where the landmarks' patches are found; those without a patch are unchanged.
 
-    Patches that are to be taken anew are dropped, in place.
-
-    Args:
-        rig: the cameras.
-        frontend: which made the features.
-        features: of the frame, as measured.
-        matches: landmarks that were found, and the pose on which they agree; without a pose nothing is aligned.
-        landmarks: the map.
-        positions: returns landmarks' positions (M, 3) [m] in the world by their ids (M,).
+    Patches that are to be taken anew are dropped, in place. Without a pose on which the matches agree nothing is
+    aligned. `positions` returns landmarks' positions (M, 3) [m] in the world by their ids (M,).
 
     Raises:
         SlamError: the front end does not return pixels.
@@ -76,14 +69,7 @@ def take_patches(
     frontend: AligningFrontend, features: StereoFeatures, seen: LandmarkMatches, landmarks: LandmarkTable,
     T_world_left: Array,
 ) -> None:  # fmt: skip
-    """Landmarks that were seen and have no patch get one, in place.
-
-    Args:
-        frontend: which made the features.
-        features: of the frame, as measured and aligned.
-        seen: landmarks and their features.
-        landmarks: the map.
-        T_world_left: the frame's pose (4, 4).
+    """Landmarks that were seen from a pose (4, 4) and have no patch get one, in place, at their aligned features.
 
     Raises:
         SlamError: the front end returns no patches, or not one for each landmark.

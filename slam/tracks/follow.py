@@ -52,32 +52,21 @@ def follow(
 ) -> Matches:  # fmt: skip
     """Match tracks to features inside windows around where the tracks are expected.
 
-    Args:
-        pixels: where they are expected (M, 2); tracks whose pixels are not finite are not matched.
-        innovation: covariances of these pixels' innovations (M, 2, 2) [px²], of which the windows are ellipses.
-        descriptors: of the tracks (M, D).
-        laplacian: signs of their Laplacians (M,).
-        features: of the frame.
-        windows: where to look, and what is a match.
-        taken: which of the features (N,) are no candidates; None for none.
+    Tracks whose `pixels` (M, 2) are not finite are not matched. The windows are ellipses of the innovations'
+    covariances (M, 2, 2) [px²]. Features that are `taken` (N,) are no candidates.
     """
     from slam.tracks import follow_kernels
 
+    order = np.argsort(features.uv_left[:, 0], kind="stable")
+    order = order if taken is None else order[~taken[order]]
     sizes, pairs = np.array(windows.sizes), np.empty((2, len(pixels)), np.intp)
     least = np.broadcast_to(windows.least, len(pixels)) / sizes[0]
     count = follow_kernels.follow(
         np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), least, windows.most / sizes[0], sizes,
         np.array(windows.d_match, np.float32), np.float32(windows.ratio), np.ascontiguousarray(descriptors), laplacian,
-        np.ascontiguousarray(features.uv_left), features.descriptors, features.laplacian,
-        _by_column(features.uv_left, taken), pairs,
+        np.ascontiguousarray(features.uv_left), features.descriptors, features.laplacian, order, pairs,
     )  # fmt: skip
     return Matches(pairs[0, :count], pairs[1, :count])
-
-
-def _by_column(uv: Array, taken: BoolArray | None) -> NDArray[np.intp]:
-    """Rows of pixels (N, 2) that are not `taken` (N,), by column."""
-    order = np.argsort(uv[:, 0], kind="stable")
-    return order if taken is None else order[~taken[order]]
 
 
 def match_everywhere(
@@ -106,16 +95,16 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
 
     order = np.argsort(uv[:, 0], kind="stable")
     boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach), np.ascontiguousarray(uv), order
-    rows, found = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
-    count = follow_kernels.pairs_in_boxes(*boxes, rows, found)
+    rows, inside = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
+    count = follow_kernels.pairs_in_boxes(*boxes, rows, inside)
     if count > len(rows):
-        rows, found = np.empty((2, count), np.intp)
-        follow_kernels.pairs_in_boxes(*boxes, rows, found)
-    return rows[:count], found[:count]
+        rows, inside = np.empty((2, count), np.intp)
+        follow_kernels.pairs_in_boxes(*boxes, rows, inside)
+    return rows[:count], inside[:count]
 
 
 def crowded(uv: Array, neighbours: Array, radius: float) -> BoolArray:
-    """Which pixels (N, 2) lie within `radius` [px] of any of `others` (M, 2)."""
+    """Which pixels (N, 2) lie within `radius` [px] of any of the `neighbours` (M, 2)."""
     if not len(neighbours):
         return np.zeros(len(uv), bool)
     rows, columns = pairs_in_boxes(uv, np.full((len(uv), 2), radius), neighbours)

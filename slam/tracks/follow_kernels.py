@@ -119,20 +119,15 @@ def product(a, b):
     return total
 
 
-@kernel
-def follow(
-    pixels, innovation, least, most, sizes, limits, ratio, looks, signs, uv, feature_looks, feature_signs, order, pairs
-):
-    """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
+@helper
+def in_windows(pixels, innovation, least, most, sizes, signs, uv, feature_signs, order):
+    """Pairs of tracks and features (P,) in the largest window of each track, and the smallest window of each pair.
 
-    Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows: their half axes
-    are `sizes` (L,) times standard deviations from `least` (M,) to `most`, or [px] of squares if `most` is zero. In
-    each window, descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs`; the features are at
-    `uv`, in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
+    For the arguments see `follow`; returns three arrays with room for more, and the number of pairs.
     """
     levels, last = len(sizes), sizes[len(sizes) - 1]
     count, room = 0, 4 * len(pixels) + 64
-    a, b, level = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.intp)
+    tracks, features, level = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.intp)
     for row in range(len(pixels)):
         x, y = pixels[row, 0], pixels[row, 1]
         if not (np.isfinite(x) and np.isfinite(y)):
@@ -162,20 +157,35 @@ def follow(
                 continue
             if count == room:
                 room *= 2
-                a, b, level = grown(a, room), grown(b, room), grown(level, room)
-            a[count], b[count], level[count] = row, feature, smallest
+                tracks, features, level = grown(tracks, room), grown(features, room), grown(level, room)
+            tracks[count], features[count], level[count] = row, feature, smallest
             count += 1
+    return tracks, features, level, count
+
+
+@kernel
+def follow(
+    pixels, innovation, least, most, sizes, limits, ratio, looks, signs, uv, feature_looks, feature_signs, order, pairs
+):
+    """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
+
+    Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows: their half axes
+    are `sizes` (L,) times standard deviations from `least` (M,) to `most`, or [px] of squares if `most` is zero. In
+    each window, descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs`; the features are at
+    `uv`, in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
+    """
+    a, b, level, count = in_windows(pixels, innovation, least, most, sizes, signs, uv, feature_signs, order)
     matched = 0  # tracks that look alike to the bit may share a feature
     done, taken = np.zeros(len(pixels), np.bool_), np.zeros(len(uv), np.bool_)
     allowed, good = np.empty(count, np.bool_), np.empty(count, np.bool_)
     distance = np.empty(count, np.float32)
-    for number in range(levels):
+    for window in range(len(sizes)):
         for p in range(count):
-            allowed[p] = level[p] <= number and not done[a[p]] and not taken[b[p]]
-            if allowed[p] and level[p] == number:  # in a larger window, of tracks that are not found yet alone
+            allowed[p] = level[p] <= window and not done[a[p]] and not taken[b[p]]
+            if allowed[p] and level[p] == window:  # in a larger window, of tracks that are not found yet alone
                 likeness = product(looks[a[p]], feature_looks[b[p]])
                 distance[p] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
-        best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[number], ratio, good)
+        best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[window], ratio, good)
         for p in range(count):
             if good[p]:
                 done[a[p]] = taken[b[p]] = True

@@ -6,12 +6,12 @@ The same for every back end, which supplies predictions and positions, and is gi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
+from slam.data import BoolArray, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
 from slam.geometry.pnp import CLEAR_MAJORITY, MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
@@ -20,56 +20,8 @@ from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
 from slam.tracks.follow import Matches, Windows, follow, match_everywhere
 from slam.tracks.standing import Standing
-from slam.tracks.state import NO_POSE, PoseHypotheses, TrackingState
+from slam.tracks.step import NO_POSE, LandmarkMatches, PoseHypotheses, TrackingState
 from slam.tracks.table import LandmarkTable
-from slam.tracks.visibility import similar_view
-
-
-@dataclass(frozen=True, eq=False)
-class LandmarkMatches:
-    """Landmarks found in a frame."""
-
-    ids: IdArray  # landmark ids (K,), ascending
-    rows: NDArray[np.intp]  # rows of their features (K,)
-    T_world_left: Array | None = None  # the pose (4, 4) on which they agree, if there is one
-    # the prediction's uncertainty does not allow that pose, but several frames agree on it: the camera was moved while
-    # it saw nothing
-    kidnapped: bool = False
-    doubted: int = 0  # number of landmarks that agree on a pose which is too far from the prediction to be believed yet
-    # ids of landmarks long out of view that were found too, but do not count yet, see `LandmarkTable.returning`
-    returning: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def joined(self, more: LandmarkMatches) -> LandmarkMatches:
-        """These and matches of other landmarks."""
-        ids, rows = np.concatenate([self.ids, more.ids]), np.concatenate([self.rows, more.rows])
-        return replace(self, ids=ids, rows=rows)
-
-    def select(self, rows: NDArray) -> LandmarkMatches:
-        """Some of the landmarks (a mask or indices)."""
-        return LandmarkMatches(self.ids[rows], self.rows[rows], self.T_world_left, doubted=self.doubted)
-
-    def rows_of(self, ids: IdArray) -> NDArray[np.intp]:
-        """Rows of the features that show landmarks, by their ids, all of which were found."""
-        order = np.argsort(self.ids, kind="stable")
-        return self.rows[order[np.searchsorted(self.ids, ids, sorter=order)]]
-
-    def landmark_of(self, features: int) -> IdArray:
-        """Id of the landmark matched with each of N = `features` features (N,), −1 for none."""
-        ids = np.full(features, -1, np.int64)
-        ids[self.rows] = self.ids
-        return ids
-
-    def observations(self, features: StereoFeatures) -> Observations:
-        """The landmarks with the pixels of the features that they were matched with."""
-        return Observations(self.ids, features.uv_left[self.rows], features.uv_right[self.rows])
-
-    @classmethod
-    def nothing(cls) -> LandmarkMatches:
-        """No landmark found."""
-        return cls(np.zeros(0, np.int64), np.zeros(0, np.intp))
 
 
 class Localizer:
@@ -96,9 +48,16 @@ class Localizer:
         return Search(self, prediction, landmarks, positions, features, seed).match()
 
     def similar_view(self, T_world_left: Array, seen_from: Array, positions: Array) -> BoolArray:
-        """Which landmarks (N,) at `positions` are seen from this pose (4, 4) much as from the places of first sight."""
-        limits = self.config.view_angle, self.config.view_ratio
-        return similar_view(positions, seen_from, T_world_left[:3, 3], *limits)
+        """Which landmarks (N,) are seen from a pose (4, 4) at a similar angle and distance as at their first sight.
+
+        From another viewpoint, the point that a descriptor describes shifts over the surface, and then changes. The
+        camera was at `seen_from` (N, 3) [m] at first sight; where that is unknown, NaN, nothing is ruled out.
+        """
+        then, now = positions - seen_from, positions - T_world_left[:3, 3]
+        before, after = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
+        turned = np.einsum("ij,ij->i", then, now) < np.cos(np.deg2rad(self.config.view_angle)) * before * after
+        ratio = self.config.view_ratio
+        return np.asarray(~(turned | (after > ratio * before) | (before > ratio * after)))
 
     def state_after(
         self, tracking: TrackingState, prediction: Prediction, features: StereoFeatures, matches: LandmarkMatches,
@@ -256,8 +215,8 @@ class Search:
     def _in_windows(self, uv: Array, innovation: Array, rows: NDArray[np.intp]) -> Matches:
         """Matches of the landmarks at `rows` (M,), in windows around their pixels (M, 2)."""
         looks = self.landmarks.descriptors[rows], self.landmarks.laplacian[rows]
-        found = follow(uv, innovation, *looks, self.features, Windows.of(self.config))
-        return Matches(rows[found.tracks], found.features)
+        pairs = follow(uv, innovation, *looks, self.features, Windows.of(self.config))
+        return Matches(rows[pairs.tracks], pairs.features)
 
     def _around(self, T_world_left: Array) -> tuple[Matches, int]:
         """Matches in small windows around a pose, and the number of landmarks searched for."""
@@ -290,12 +249,12 @@ class Search:
             return LandmarkMatches.nothing()
         matches = matches.select(np.argsort(matches.tracks, kind="stable"))
         c, table = self.config, self.landmarks
-        found = LandmarkMatches(table.ids[matches.tracks], matches.features, consensus.T_world_left)
-        new = table.long_out_of_view(c.rematch_after) & (table.returning + 1 < c.kidnapped_after)
-        new = new[matches.tracks]
-        if not 0 < new.sum() < min(c.minimum_consistent, len(found)):
-            return found
-        return replace(found.select(~new), returning=found.ids[new])
+        agreeing = LandmarkMatches(table.ids[matches.tracks], matches.features, consensus.T_world_left)
+        awaited = table.long_out_of_view(c.rematch_after) & (table.returning + 1 < c.kidnapped_after)
+        awaited = awaited[matches.tracks]
+        if not 0 < awaited.sum() < min(c.minimum_consistent, len(agreeing)):
+            return agreeing
+        return replace(agreeing.select(~awaited), returning=agreeing.ids[awaited])
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:

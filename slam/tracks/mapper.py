@@ -1,33 +1,59 @@
-"""Updates the map after a frame: counts, erases and adds landmarks, both in the system's rows and in the back end."""
+"""Birth and death of landmarks after a frame (paper A, IV), in the table of tracks and in the back end alike.
+
+New landmarks are evenly spread and have a well-known depth. Landmarks are erased if they are not continuously detected,
+move, duplicate another one, crowd a place out of view, or if the map is full.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.checks import in_front
-from slam.data import BoolArray, IdArray, IndexArray
+from slam.chi_square import SIGMAS
+from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import inverse, transform
 from slam.interfaces import Backend, MapBackend
 from slam.third_party import checked
 from slam.tracks.config import MapConfig
-from slam.tracks.localizer import LandmarkMatches, Localizer
-from slam.tracks.management import (
-    bad_landmarks,
-    crowded_landmarks,
-    doubled_landmarks,
-    known_features,
-    new_landmarks,
-    surplus_landmarks,
-)
+from slam.tracks.follow import crowded, pairs_in_boxes
+from slam.tracks.localizer import Localizer
 from slam.tracks.monocular import depths_by_motion, frame_covariance, unclaimed
-from slam.tracks.step import Step
+from slam.tracks.step import LandmarkMatches, Step
 from slam.tracks.table import LandmarkTable, Tracks
-from slam.tracks.visibility import MapView, expected_landmarks
+
+_BLOCK = 256  # cost: landmarks compared with all others at once
+_SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
+
+
+@dataclass(frozen=True, eq=False)
+class MapView:
+    """The map and the frame's features as seen from one pose."""
+
+    T_world_left: Array  # the pose (4, 4)
+    positions: Array  # of the landmarks (N, 3) in world coordinates [m]
+    local: Array  # the same in left-camera coordinates (N, 3)
+    uv_left: Array  # the landmarks' left pixels (N, 2), NaN behind the camera
+    in_image: BoolArray  # which landmarks are in front of the camera and inside the left image (N,)
+    points: Array  # the features in left-camera coordinates (F, 3), NaN without depth
+    depth_sigma: Array  # standard deviations of the features' depths (F,) [m]
+
+    @classmethod
+    def of(
+        cls, rig: StereoRig, T_world_left: Array, positions: Array, features: StereoFeatures, pixel_sigma: float
+    ) -> MapView:
+        """Landmarks at `positions` (N, 3) and features, seen from a pose (4, 4)."""
+        local = transform(inverse(T_world_left), positions)
+        uv = rig.left.project(local)
+        points = rig.triangulate(features.uv_left, features.uv_right)
+        deviation = rig.depth_deviation(points, pixel_sigma)
+        return cls(T_world_left, positions, local, uv, rig.left.in_image(uv), points, deviation)
 
 
 class Mapper:
@@ -53,19 +79,22 @@ class Mapper:
 
     def update(self, backend: Backend, step: Step) -> Step:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
-        tracks = step.tracks
+        tracks, features = step.tracks, step.features
         view = self._view(backend, step)
         self._count(view, step)
         rows, landmarks = tracks.mapped, tracks.landmarks()
         bad = isin(landmarks.ids, step.labels.landmarks)
-        if step.features.has_stereo.any() or not len(step.features):  # else nothing can take their place
-            bad |= bad_landmarks(landmarks, self.config)
+        if features.has_stereo.any() or not len(features):  # else nothing can take their place
+            bad |= undetected_landmarks(landmarks, self.config)
         bad |= doubled_landmarks(view, landmarks, self.config)
-        bad |= crowded_landmarks(landmarks, view.positions, self.config)
-        known = known_features(view, landmarks, step.features, self.config)
+        bad |= redundant_landmarks(landmarks, view.positions, self.config)
+        free = ~features_of_landmarks(view, landmarks, features, self.config)
         erased = landmarks.ids[bad]
         tracks.erase_landmarks(rows[bad])
-        step = self._add(backend, step, known)
+        if len(tracks.mapped) < MINIMAL_POINTS or step.tracking.may_add(self.config.restart_after):
+            for taken in (step.matches.rows, step.labels.moving, step.labels.undecided):
+                free[taken] = False
+            step = self._add(backend, step, free)
         if len(tracks.mapped) > self.config.max_landmarks:
             surplus = tracks.mapped[surplus_landmarks(tracks.landmarks(), self.config)]
             erased = np.concatenate([erased, tracks.ids[surplus]])
@@ -83,10 +112,9 @@ class Mapper:
         landmark needs a new one.
         """
         assert isinstance(backend, MapBackend)  # only such back ends start in a map
-        old = landmarks.ids
-        new = np.flatnonzero(~np.isin(old, tracks.ids) | (old < 0))
-        ids, without = old[new], old[new] < 0
-        ids[without] = self._new_ids(int(without.sum()))
+        new = np.flatnonzero(~np.isin(landmarks.ids, tracks.ids) | (landmarks.ids < 0))
+        ids = landmarks.ids[new]
+        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
         backend.insert(ids, positions[new], covariances[new])
         return tracks.with_landmarks(replace(landmarks.select(new), ids=ids))
 
@@ -95,13 +123,14 @@ class Mapper:
 
         The back end is as that step left it, the landmarks are those before it; those that stay are returned.
         """
-        known = backend.estimate().ids
-        strangers = known if tracks is None else np.setdiff1d(known, tracks.ids)
+        in_backend = backend.estimate().ids
+        strangers = in_backend if tracks is None else np.setdiff1d(in_backend, tracks.ids)
         if len(strangers):
             backend.remove(strangers)
         if tracks is not None:
             tracks = tracks.begun(0, tracks.dof.shape[1])
-            tracks.erase_landmarks(np.flatnonzero(~np.isin(tracks.ids, known)))
+            tracks.waiting_since[:] = -1
+            tracks.erase_landmarks(np.flatnonzero(~np.isin(tracks.ids, in_backend)))
         return tracks
 
     def _view(self, backend: Backend, step: Step) -> MapView:
@@ -116,7 +145,7 @@ class Mapper:
         matches = matches.select(isin(matches.ids, step.report.used))
         expected = rows[:0]
         if not step.tracking.unmatched:
-            size = (self.rig.width, self.rig.height)
+            size = (self.rig.left.width, self.rig.left.height)
             shown = expected_landmarks(view, step.features, size, m.view_margin, m.occlusion_radius)
             shown &= self._localizer.similar_view(view.T_world_left, tracks.seen_from[rows], view.positions)
             expected = rows[shown]
@@ -126,48 +155,43 @@ class Mapper:
             rows[isin(tracks.ids[rows], step.suspects)],
         )  # fmt: skip
 
-    def _add(self, backend: Backend, step: Step, known: BoolArray) -> Step:
-        """Turn features that are no landmarks yet into landmarks, unless the pose is unknown.
-
-        Features that move, or whose motion label is undecided, are left out.
-        """
-        features, matches = step.features, step.matches
-        if len(step.tracks.mapped) >= MINIMAL_POINTS and not step.tracking.may_add(self.config.restart_after):
-            return step
-        free = ~known
-        free[matches.rows] = free[step.labels.moving] = free[step.labels.undecided] = False
-        occupied = features.uv_left[matches.rows]
-        rows = new_landmarks(features, free, occupied, self.rig, self._localizer.pixel_sigma, self.config)
-        step = self._with_new(step, rows)
-        if len(rows):
+    def _add(self, backend: Backend, step: Step, free: BoolArray) -> Step:
+        """Turn `free` features (F,) into landmarks, so far as landmarks are wanted."""
+        features, occupied = step.features, step.features.uv_left[step.matches.rows]
+        step = self._entered(
+            step, new_landmarks(features, free, occupied, self.rig, self._localizer.pixel_sigma, self.config)
+        )
+        if len(step.added):
             backend.add(step.added.observations(features))
         wanted = self.config.monocular or (self.config.monocular is None and not features.has_stereo.any())
-        if not (wanted and isinstance(backend, MapBackend) and len(matches) >= MINIMAL_POINTS):
-            return step
-        return self._add_monocular(backend, step, np.flatnonzero(free & ~features.has_stereo))
+        if wanted and isinstance(backend, MapBackend) and len(step.matches) >= MINIMAL_POINTS:
+            return self._add_monocular(backend, step, np.flatnonzero(free & ~features.has_stereo))
+        return step
 
-    def _add_monocular(self, backend: Backend, step: Step, rows: IndexArray) -> Step:
+    def _add_monocular(self, backend: MapBackend, step: Step, rows: IndexArray) -> Step:
         """Turn features `rows` without a stereo match into landmarks once two views give depth (paper B, 2.2)."""
         landmarks, features, matches = step.tracks.landmarks(), step.features, step.matches
         T, sigma = step.estimate.T_world_left, self._localizer.pixel_sigma
-        view = self._view(backend, step)
-        rows = unclaimed(view, landmarks, features, rows)
-        there = isin(matches.ids, landmarks.ids)
-        local, stereo = view.local[landmarks.rows(matches.ids[there])], features.has_stereo[matches.rows[there]]
+        view = self._view(backend, step)  # type: ignore[arg-type]
+        shown = np.flatnonzero(view.in_image)
+        rows = unclaimed(view.uv_left[shown], landmarks.descriptors[shown], features, rows)
+        in_map = isin(matches.ids, landmarks.ids)
+        local, stereo = view.local[landmarks.rows(matches.ids[in_map])], features.has_stereo[matches.rows[in_map]]
         P = frame_covariance(self.rig, local, stereo, sigma)
-        views, found, depths = depths_by_motion(
-            self.rig, step.views, features.select(rows), T, P, step.index, sigma, self.config.max_depth_error
+        with_depth, depths = depths_by_motion(
+            self.rig, step.tracks, features, rows, T, P, step.index, sigma, self.config.max_depth_error
         )
         front = np.flatnonzero(in_front(depths.local))
         wanted = max(self.config.target_in_view - len(matches) - len(step.added), 0)
-        best = front[np.sort(np.argsort(-features.response[rows[found[front]]], kind="stable")[:wanted])]
-        step, count = replace(self._with_new(step, rows[found[best]]), views=views), len(step.added)
+        best = front[np.sort(np.argsort(-features.response[with_depth[front]], kind="stable")[:wanted])]
+        before = len(step.added)
+        step = self._entered(step, with_depth[best])
         if len(best):
-            backend.place(step.added.ids[count:], depths.local[best], depths.covariances[best])  # type: ignore[attr-defined]
+            backend.place(step.added.ids[before:], depths.local[best], depths.covariances[best])
         return step
 
-    def _with_new(self, step: Step, rows: IndexArray) -> Step:
-        """A step whose features `rows` (M,) are landmarks, with ids that were never used."""
+    def _entered(self, step: Step, rows: IndexArray) -> Step:
+        """A step whose features `rows` (M,) have become landmarks, with ids that were never used."""
         ids = self._new_ids(len(rows))
         step.tracks.enter_landmarks(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
         return replace(step, added=step.added.joined(LandmarkMatches(ids, rows)))
@@ -177,3 +201,189 @@ class Mapper:
         ids = np.arange(self.next_id, self.next_id + count, dtype=np.int64)
         self.next_id += count
         return ids
+
+
+def new_landmarks(
+    features: StereoFeatures, free: BoolArray, occupied: Array, rig: StereoRig, pixel_sigma: float, config: MapConfig
+) -> IndexArray:
+    """Rows of the features that become landmarks.
+
+    `free` (N,) says which features belong to no landmark; `occupied` (M, 2) are pixels of the landmarks in view, the
+    measured ones first.
+    """
+    wanted = config.target_in_view - len(occupied)
+    if wanted <= 0 or not len(features):
+        return np.zeros(0, np.intp)
+    rows = np.flatnonzero(free & features.has_stereo)
+    rows = rows[~crowded(features.uv_left[rows], occupied, config.separation)]
+    rows = rows[depth_is_known(rig, features, rows, pixel_sigma, config.max_depth_error)]
+    rows = rows[np.argsort(-features.response[rows], kind="stable")]
+    return _spread(features.uv_left, rows, occupied, wanted, rig, config)
+
+
+def depth_is_known(
+    rig: StereoRig, features: StereoFeatures, rows: IndexArray, pixel_sigma: float, limit: float
+) -> BoolArray:
+    """Which rows (K,) of stereo features have a positive depth whose relative standard deviation is below the limit."""
+    points = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
+    return np.asarray(rig.depth_deviation(points, pixel_sigma) < limit * points[:, 2])
+
+
+def _spread(uv: Array, rows: IndexArray, occupied: Array, wanted: int, rig: StereoRig, config: MapConfig) -> IndexArray:
+    """Pick rows (best first) so that the grid fills evenly and no two lie closer than the separation."""
+    if not len(rows):
+        return np.zeros(0, np.intp)
+    columns, lines = config.grid
+    size = np.array([rig.left.width / columns, rig.left.height / lines])
+
+    def cell(pixels: Array) -> IndexArray:
+        c = np.clip((pixels / size).astype(int), 0, (columns - 1, lines - 1))
+        return c[:, 1] * columns + c[:, 0]
+
+    load = np.bincount(cell(occupied), minlength=columns * lines)
+    # Queue by each feature's rank in its cell plus the cell's landmarks: features of empty cells come first.
+    cells = cell(uv[rows])
+    order = np.argsort(cells, kind="stable")
+    starts = np.searchsorted(cells[order], np.arange(columns * lines))
+    rank = np.empty(len(rows), int)
+    rank[order] = np.arange(len(rows)) - starts[cells[order]]
+    queue = rows[np.argsort(rank + load[cells], kind="stable")]
+    # Pairs of features closer than the separation, ordered by place in the queue.
+    first, second = pairs_in_boxes(uv[queue], np.full((len(queue), 2), config.separation), uv[queue])
+    gap = uv[queue[first]] - uv[queue[second]]
+    near = np.einsum("ij,ij->i", gap, gap) < config.separation**2
+    begin, second = np.searchsorted(first[near], np.arange(len(queue) + 1)).tolist(), second[near]
+    chosen: list[int] = []
+    free = np.ones(len(queue), bool)
+    for place in range(len(queue)):
+        if len(chosen) == wanted:
+            break
+        if free[place]:
+            free[second[begin[place] : begin[place + 1]]] = False
+            chosen.append(int(queue[place]))
+    return np.array(chosen, np.intp)
+
+
+def expected_landmarks(
+    view: MapView, features: StereoFeatures, size: tuple[int, int], margin: float, radius: float
+) -> BoolArray:
+    """Which landmarks (N,) should have been detected: inside an image of this `size` by a `margin` [px], not hidden.
+
+    A landmark is hidden if most of the features within `radius` [px] are clearly nearer than it is.
+    """
+    with np.errstate(invalid="ignore"):
+        inside = ((view.uv_left >= margin) & (view.uv_left <= np.array(size) - 1 - margin)).all(axis=1)
+    expected = inside & view.in_image
+    rows, stereo = np.flatnonzero(expected), np.flatnonzero(np.isfinite(view.depth_sigma))
+    if len(rows) and len(stereo) and radius > 0:
+        at, which = pairs_in_boxes(view.uv_left[rows], np.full((len(rows), 2), radius), features.uv_left[stereo])
+        feature = stereo[which]
+        depth = view.points[feature, 2] + SIGMAS * view.depth_sigma[feature]
+        # 0.9: a surface nearer than this share of a landmark's depth may hide it
+        nearer = np.bincount(at, depth < 0.9 * view.local[rows[at], 2], minlength=len(rows))
+        expected[rows[2 * nearer > np.bincount(at, minlength=len(rows))]] = False
+    return np.asarray(expected)
+
+
+def undetected_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
+    """Which landmarks (N,) are to be erased: not continuously detected although in view (paper A, IV).
+
+    Those are the ones that were missed too often in a row, are seen in too small a share of the frames, or were never
+    confirmed; and those not seen for longer than a map remembers.
+    """
+    lost = landmarks.missed >= config.erase_missed
+    tested = landmarks.in_view > config.erase_missed
+    rare = tested & (landmarks.seen < config.erase_share * landmarks.in_view)
+    unconfirmed = (landmarks.seen < config.confirmed) & (landmarks.unseen > config.erase_missed)
+    unconfirmed &= landmarks.last_seen >= 0  # a loaded map's landmarks stay until this run has seen them
+    unseen = landmarks.last_seen.max(initial=0) - landmarks.last_seen
+    forgotten = unseen > config.forget_after if config.forget_after else np.zeros(len(landmarks), bool)
+    return np.asarray(lost | rare | unconfirmed | forgotten)
+
+
+def redundant_landmarks(landmarks: LandmarkTable, positions: Array, config: MapConfig) -> BoolArray:
+    """Which landmarks (N,) at `positions` (N, 3) [m] are redundant once out of view; see `MapConfig.spacing`.
+
+    Landmarks that have just gone out of view are compared with each other and with all others out of view. Those of a
+    loaded map that this run has not seen yet count among the others only.
+    """
+    out = np.zeros(len(landmarks), bool)
+    gone = np.flatnonzero((landmarks.unseen > config.erase_missed) & np.isfinite(landmarks.seen_from[:, 0]))
+    just = gone[(landmarks.unseen[gone] <= 2 * config.erase_missed) & (landmarks.last_seen[gone] >= 0)]
+    if not len(just) or not config.spacing:
+        return out
+    reach = config.spacing * np.linalg.norm(positions - landmarks.seen_from, axis=1)
+    rank = np.lexsort((-np.arange(len(out)), landmarks.seen)).argsort()  # among equals, the older is better
+    for block in np.split(just, range(_BLOCK, len(just), _BLOCK)):
+        gap = positions[block][:, None] - positions[gone][None]
+        near = np.einsum("ijk,ijk->ij", gap, gap) < np.minimum(reach[block][:, None], reach[gone][None]) ** 2
+        first, second = np.nonzero(near & (block[:, None] != gone[None]))
+        one, other = block[first], gone[second]
+        out[np.where(rank[one] < rank[other], one, other)] = True
+    return out
+
+
+def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
+    """Which landmarks (N,) to erase so that `max_landmarks` remain.
+
+    First those that were measured in a single frame, then the others by their last measurement, oldest first; those
+    measured in the newest frame last.
+    """
+    out = np.zeros(len(landmarks), bool)
+    surplus = len(landmarks) - config.max_landmarks
+    if surplus > 0:
+        now = landmarks.last_seen == landmarks.last_seen.max()
+        order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
+        out[order[:surplus]] = True
+    return out
+
+
+def features_of_landmarks(
+    view: MapView, landmarks: LandmarkTable, features: StereoFeatures, config: MapConfig
+) -> BoolArray:
+    """Which unmatched features (F,) have the position and descriptor of an existing landmark.
+
+    Positions are the same if they are within `same_distance`, or differ in depth by no more than stereo's uncertainty.
+    """
+    out = np.zeros(len(features), bool)
+    feature, rows = _near_landmarks(features.uv_left, view)
+    offset = view.points[feature] - view.local[rows]
+    along = np.abs(offset[:, 2]) < SIGMAS * view.depth_sigma[feature]
+    same = along | (np.linalg.norm(offset, axis=1) < config.same_distance)
+    same &= _alike(landmarks, rows, features.descriptors[feature], features.laplacian[feature], config)
+    out[feature[same]] = True
+    return out
+
+
+def doubled_landmarks(view: MapView, landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
+    """Which landmarks in view (N,) duplicate another one that was seen more often, or as often and is older."""
+    out = np.zeros(len(landmarks), bool)
+    shown = np.flatnonzero(view.in_image)
+    row, rival = _near_landmarks(view.uv_left[shown], view)
+    row = shown[row]
+    less = (landmarks.seen[row] < landmarks.seen[rival]) | (
+        (landmarks.seen[row] == landmarks.seen[rival]) & (row > rival)
+    )
+    row, rival = row[less], rival[less]
+    same = np.linalg.norm(view.positions[row] - view.positions[rival], axis=1) < config.same_distance
+    same &= _alike(landmarks, row, landmarks.descriptors[rival], landmarks.laplacian[rival], config)
+    out[row[same]] = True
+    return out
+
+
+def _near_landmarks(uv: Array, view: MapView) -> tuple[IndexArray, IndexArray]:
+    """Pairs of pixels (P, 2) and landmarks in view that are near each other in the image, as rows of both."""
+    shown = np.flatnonzero(view.in_image)
+    if not len(uv) or not len(shown):
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    at, which = pairs_in_boxes(uv, np.full((len(uv), 2), _SAME_PIXELS), view.uv_left[shown])
+    return at, shown[which]
+
+
+def _alike(
+    landmarks: LandmarkTable, rows: IndexArray, descriptors: NDArray[np.float32], laplacian: NDArray[np.int8],
+    config: MapConfig,
+) -> BoolArray:  # fmt: skip
+    """Whether landmarks at `rows` (P,) match descriptors (P, D) and signs of the Laplacian (P,), pair by pair."""
+    distance = np.linalg.norm(landmarks.descriptors[rows] - descriptors, axis=1)
+    return np.asarray((distance < config.same_descriptor) & (landmarks.laplacian[rows] == laplacian))

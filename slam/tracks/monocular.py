@@ -1,7 +1,7 @@
 """Depth from two images of one moving camera (paper B, 2.2 and Fig. 2), for features without a stereo match.
 
 Paper B takes two successive images. A hand-held camera moves a centimetre between frames, too little to show depth
-beyond arm's length; so a feature's first view is kept while it is tracked from frame to frame, and its depth is
+beyond arm's length; so a feature's first view is kept in its row of the tracks while it is followed, and its depth is
 computed once the parallax is large enough.
 
 The camera's motion between the two views comes from both pose estimates, whose errors are taken to be independent: each
@@ -14,18 +14,17 @@ A point that moves along its epipolar line gets a wrong depth: a single moving c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, StereoFeatures
+from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import Table
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, points_by_pose
 from slam.tracks.follow import Matches, Windows, follow, pairs_in_boxes
-from slam.tracks.table import LandmarkTable
-from slam.tracks.visibility import MapView
+from slam.tracks.table import Tracks
 
 _PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
 _RADIUS = 20.0  # most that a feature moves between two frames, besides the camera's rotation [px]
@@ -56,18 +55,11 @@ class Depths(Table):
 def two_view_depth(
     rig: StereoRig, uv_then: Array, uv_now: Array, T_then_now: Array, motion_covariance: Array, sigma: float
 ) -> Depths:
-    """Triangulate points from two views of the left camera, to first order of the pixels' and the motion's errors.
+    """Triangulate points from pixels (N, 2) in two views, to first order of the pixels' and the motion's errors.
 
     Both rays pass each other at a distance. The point between them is the estimate; that the true distance is zero is
-    one more measurement of it, which also says whether the two views show one point.
-
-    Args:
-        rig: the cameras.
-        uv_then: left pixels (N, 2) in the first view.
-        uv_now: the same in the second.
-        T_then_now: poses (4, 4) or (N, 4, 4) of the second camera in the first one's coordinates.
-        motion_covariance: of these poses (6, 6) or (N, 6, 6), for a perturbation ``T exp(ξ)``.
-        sigma: pixel noise [px].
+    one more measurement of it, which also says whether the two views show one point. The second camera's poses in the
+    first one's coordinates (N, 4, 4) have covariances (N, 6, 6), or all share one; `sigma` is the pixel noise [px].
     """
     n = len(uv_now)
     T = np.broadcast_to(T_then_now, (n, 4, 4))
@@ -122,77 +114,56 @@ def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma:
     return np.asarray(np.linalg.inv(rows.T @ rows + 1e-6 * np.eye(6)))
 
 
-def unclaimed(view: MapView, landmarks: LandmarkTable, features: StereoFeatures, rows: NDArray) -> NDArray[np.intp]:
-    """Those of the features `rows` (K,) that no landmark in view claims: none nearby in the image looks alike."""
-    shown = np.flatnonzero(view.in_image)
-    if not len(rows) or not len(shown):
+def unclaimed(uv: Array, descriptors: NDArray[np.float32], features: StereoFeatures, rows: IndexArray) -> IndexArray:
+    """Those of the features `rows` (K,) to which no landmark in view, at pixels (M, 2), is near and looks alike."""
+    if not len(rows) or not len(uv):
         return np.asarray(rows)
-    at, which = pairs_in_boxes(view.uv_left[shown], np.full((len(shown), 2), _CLAIM), features.uv_left[rows])
-    gap = np.linalg.norm(landmarks.descriptors[shown[at]] - features.descriptors[rows[which]], axis=1)
+    at, which = pairs_in_boxes(uv, np.full((len(uv), 2), _CLAIM), features.uv_left[rows])
+    gap = np.linalg.norm(descriptors[at] - features.descriptors[rows[which]], axis=1)
     return np.delete(rows, which[gap < _D_MATCH])
 
 
-@dataclass(frozen=True, eq=False)
-class FirstViews(Table):
-    """Features without depth that are followed until two views give it, a row each."""
-
-    uv_first: Array  # left pixels (N, 2) at first sight
-    T_first: Array  # T_world_left (N, 4, 4) then
-    covariance: Array  # of that pose (N, 6, 6) by its own frame, see `frame_covariance`
-    frame: NDArray[np.int64]  # its number (N,)
-    uv_last: Array  # left pixels (N, 2) when last seen
-    T_last: Array  # T_world_left (N, 4, 4) then
-    descriptors: NDArray[np.float32]  # as last seen (N, D)
-    laplacian: NDArray[np.int8]  # signs of the Laplacian (N,)
-
-
 def depths_by_motion(
-    rig: StereoRig, views: FirstViews | None, features: StereoFeatures, T_world_left: Array, covariance: Array,
+    rig: StereoRig, tracks: Tracks, features: StereoFeatures, rows: IndexArray, T_world_left: Array, covariance: Array,
     frame: int, sigma: float, depth_error: float,
-) -> tuple[FirstViews, NDArray[np.intp], Depths]:  # fmt: skip
-    """Follow features without depth into a frame.
+) -> tuple[IndexArray, Depths]:  # fmt: skip
+    """Follow features `rows` (K,) without depth into a frame, in place, until two views give depth.
 
-    Args:
-        rig: the cameras.
-        views: the features followed so far; None for none.
-        features: of the frame, without depth, that could become landmarks (K rows).
-        T_world_left: pose (4, 4) after the update.
-        covariance: of the pose by this frame (6, 6), see `frame_covariance`.
-        frame: the frame's number.
-        sigma: pixel noise [px].
-        depth_error: largest relative standard deviation of a new landmark's depth.
-
-    Returns:
-        the features that are followed on, the rows of `features` (N,) whose depth has become known, and these depths.
+    The frame has the pose (4, 4) with a covariance (6, 6) as in `frame_covariance`; `sigma` is the pixel noise [px],
+    `depth_error` the largest relative standard deviation of a depth. Returns the rows of `features` (N,) whose depth
+    has become known, and these depths.
     """
-    n, uv = len(features), features.uv_left
-    T, P = np.tile(T_world_left, (n, 1, 1)), np.tile(covariance, (n, 1, 1))
-    now = FirstViews(uv, T, P, np.full(n, frame), uv, T, features.descriptors, features.laplacian)
-    views = now.select(slice(0)) if views is None else views
-    found = _followed(rig, views, features, T_world_left)
-    first, seen = views.select(found.tracks), now.select(found.features)
-    motion = adjoint(inverse(T_world_left) @ first.T_first)
-    P = covariance + motion @ first.covariance @ np.swapaxes(motion, 1, 2)
-    depths = two_view_depth(rig, first.uv_first, seen.uv_last, inverse(first.T_first) @ T_world_left, P, sigma)
+    directions = _rays(rig, features.uv_left[rows]) @ T_world_left[:3, :3].T
+    waiting = np.flatnonzero(tracks.waiting_since >= 0)
+    pairs = _followed(rig, tracks, waiting, features.select(rows), T_world_left)
+    at, seen = waiting[pairs.tracks], rows[pairs.features]
+    then = tracks.first_pose[at]
+    motion = adjoint(inverse(T_world_left) @ then)
+    P = covariance + motion @ tracks.first_covariance[at] @ np.swapaxes(motion, 1, 2)
+    now = features.uv_left[seen]
+    depths = two_view_depth(rig, tracks.first_pixel[at], now, inverse(then) @ T_world_left, P, sigma)
     good = depths.good(depth_error)
-    again = ~good & (depths.misfit < _MISFIT)
-    kept = replace(first, uv_last=seen.uv_last, T_last=seen.T_last, descriptors=seen.descriptors).select(again)
-    lost = views.select(np.delete(np.arange(len(views)), found.tracks))
-    fresh = now.select(np.delete(np.arange(n), found.features[good | again]))
-    every = kept.joined(lost).joined(fresh)
-    return (
-        every.select(np.flatnonzero(every.frame > frame - _KEPT)[-_VIEWS:]),
-        found.features[good],
-        depths.select(good),
-    )
+    goes_on = ~good & (depths.misfit < _MISFIT)
+    tracks.row[at] = seen
+    tracks.look[at], tracks.direction[at] = features.descriptors[seen], directions[pairs.features]
+    tracks.waiting_since[at[~(good | goes_on)]] = -1
+    new = np.delete(np.arange(len(rows)), pairs.features[good | goes_on])
+    tracks.wait(frame, features, rows[new], directions[new], T_world_left, covariance)
+    tracks.waiting_since[at[good]] = -1
+    tracks.waiting_since[tracks.waiting_since <= frame - _KEPT] = -1
+    waiting = np.flatnonzero(tracks.waiting_since >= 0)
+    oldest = np.argsort(tracks.waiting_since[waiting], kind="stable")[: max(len(waiting) - _VIEWS, 0)]
+    tracks.waiting_since[waiting[oldest]] = -1
+    return seen[good], depths.select(good)
 
 
-def _followed(rig: StereoRig, views: FirstViews, features: StereoFeatures, T_world_left: Array) -> Matches:
-    """Features that continue views, where the camera's rotation takes them."""
-    turn = np.swapaxes(views.T_last[:, :3, :3], 1, 2) @ T_world_left[:3, :3]
-    expected = rig.left.project((_rays(rig, views.uv_last)[:, None, :] @ turn)[:, 0])
+def _followed(
+    rig: StereoRig, tracks: Tracks, waiting: IndexArray, features: StereoFeatures, T_world_left: Array
+) -> Matches:
+    """Features that continue the tracks `waiting` (M,) for a depth, where the camera's rotation takes them."""
+    expected = rig.left.project(tracks.direction[waiting] @ T_world_left[:3, :3])
     # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
     windows, square = Windows((2 * _RADIUS,), (_D_MATCH,), _RATIO), np.zeros((len(expected), 2, 2))
-    found = follow(expected, square, views.descriptors, views.laplacian, features, windows)
-    gap = np.abs(features.uv_left[found.features] - expected[found.tracks])
-    return found.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))
+    pairs = follow(expected, square, tracks.look[waiting], tracks.laplacian[waiting], features, windows)
+    gap = np.abs(features.uv_left[pairs.features] - expected[pairs.tracks])
+    return pairs.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))

@@ -4,6 +4,9 @@ A camera stands if most features stay at their pixels and no small motion explai
 Once it stands, features that stay where they were are witnesses, however few a passing body leaves of them: a motion of
 the camera would move them too. It is over as soon as some motion of the camera explains witnesses and moving features
 alike. While the camera stands, only features that stay are used to measure its pose and to make landmarks.
+
+Places are pixels and no points of the world: they are compared with the features before the pose is predicted, as how
+it is predicted depends on them, and they have neither a depth nor a prediction of their own. So they are no tracks.
 """
 
 from __future__ import annotations
@@ -25,9 +28,7 @@ _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stay
 _MOVES = chi_square_limit(6, 1 - 1e-4)  # of a common motion; asked in every frame
 _MEDIAN = chi_square_limit(3, 0.5)
 _FEW = 2 * MINIMAL_POINTS  # features that tell nothing of a motion
-_BLIND = (
-    10  # frames without enough features that stay, for which a rest is believed to last: the camera may be carried off
-)
+_BLIND = 10  # frames without enough features that stay, after which the camera may have been carried off
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,26 +45,14 @@ class Places(Table):
         """Features seen for the first time."""
         return cls(z, descriptors, np.ones(len(z), np.int64), np.zeros(len(z), np.int64))
 
-    def find(self, z: Array, descriptors: NDArray[np.float32], radius: float) -> tuple[NDArray, NDArray]:
-        """Rows of those that are found again less than `radius` [px] away among features (N,), and the features."""
-        if not len(self.z) or not len(z):
-            return np.zeros(0, np.intp), np.zeros(0, np.intp)
-        from slam.tracks.follow_kernels import nearest
-
-        # 0.5: largest distance of descriptors of one feature in unchanged light
-        order = np.argsort(self.z[:, 0], kind="stable")
-        rows = nearest(z, order, self.z, radius, descriptors, self.descriptors, 0.5)
-        places = np.flatnonzero(rows >= 0)
-        return places, rows[places]
-
-    def after(self, places: NDArray, rows: NDArray, z: Array, descriptors: NDArray[np.float32]) -> Places:
-        """The places after a frame with features (N,), of which `rows` were found at `places` again."""
+    def after(self, at: NDArray, rows: NDArray, z: Array, descriptors: NDArray[np.float32]) -> Places:
+        """The places after a frame with features (N,), of which `rows` stayed at the places `at`."""
         sights, missed, mean = self.sights.copy(), self.missed + 1, self.z.copy()
-        sights[places] += 1
-        missed[places] = 0
+        sights[at] += 1
+        missed[at] = 0
         # 10: sights whose mean is a feature's place; later ones would follow a slow motion
-        share = np.where(sights[places] <= 10, 1.0 / sights[places], 0.0)
-        mean[places] += share[:, None] * (z[rows] - mean[places])
+        share = np.where(sights[at] <= 10, 1.0 / sights[at], 0.0)
+        mean[at] += share[:, None] * (z[rows] - mean[at])
         keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
         keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:3000])  # 3000: features
         new = np.delete(np.arange(len(z)), rows)
@@ -91,28 +80,32 @@ class Standing:
         """Whether the camera stands at a known place, or something hides what it knows: then no other is looked for."""
         return self.stands and (self.blind > 0 or not lost)
 
-    def leaving(self, features: int) -> NDArray[np.intp]:
-        """Rows of a frame's N = `features` features that do not stay, if the camera stands."""
-        return np.setdiff1d(np.arange(features), self.witnesses) if self.stands else np.zeros(0, np.intp)
-
     def after(self, rig: StereoRig, sigma: float, features: StereoFeatures) -> Standing:
         """What a frame's features with a right pixel say; `sigma` is the pixel noise [px]."""
         stereo = np.flatnonzero(features.has_stereo)
         z = measurement_rows(features.uv_left[stereo], features.uv_right[stereo])
         descriptors = features.descriptors[stereo]
-        begun = Standing(Places.of(z, descriptors), T_world_left=self.T_world_left)
-        if self.places is None or self.places.descriptors.shape[1] != descriptors.shape[1]:
+        begun, places = Standing(Places.of(z, descriptors), T_world_left=self.T_world_left), self.places
+        if places is None or places.descriptors.shape[1] != descriptors.shape[1]:
             return begun
-        places, rows = self.places.find(z, descriptors, SIGMAS * np.sqrt(2.0) * sigma)
-        shift = z[rows] - self.places.z[places]
+        at, rows = np.zeros((2, 0), np.intp)
+        if len(places) and len(z):
+            from slam.tracks.follow_kernels import nearest
+
+            # 0.5: largest distance of descriptors of one feature in unchanged light
+            order, radius = np.argsort(places.z[:, 0], kind="stable"), SIGMAS * np.sqrt(2.0) * sigma
+            row_of = nearest(z, order, places.z, radius, descriptors, places.descriptors, 0.5)
+            at = np.flatnonzero(row_of >= 0)
+            rows = row_of[at]
+        shift = z[rows] - places.z[at]
         stay = np.square(shift).sum(axis=1) <= _GATE * min(self.variance, 2.0 * sigma**2)
-        places, rows, shift = places[stay], rows[stay], shift[stay]
-        most = 2 * len(rows) > min(len(z), int((self.places.missed == 0).sum()))
+        at, rows, shift = at[stay], rows[stay], shift[stay]
+        most = 2 * len(rows) > min(len(z), int((places.missed == 0).sum()))
         if not (self.stands or most):
             return begun
-        witnesses = stereo[rows[self.places.sights[places] >= _FRAMES]]
-        places_after = self.places.after(places, rows, z, descriptors)
-        at_rest, variance = _at_rest(rig, self.places.z[places], shift, self.variance)
+        witnesses = stereo[rows[places.sights[at] >= _FRAMES]]
+        places_after = places.after(at, rows, z, descriptors)
+        at_rest, variance = _at_rest(rig, places.z[at], shift, self.variance)
         if at_rest:
             return Standing(places_after, self.frames + 1, witnesses, variance, self.T_world_left)
         if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, _BLIND):
@@ -124,12 +117,7 @@ class Standing:
     ) -> Standing:
         """At rest no more if a motion of the camera explains all: some landmarks move with it, and few witnesses would.
 
-        Args:
-            rig: the cameras.
-            sigma: pixel noise [px].
-            features: of the frame.
-            matched: rows of those that agree on a pose, and
-            T_world_left: that pose (4, 4).
+        `sigma` is the pixel noise [px], `matched` are rows of the features that agree on a pose `T_world_left` (4, 4).
         """
         motion = inverse(T_world_left) @ self.T_world_left
         landmarks, witnesses = (_moved_share(rig, sigma, features, rows, motion) for rows in (matched, self.witnesses))

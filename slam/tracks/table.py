@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import Table, among
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array
 from slam.naming import count
 
 _ROOM = 1000  # cost: rows that a table begins with
@@ -90,10 +90,6 @@ class LandmarkTable(Table):
         self.returning[:] = 0
         self.returning[rows] = successive
 
-    def in_world(self, T: Array) -> LandmarkTable:
-        """The same in another world frame; `T` (4, 4) transforms coordinates to it."""
-        return replace(self, seen_from=transform(T, self.seen_from))
-
     def count_frame(
         self,
         frame: int,
@@ -136,7 +132,8 @@ class LandmarkTable(Table):
 
 @dataclass(frozen=True, eq=False)
 class Tracks(LandmarkTable):
-    """All rows: `ids` are −1 for what is no landmark, `number` for what is not followed; a row with neither is unused.
+    """All rows: `ids` are −1 where a row is no landmark, `number` where it is not followed as part of a body or a
+    candidate, `waiting_since` where it does not wait for a depth; a row with all three is unused.
 
     Every measurement of what is followed is kept as a point in world coordinates with its information: the point ``p``
     that the pixels say, relative to the track's own anchor, and ``A = Jᵀ J / σ²``; `slam.bodies.fits` fits them.
@@ -171,6 +168,12 @@ class Tracks(LandmarkTable):
     still: BoolArray = _column(bool)
     # frames for which, as a landmark, it is in doubt since it parted from the rest (N,), see `slam.bodies.parting`
     parted: IdArray = _column(np.int64)
+    # frame in which a feature without depth was first seen, as long as it waits for a second view (N,); −1 for others
+    waiting_since: IdArray = _column(np.int64, fill=-1)
+    first_pixel: Array = _column(float, 2)  # left pixel of such a feature at first sight (N, 2)
+    first_pose: Array = _column(float, 4, 4)  # T_world_left then (N, 4, 4)
+    first_covariance: Array = _column(float, 6, 6)  # of that pose by its own frame (N, 6, 6)
+    direction: Array = _column(float, 3)  # in which it was last seen (N, 3), in world axes
 
     @classmethod
     def empty(cls, dimensions: int, window: int = 0, rows: int = _ROOM) -> Tracks:
@@ -208,7 +211,7 @@ class Tracks(LandmarkTable):
     @property
     def used(self) -> BoolArray:
         """Which rows are in use (N,)."""
-        return (self.ids >= 0) | (self.number >= 0)
+        return (self.ids >= 0) | (self.number >= 0) | (self.waiting_since >= 0)
 
     @property
     def found(self) -> BoolArray:
@@ -253,10 +256,25 @@ class Tracks(LandmarkTable):
         at[at < 0] = np.flatnonzero(~self.used)[: int((at < 0).sum())]
         new = LandmarkTable(ids, features.descriptors[rows], features.laplacian[rows])
         new.seen[:], new.in_view[:], new.last_seen[:], new.seen_from[:] = 1, 1, frame, camera
-        self.row[at] = rows
+        self.row[at], self.waiting_since[at] = rows, -1
         for name in LandmarkTable.__dataclass_fields__:
             getattr(self, name)[at] = getattr(new, name)
         vars(self).pop("mapped", None)
+
+    def wait(
+        self, frame: int, features: StereoFeatures, rows: IndexArray, directions: Array, T_world_left: Array,
+        covariance: Array,
+    ) -> None:  # fmt: skip
+        """Features `rows` (K,) without depth begin to wait for a second view, in place.
+
+        They are seen in `directions` (K, 3) in world axes, from a pose (4, 4) whose covariance by its own frame is
+        (6, 6).
+        """
+        at = np.flatnonzero(~self.used)[: len(rows)]
+        self.row[at], self.waiting_since[at] = rows, frame
+        self.look[at], self.laplacian[at] = features.descriptors[rows], features.laplacian[rows]
+        self.first_pixel[at], self.direction[at] = features.uv_left[rows], directions
+        self.first_pose[at], self.first_covariance[at] = T_world_left, covariance
 
     def erase_landmarks(self, rows: IndexArray) -> None:
         """Landmarks (K,) leave the map, in place; their tracks go on."""

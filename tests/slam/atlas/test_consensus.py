@@ -11,9 +11,9 @@ from slam.atlas.atlas import Atlas
 from slam.atlas.closing import close
 from slam.atlas.keyframes import Keyframe, Loop
 from slam.atlas.pose_graph import Chain, PoseGraph
+from slam.data import CommonError
 from slam.geometry.se3 import Array, exp, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.rig_error import CommonError
 
 LAP, DEPTH = 60, 2.0
 SIGMAS = np.repeat([2e-3, 0.05], 3)  # of a step

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from slam.atlas.config import AtlasConfig
-from slam.atlas.keyframes import Keyframe, covariance_growth, step_covariance, view_has_changed
+from slam.atlas.keyframes import Keyframe, covariance_growth, step_covariance
+from slam.atlas.loop_closer import view_has_changed
 from slam.atlas.verification import refined_pose, verify
 from slam.calibration import RigModel
 from slam.calibration.model import Revision, RigCorrection
@@ -19,7 +20,7 @@ from slam.geometry.se3 import Array, adjoint, exp, inverse, log, transform
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
 from slam.tracks.localizer import Localizer
-from slam.tracks.management import depth_is_known
+from slam.tracks.mapper import depth_is_known
 
 SIGMA = 0.5
 CAMERA = PinholeCamera(300.0, 300.0, 320.0, 180.0, 640, 360)

@@ -152,5 +152,5 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
     known = result.common.jacobian @ result.common.root[:, -1]
     assert np.linalg.norm(known - error) < 0.2 * np.linalg.norm(error)
     np.testing.assert_array_equal(result.common.root[:-1, -1], FOLLOWED.of(mean))
-    in_path = system._session.rig_error.common(system.backend, as_reported=False).root[:-1, -1]
+    in_path = system._tracker.rig_error.common(system.backend, as_reported=False).root[:-1, -1]
     np.testing.assert_array_equal(in_path, FOLLOWED.of(0 * mean if revises else mean))

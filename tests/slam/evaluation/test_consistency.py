@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from slam.data import CommonError
 from slam.evaluation.consistency import consistency_figures, stretch_nees
 from slam.evaluation.summary import evaluate
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.rig_error import CommonError
 from slam.run.results import verdict
 
 STEP = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 1.0])  # a turn of 0.02 rad and 1 m forward

@@ -9,8 +9,7 @@ from slam.data import StereoFrame
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.input.features import outside_masks
-from slam.input.rectification import Rectification
+from slam.input.features import Rectification, outside_masks
 from slam.models import models_for
 from slam.system import StereoSlam
 from tests.slam.scene import GENERAL_RIG, Cloud

@@ -13,7 +13,7 @@ from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.tracks import alignment
 from slam.tracks.alignment import warps_of
-from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.step import LandmarkMatches
 from slam.tracks.table import LandmarkTable, Patch
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)

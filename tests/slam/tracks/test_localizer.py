@@ -10,7 +10,7 @@ from slam.geometry import se3
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
 from slam.tracks.localizer import Localizer, Search, jump
-from slam.tracks.state import TrackingState
+from slam.tracks.step import TrackingState
 from slam.tracks.table import LandmarkTable
 from tests.slam.scene import RIG, Cloud
 

@@ -5,16 +5,17 @@ import pytest
 
 from slam.data import StereoFeatures
 from slam.tracks.config import MapConfig
-from slam.tracks.management import (
-    bad_landmarks,
-    crowded_landmarks,
+from slam.tracks.mapper import (
+    MapView,
     doubled_landmarks,
-    known_features,
+    expected_landmarks,
+    features_of_landmarks,
     new_landmarks,
+    redundant_landmarks,
     surplus_landmarks,
+    undetected_landmarks,
 )
 from slam.tracks.table import LandmarkTable
-from slam.tracks.visibility import MapView, expected_landmarks
 from tests.slam.scene import RIG
 
 CONFIG = MapConfig(target_in_view=20, separation=5.0)
@@ -75,7 +76,7 @@ def test_uncertain_depth_is_left_out():
 def test_erase_what_is_missed_or_seldom_seen():
     config = MapConfig(erase_missed=5, erase_share=0.3)
     rows = rows_with(seen=[9, 9, 2, 2, 1], in_view=[10, 14, 10, 5, 1], missed=[1, 5, 1, 3, 0])
-    assert bad_landmarks(rows, config).tolist() == [False, True, True, False, False]
+    assert undetected_landmarks(rows, config).tolist() == [False, True, True, False, False]
 
 
 def test_frames_unseen_are_counted_though_the_others_are_seen_in_every_one():
@@ -84,13 +85,15 @@ def test_frames_unseen_are_counted_though_the_others_are_seen_in_every_one():
     rows = rows_with(seen=np.full(81, 5))
     features = features_at(np.zeros((80, 2)))
     for frame in range(1, 7):
-        assert not bad_landmarks(rows, MapConfig(confirmed=6)).any()
+        assert not undetected_landmarks(rows, MapConfig(confirmed=6)).any()
         rows.count_frame(2 * frame, others, others, features, np.arange(80))
         rows.count_frame(2 * frame + 1, none, none, features_at(np.zeros((0, 2))), none.astype(np.intp))
     assert rows.unseen.tolist() == [6] + [0] * 80
-    assert np.flatnonzero(bad_landmarks(rows, MapConfig(confirmed=6))).tolist() == [0]
+    assert np.flatnonzero(undetected_landmarks(rows, MapConfig(confirmed=6))).tolist() == [0]
     earlier = LandmarkTable(**{**vars(rows), "last_seen": rows.last_seen - (np.arange(81) == 0)})
-    assert not bad_landmarks(earlier, MapConfig(confirmed=6)).any()  # kept by an earlier run, not seen in this one
+    assert not undetected_landmarks(
+        earlier, MapConfig(confirmed=6)
+    ).any()  # kept by an earlier run, not seen in this one
 
 
 def test_what_is_held_back_is_neither_missed_nor_seen():
@@ -104,7 +107,7 @@ def test_what_is_held_back_is_neither_missed_nor_seen():
         [4, 5, 0],
         [4, 5, 0],
     ]
-    assert bad_landmarks(rows, MapConfig(confirmed=0)).tolist() == [False, True, False]
+    assert undetected_landmarks(rows, MapConfig(confirmed=0)).tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(
@@ -121,12 +124,12 @@ def test_out_of_view_the_map_is_thinned_to_the_best_seen():
     config = MapConfig(spacing=0.1, erase_missed=2)
     positions = np.array([[0, 0, 2], [0.1, 0, 2], [0.2, 0, 2], [0.3, 0, 2], [0.4, 0, 2], [1.4, 0, 2.0]])
     rows = rows_with(seen=[3, 9, 4, 1, 1, 1], unseen=[5, 4, 3, 2, 1, 0], seen_from=np.zeros((6, 3)))
-    assert crowded_landmarks(rows, positions, config).tolist() == [True, False, True, False, False, False]
-    assert not crowded_landmarks(rows, positions, MapConfig(spacing=0.0, erase_missed=2)).any()
+    assert redundant_landmarks(rows, positions, config).tolist() == [True, False, True, False, False, False]
+    assert not redundant_landmarks(rows, positions, MapConfig(spacing=0.0, erase_missed=2)).any()
     apart = positions * [3, 1, 1]  # further apart than a tenth of the distance
-    assert not crowded_landmarks(rows, apart, config).any()
+    assert not redundant_landmarks(rows, apart, config).any()
     unknown = rows_with(seen=rows.seen, unseen=rows.unseen)
-    assert not crowded_landmarks(unknown, positions, config).any()
+    assert not redundant_landmarks(unknown, positions, config).any()
 
 
 def seen_from_the_origin(positions, features):
@@ -148,7 +151,7 @@ def test_a_feature_that_is_a_landmark_already_is_known():
     # like another feature.
     positions = [points[0] * 1.07, points[1] + [0.2, 0, 0], points[2]]
     view = seen_from_the_origin(positions, features)
-    assert known_features(view, landmarks, features, CONFIG).tolist() == [True, False, False]
+    assert features_of_landmarks(view, landmarks, features, CONFIG).tolist() == [True, False, False]
 
 
 def test_of_doubled_landmarks_the_one_seen_less_goes():

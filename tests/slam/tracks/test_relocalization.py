@@ -13,7 +13,7 @@ from slam.geometry import se3
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from slam.tracks.config import MapConfig
-from slam.tracks.state import TrackingState
+from slam.tracks.step import TrackingState
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother", "window")
