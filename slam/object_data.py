@@ -7,7 +7,7 @@ coordinates does not depend on that choice: it takes a point of the body from it
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,15 +36,6 @@ class ObjectObservations:
     def has_stereo(self) -> BoolArray:
         """Which observations have a right pixel (M,)."""
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
-
-
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """The use of a body's observations in one frame."""
-
-    measured: bool = False  # whether the body's update used observations
-    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))  # ids of the points whose ones were used (K,)
-    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))  # ids of those that failed the gate (R,)
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,7 +107,7 @@ class Session:
             state.index + 1, FrameStatus.LOST, NOT_FOUND, estimate, report, seen, predicted=0, matched=none,
             matched_features=rows, added=none, added_features=rows, erased=none, map_size=len(whole.ids), located=False,
         )  # fmt: skip
-        return replace(state, index=state.index + 1, stamp=features.stamp, checksum=None), result
+        return replace(state, index=state.index + 1, checksum=None), result
 
     def map_estimate(self, state: State, stamp: float) -> Estimate:
         """The prior map, with a guess as the pose; its covariance is so large that the pose means nothing."""

@@ -55,7 +55,6 @@ class State:
     tracks: Tracks | None = None  # the table of all that is followed or in the map; None before the first frame
     atlas: Atlas = field(default_factory=Atlas)  # keyframes and loops
     index: int = -1  # of the last frame
-    stamp: float = -np.inf  # its time [s]
     tracking: TrackingState = field(default_factory=TrackingState)  # how localization has gone
     standing: Standing = field(default_factory=Standing)  # whether the camera stands
     dimensions: int | None = None  # length of the descriptors; None before the first feature
@@ -75,8 +74,7 @@ class State:
         """The state after one more frame."""
         located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
         return replace(
-            self, tracks=step.tracks, atlas=atlas, index=step.index,
-            stamp=step.features.stamp, tracking=step.tracking,
+            self, tracks=step.tracks, atlas=atlas, index=step.index, tracking=step.tracking,
             standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
             checksum=checksum, mapped=self.mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
@@ -189,10 +187,9 @@ class Tracker:
             corrected = _shifted_as(corrected, features, aligned)
         step = Step(index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking)
         suspects = self._suspects(step)
-        moving = isin(matches.ids, suspects)
-        matches, withheld = matches.select(~moving), matches.select(moving)
+        matches = matches.select(~isin(matches.ids, suspects))
         tracks.find(tracks.rows(matches.ids), matches.rows)
-        return replace(step, matches=matches, withheld=withheld, suspects=suspects)
+        return replace(step, matches=matches, suspects=suspects)
 
     def _suspects(self, step: Step) -> IdArray:
         """Ids of landmarks that may move; while the camera stands, all matched ones that do not stay where they are."""

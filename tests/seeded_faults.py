@@ -127,13 +127,13 @@ FAULTS = (
     ),
     # tracks
     Fault(
-        "a second feature that is as near counts for nothing", "slam/tracks/follow_kernels.py",
+        "a second feature that is as near counts for nothing", "slam/tracks/follow.py",
         "elif d < second[row]:  # also one that is as near as the first",
         "elif nearest[row] < d < second[row]:",
         "tests/slam/tracks",
     ),
     Fault(
-        "a match need not be mutual", "slam/tracks/follow_kernels.py",
+        "a match need not be mutual", "slam/tracks/follow.py",
         "good[p] = good[p] and distance[p] <= of_column[columns[p]]", "pass",
         "tests/slam/tracks",
     ),

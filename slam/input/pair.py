@@ -25,8 +25,6 @@ _SHOWN_PLAIN = 0.9  # guard: the same of cameras that are rectified but for lens
 #: Disparities below this count as zero [px].
 NO_DISPARITY = _TOLERANCE
 
-_LENS_IS_RIGHT = 0.1  # guard: a lens is calibrated to a tenth of its distortion, and mostly far better
-
 _SAMPLE = 8  # fixed: matches that any fundamental matrix can be made to fit
 _SIGMAS = 5.0  # guard: a chance of 3e-7 to be wrong
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
+from slam.runtime.compilation import helper, kernel, vector_helper
 from slam.tracks.config import AssociationConfig
 
 Descriptors = NDArray[np.float32]
@@ -55,13 +56,11 @@ def follow(
     Tracks whose `pixels` (M, 2) are not finite are not matched. The windows are ellipses of the innovations'
     covariances (M, 2, 2) [px²]. Features that are `taken` (N,) are no candidates.
     """
-    from slam.tracks import follow_kernels
-
     order = np.argsort(features.uv_left[:, 0], kind="stable")
     order = order if taken is None else order[~taken[order]]
     sizes, pairs = np.array(windows.sizes), np.empty((2, len(pixels)), np.intp)
     least = np.broadcast_to(windows.least, len(pixels)) / sizes[0]
-    count = follow_kernels.follow(
+    count = _follow(
         np.ascontiguousarray(pixels), np.ascontiguousarray(innovation), least, windows.most / sizes[0], sizes,
         np.array(windows.d_match, np.float32), np.float32(windows.ratio), np.ascontiguousarray(descriptors), laplacian,
         np.ascontiguousarray(features.uv_left), features.descriptors, features.laplacian, order, pairs,
@@ -74,8 +73,6 @@ def match_everywhere(
     allowed: BoolArray | None = None,
 ) -> Matches:  # fmt: skip
     """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image, or in pairs `allowed` (M, N)."""
-    from slam.tracks.follow_kernels import mutual_best
-
     best = np.empty(len(descriptors), np.intp)
     allowed = np.ones((0, 0), bool) if allowed is None else np.ascontiguousarray(allowed)
     mutual_best(
@@ -91,15 +88,13 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
 
     Pixels are sorted by column, so that few pairs have to be tested.
     """
-    from slam.tracks import follow_kernels
-
     order = np.argsort(uv[:, 0], kind="stable")
     boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach), np.ascontiguousarray(uv), order
     rows, inside = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
-    count = follow_kernels.pairs_in_boxes(*boxes, rows, inside)
+    count = _pairs_in_boxes(*boxes, rows, inside)
     if count > len(rows):
         rows, inside = np.empty((2, count), np.intp)
-        follow_kernels.pairs_in_boxes(*boxes, rows, inside)
+        _pairs_in_boxes(*boxes, rows, inside)
     return rows[:count], inside[:count]
 
 
@@ -112,3 +107,225 @@ def crowded(uv: Array, neighbours: Array, radius: float) -> BoolArray:
     out = np.zeros(len(uv), bool)
     out[rows[np.square(gap).sum(axis=1) < radius * radius]] = True
     return out
+
+
+@helper
+def first_column(uv, order, low):
+    """First place in the `order` (N,) of columns whose pixel `uv` (N, 2) is not left of `low`."""
+    place, end = 0, len(order)
+    while place < end:
+        middle = (place + end) // 2
+        if uv[order[middle], 0] < low:
+            place = middle + 1
+        else:
+            end = middle
+    return place
+
+
+@kernel
+def _pairs_in_boxes(centres, reach, uv, order, rows, found):
+    """Pairs of boxes and of pixels inside them, by ascending box; returns how many there are.
+
+    Boxes have centres and half sizes `reach` (M, 2); `order` is that of the columns of the pixels `uv` (N, 2). Pairs
+    are written into `rows` of boxes and those `found` as far as there is room.
+    """
+    count = 0
+    for row in range(len(centres)):
+        place, high = first_column(uv, order, centres[row, 0] - reach[row, 0]), centres[row, 0] + reach[row, 0]
+        while place < len(order) and uv[order[place], 0] <= high:
+            if abs(uv[order[place], 1] - centres[row, 1]) <= reach[row, 1]:
+                if count < len(rows):
+                    rows[count], found[count] = row, order[place]
+                count += 1
+            place += 1
+    return count
+
+
+@helper
+def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, good):
+    """Mark in `good` which of the first `count` pairs of rows and columns belong together.
+
+    A row's nearest column must be nearer than `d_match`, and than `ratio` times its second; among the rows that have
+    the same one, the nearest gets it. There are `size` rows and columns; pairs that are not `allowed` do not count.
+    """
+    nearest, second = np.empty(size[0], np.float32), np.empty(size[0], np.float32)
+    of_column, most = np.empty(size[1], np.float32), np.float32(np.inf)
+    for row in range(size[0]):  # slices and fills take a second to compile
+        nearest[row] = second[row] = most
+    for column in range(size[1]):
+        of_column[column] = most
+    for p in range(count):
+        if allowed[p]:
+            row, column, d = rows[p], columns[p], distance[p]
+            if d < nearest[row]:
+                second[row], nearest[row] = nearest[row], d
+            elif d < second[row]:  # also one that is as near as the first
+                second[row] = d
+    for p in range(count):
+        row, column, d = rows[p], columns[p], distance[p]
+        good[p] = allowed[p] and d == nearest[row] and d < d_match and d < ratio * second[row]
+        if good[p] and d < of_column[column]:  # a row that would not take it has no claim to a column
+            of_column[column] = d
+    for p in range(count):
+        good[p] = good[p] and distance[p] <= of_column[columns[p]]
+
+
+@kernel
+def mutual_best(products, allowed, signs, feature_signs, d_match, ratio, best):
+    """Features (N,) into `best` that belong to tracks by `best_pairs`, −1 for none, wherever they lie.
+
+    Given are the inner products of descriptors, tracks by features (N, M), which pairs are `allowed` (N, M; all where
+    that is empty), and both signs of the Laplacian.
+    """
+    limit = d_match / ratio  # farther features affect neither best nor ratio
+    least = np.float32(1.0) - np.float32(0.5) * limit * limit
+    count, room = 0, 4 * len(products) + 64
+    rows, columns, distance = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.float32)
+    for n in range(products.shape[0]):
+        best[n] = -1
+        for m in range(products.shape[1]):
+            if products[n, m] <= least or signs[n] != feature_signs[m] or (allowed.size > 0 and not allowed[n, m]):
+                continue
+            if count == room:
+                room *= 2
+                rows, columns, distance = grown(rows, room), grown(columns, room), grown(distance, room)
+            d = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * products[n, m], np.float32(0.0)))
+            rows[count], columns[count], distance[count] = n, m, d
+            count += 1
+    every, good = np.ones(count, np.bool_), np.empty(count, np.bool_)
+    best_pairs(rows, columns, distance, every, count, products.shape, d_match, ratio, good)
+    for p in range(count):
+        if good[p] and best[rows[p]] < 0:
+            best[rows[p]] = columns[p]
+
+
+@helper
+def ellipse(S, low, high):
+    """Shape (uu, uv, vv) of the ellipse of a covariance (2, 2), and its half sizes; squared half axes are bounded."""
+    mean, half, cross = 0.5 * (S[0, 0] + S[1, 1]), 0.5 * (S[0, 0] - S[1, 1]), S[0, 1]
+    radius = np.hypot(half, cross)
+    safe = max(radius, 2.2250738585072014e-308)
+    c2, cs = 0.5 + 0.5 * half / safe, 0.5 * cross / safe  # cos², cos · sin of the long axis' angle
+    s2 = 1.0 - c2
+    long, short = min(max(mean + radius, low), high), min(max(mean - radius, low), high)
+    u, v = np.sqrt(c2 * long + s2 * short), np.sqrt(s2 * long + c2 * short)
+    return c2 / long + s2 / short, cs / long - cs / short, s2 / long + c2 / short, u, v
+
+
+@vector_helper
+def product(a, b):
+    """Inner product of two descriptors (D,)."""
+    total = np.float32(0.0)
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@helper
+def in_windows(pixels, innovation, least, most, sizes, signs, uv, feature_signs, order):
+    """Pairs of tracks and features (P,) in the largest window of each track, and the smallest window of each pair.
+
+    For the arguments see `_follow`; returns three arrays with room for more, and the number of pairs.
+    """
+    levels, last = len(sizes), sizes[len(sizes) - 1]
+    count, room = 0, 4 * len(pixels) + 64
+    tracks, features, level = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.intp)
+    for row in range(len(pixels)):
+        x, y = pixels[row, 0], pixels[row, 1]
+        if not (np.isfinite(x) and np.isfinite(y)):
+            continue
+        if most > 0:
+            shape = ellipse(innovation[row], least[row] ** 2, most**2)
+            uu, cross, vv = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
+            reach_u, reach_v = last * shape[3], last * shape[4]
+        else:
+            uu = cross = vv = np.float32(0.0)
+            reach_u = reach_v = last
+        place = first_column(uv, order, x - reach_u)
+        while place < len(order) and uv[order[place], 0] <= x + reach_u:
+            feature = order[place]
+            place += 1
+            if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[row]:
+                continue
+            du, dv = np.float32(uv[feature, 0] - x), np.float32(uv[feature, 1] - y)
+            if most > 0:
+                off, power = np.float64(uu * du * du + np.float32(2.0) * cross * du * dv + vv * dv * dv), 2
+            else:
+                off, power = np.float64(max(abs(du), abs(dv))), 1
+            smallest = 0
+            while smallest < levels and off > sizes[smallest] ** power:
+                smallest += 1
+            if smallest == levels:
+                continue
+            if count == room:
+                room *= 2
+                tracks, features, level = grown(tracks, room), grown(features, room), grown(level, room)
+            tracks[count], features[count], level[count] = row, feature, smallest
+            count += 1
+    return tracks, features, level, count
+
+
+@kernel
+def _follow(
+    pixels, innovation, least, most, sizes, limits, ratio, looks, signs, uv, feature_looks, feature_signs, order, pairs
+):
+    """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
+
+    Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows: their half axes
+    are `sizes` (L,) times standard deviations from `least` (M,) to `most`, or [px] of squares if `most` is zero. In
+    each window, descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs`; the features are at
+    `uv`, in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
+    """
+    a, b, level, count = in_windows(pixels, innovation, least, most, sizes, signs, uv, feature_signs, order)
+    matched = 0  # tracks that look alike to the bit may share a feature
+    done, taken = np.zeros(len(pixels), np.bool_), np.zeros(len(uv), np.bool_)
+    allowed, good = np.empty(count, np.bool_), np.empty(count, np.bool_)
+    distance = np.empty(count, np.float32)
+    for window in range(len(sizes)):
+        for p in range(count):
+            allowed[p] = level[p] <= window and not done[a[p]] and not taken[b[p]]
+            if allowed[p] and level[p] == window:  # in a larger window, of tracks that are not found yet alone
+                likeness = product(looks[a[p]], feature_looks[b[p]])
+                distance[p] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
+        best_pairs(a, b, distance, allowed, count, (len(pixels), len(uv)), limits[window], ratio, good)
+        for p in range(count):
+            if good[p]:
+                done[a[p]] = taken[b[p]] = True
+                pairs[0, matched], pairs[1, matched] = a[p], b[p]
+                matched += 1
+    return matched
+
+
+@kernel
+def nearest(points, order, places, radius, looks, place_looks, alike):
+    """Of each place (M, 2 or more) the nearest point (N, 2 or more) that has it as its own nearest place; −1 for none.
+
+    Both are less than `radius` apart, and their descriptors (N, D), (M, D) less than `alike`; `order` is that of the
+    places' columns.
+    """
+    matched, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
+    for n in range(len(points)):
+        x, y, best, least = points[n, 0], points[n, 1], -1, radius * radius
+        place = first_column(places, order, x - radius)
+        while place < len(order) and places[order[place], 0] <= x + radius:
+            m = order[place]
+            gap = (places[m, 0] - x) ** 2 + (places[m, 1] - y) ** 2
+            if gap < least:
+                best, least = m, gap
+            place += 1
+        if best >= 0 and least < gaps[best]:
+            off = np.float32(0.0)
+            for k in range(looks.shape[1]):
+                off += (looks[n, k] - place_looks[best, k]) ** 2
+            if off < alike * alike:
+                matched[best], gaps[best] = n, least
+    return matched
+
+
+@helper
+def grown(array, room):
+    """A copy with more room."""
+    new = np.empty(room, array.dtype)
+    for k in range(len(array)):
+        new[k] = array[k]
+    return new

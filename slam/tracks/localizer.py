@@ -107,7 +107,7 @@ class Search:
             if standing.stands:
                 if 2 * isin(matches.rows, standing.witnesses).sum() <= len(matches):
                     staying = replace(self, features=self.features.select(standing.witnesses))
-                    matches = staying.match_around(standing.T_world_left)
+                    matches, _ = staying.match_around(standing.T_world_left)
                     matches = replace(matches, rows=standing.witnesses[matches.rows])
                 if len(matches) or standing.holds(tracking.lost):
                     return matches, tracking, standing
@@ -132,7 +132,7 @@ class Search:
             if T is None:
                 return matches, replace(tracking, doubted=NO_POSE)
             if jump(self.prediction, T) <= farthest:
-                matches = self.match_around(T)
+                matches, _ = self.match_around(T)
         carried = tracking.carried(T)
         if carried:  # two, so that the place does not count as unknown: it is what hides the view
             none = replace(LandmarkMatches.nothing(), doubted=len(matches))
@@ -140,8 +140,10 @@ class Search:
         hidden_at = tracking.hidden_at if carried is None else None
         allowed = jump(self.prediction, T) <= farthest
         if not allowed and tracking.believed.after(T, stamp, models).count > 1:
-            around = self.match_around(T)
-            allowed = self._most_agree(around)
+            around, expected = self.match_around(T)
+            # 0.5: share of the landmarks in view, or of the features where these are fewer, that makes a majority
+            majority = 0.5 * min(expected, len(self.features))
+            allowed = len(around) >= max(majority, 2 * self.config.minimum_consistent)
             matches = around if allowed else matches
         if allowed and len(matches):
             return matches, tracking.believing(T, stamp, hidden_at)
@@ -188,24 +190,12 @@ class Search:
                 return LandmarkMatches.nothing()
         return self._agreeing(matches, consensus)
 
-    def match_around(self, T_world_left: Array) -> LandmarkMatches:
-        """Match landmarks in small windows around a known pose (4, 4); nothing if too few of them agree."""
-        matches, _ = self._around(T_world_left)
+    def match_around(self, T_world_left: Array) -> tuple[LandmarkMatches, int]:
+        """Landmarks in small windows around a pose (4, 4), none if too few agree, and how many were searched for."""
+        matches, expected = self._around(T_world_left)
         consensus = self._consensus(matches, T_world_left)
-        if consensus.inliers.sum() < self.config.minimum_consistent:
-            return LandmarkMatches.nothing()
-        return self._agreeing(matches, consensus)
-
-    def _most_agree(self, matches: LandmarkMatches) -> bool:
-        """Whether most of the landmarks in view from a pose agree on it, or of the features where these are fewer."""
-        T, left = matches.T_world_left, self.localizer.rig.left
-        if T is None:
-            return False
-        view = left.in_image(left.project(transform(inverse(T), self.positions)))
-        shown = view & self._searched_for(T)
-        # 0.5: share of what is in view that makes a majority
-        enough = max(0.5 * min(int(shown.sum()), len(self.features)), 2 * self.config.minimum_consistent)
-        return len(matches) >= enough
+        enough = consensus.inliers.sum() >= self.config.minimum_consistent
+        return self._agreeing(matches, consensus) if enough else LandmarkMatches.nothing(), expected
 
     def _searched_for(self, T_world_left: Array) -> BoolArray:
         """Which landmarks (N,) are searched for in windows: those in a similar view, and those long out of view."""
@@ -232,11 +222,9 @@ class Search:
         if wide and len(matches) < c.minimum_consistent:
             return PoseConsensus(guess, np.zeros(len(matches), bool))
         measured = measurement_rows(self.features.uv_left[rows], self.features.uv_right[rows])
-        threshold, hypotheses = c.consistency_sigmas * self.localizer.pixel_sigma, c.hypotheses
-        return find_consensus(
-            self.localizer.rig, self.positions[matches.tracks], measured, guess, threshold,
-            c.wide_hypotheses if wide else hypotheses, self.seed,
-        )  # fmt: skip
+        rig, threshold = self.localizer.rig, c.consistency_sigmas * self.localizer.pixel_sigma
+        hypotheses = c.wide_hypotheses if wide else c.hypotheses
+        return find_consensus(rig, self.positions[matches.tracks], measured, guess, threshold, hypotheses, self.seed)
 
     def _agreeing(self, matches: Matches, consensus: PoseConsensus) -> LandmarkMatches:
         """The matches that agree with a pose, by ascending id.

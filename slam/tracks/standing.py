@@ -90,7 +90,7 @@ class Standing:
             return begun
         at, rows = np.zeros((2, 0), np.intp)
         if len(places) and len(z):
-            from slam.tracks.follow_kernels import nearest
+            from slam.tracks.follow import nearest
 
             # 0.5: largest distance of descriptors of one feature in unchanged light
             order, radius = np.argsort(places.z[:, 0], kind="stable"), SIGMAS * np.sqrt(2.0) * sigma

@@ -169,12 +169,10 @@ class Step:
     features: StereoFeatures  # the same, corrected by the calibration
     prediction: Prediction  # of the back end
     tracks: Tracks  # the table of all that is followed or in the map; each stage changes it in place
-    matches: LandmarkMatches  # landmarks and the features that show them, without the withheld ones
+    matches: LandmarkMatches  # landmarks and the features that show them, without the suspects
     standing: Standing  # whether the camera stands
     tracking: TrackingState  # whether the pose is known
     suspects: IdArray = field(default_factory=_NONE.copy)  # ids of landmarks that may move
-    # those of them that were matched; they are withheld from the back end's update
-    withheld: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
     report: UpdateReport = field(default_factory=lambda: UpdateReport.nothing(UpdateStatus.EMPTY, ""))  # of the update
     estimate: Estimate = _NOWHERE  # the camera's pose after the update
     labels: MotionLabels = field(default_factory=lambda: MotionLabels(_NONE, _NONE, _NONE))  # which features move
