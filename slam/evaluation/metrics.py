@@ -114,23 +114,14 @@ def _span(name: str, stamps: Array) -> str:
     return f"{name} from {stamps[0]:.3f} to {stamps[-1]:.3f} s" if len(stamps) else f"{name} is empty"
 
 
-def absolute_errors(
-    estimate: Trajectory, truth: Trajectory, aligned: bool = True, with_scale: bool = False
-) -> PathErrors:
-    """ATE of two paths of equal length, row by row (see `associate`).
-
-    Args:
-        estimate: the estimated path.
-        truth: the true path.
-        aligned: align the estimate first: SE(3), or Sim(3) with `with_scale`.
-        with_scale: see `aligned`.
+def absolute_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
+    """ATE of two paths of equal length, row by row (see `associate`), after their alignment without scale.
 
     Raises:
         TrajectoryError: the lengths differ, or there is no pose.
     """
     _require_pairs(estimate, truth, 1)
-    if aligned:
-        estimate = align(estimate, truth, with_scale).apply_trajectory(estimate)
+    estimate = align(estimate, truth).apply_trajectory(estimate)
     distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
     turn = np.swapaxes(truth.poses[:, :3, :3], 1, 2) @ estimate.poses[:, :3, :3]
     return PathErrors(distance, np.degrees(rotation_angle(turn)))
@@ -223,15 +214,14 @@ def nees(residuals: Array, covariances: Array) -> Array:
     return np.asarray((whitened**2).sum(axis=-1), np.float64)
 
 
-def chi_square_band(dof: int, count: int = 1, probability: float = 0.95) -> tuple[float, float]:
+def chi_square_band(dof: int, count: int = 1) -> tuple[float, float]:
     """Bounds between which the mean of `count` independent NEES of `dof` degrees of freedom lies.
 
     The sum of the `count` values has a χ² distribution of ``dof · count`` degrees of freedom; the band is two-sided and
-    holds with `probability` where the estimator is consistent. Values of one run are not independent: take the mean
+    holds in 95 % of cases where the estimator is consistent. Values of one run are not independent: take the mean
     over runs (Monte Carlo), or read the band as a guide.
     """
     from scipy.special import gammaincinv  # scipy.stats would take a second to import
 
-    tails = [(1 - probability) / 2, (1 + probability) / 2]
-    low, high = 2 * gammaincinv(dof * count / 2, tails) / count
+    low, high = 2 * gammaincinv(dof * count / 2, [0.025, 0.975]) / count
     return float(low), float(high)

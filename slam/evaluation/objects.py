@@ -19,20 +19,17 @@ _SINGULAR = 1e-9  # numerics: smallest eigenvalue of a matrix of correlations th
 _OUTLINE = 0.25  # a feature sees as far as this, as a share of its size
 
 
-def motion_errors(estimated: Array, true: Array, delta: int = 1) -> PathErrors:
-    """Errors of the motions over `delta` rows, in the true body's frame before the motion.
+def motion_errors(estimated: Array, true: Array) -> PathErrors:
+    """Errors of the motions from row to row, in the true body's frame before the motion.
 
-    ``E = T⁻¹ (H_est⁻¹ H_true) T`` with ``H = T_k T_{k−Δ}⁻¹`` in world coordinates and T the true pose at k − Δ. It
+    ``E = T⁻¹ (H_est⁻¹ H_true) T`` with ``H = T_k T_{k−1}⁻¹`` in world coordinates and T the true pose at k − 1. It
     does not depend on where in the body its frame was put, and the translation is that of the body's own place.
 
     Args:
         estimated: poses T_world_object (N, 4, 4).
         true: the true ones in the same world frame; the body frames may differ.
-        delta: number of rows between.
     """
-    H = estimated[delta:] @ inverse(estimated[:-delta])
-    G = true[delta:] @ inverse(true[:-delta])
-    before = true[:-delta]
+    H, G, before = estimated[1:] @ inverse(estimated[:-1]), true[1:] @ inverse(true[:-1]), true[:-1]
     return error_sizes(inverse(before) @ inverse(H) @ G @ before)
 
 

@@ -223,37 +223,33 @@ _STILL = 1e-12  # numerics: [m²] product of the two spreads: less than a microm
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A similarity ``target ≈ scale R source + t``.
+    """A motion ``target ≈ R source + t``.
 
     Attributes:
         R: proper rotation (D, D).
         t: translation (D,) [m].
-        scale: 1 where it was not estimated.
         rank: number of directions that the positions determine; a turn about a straight path (rank 1) or of a path
             that stands still (rank 0) is not determined by them.
     """
 
     R: Array
     t: Array
-    scale: float
     rank: int
 
     def apply(self, positions: Array) -> Array:
         """Aligned positions (N, D)."""
-        return np.asarray(self.scale * positions @ self.R.T + self.t, np.float64)
+        return np.asarray(positions @ self.R.T + self.t, np.float64)
 
     def apply_trajectory(self, trajectory: Trajectory) -> Trajectory:
-        """The aligned trajectory: positions by the similarity, orientations by its rotation."""
+        """The aligned trajectory."""
         poses = trajectory.poses.copy()
         poses[:, :3, :3] = self.R @ poses[:, :3, :3]
         poses[:, :3, 3] = self.apply(trajectory.positions)
         return Trajectory(trajectory.stamps, poses)
 
 
-def align_positions(
-    source: Array, target: Array, with_scale: bool = False, orientations: Array | None = None
-) -> Alignment:
-    """The similarity that takes positions `source` (N, D) nearest to `target` (N, D), D = 2 or 3 (Umeyama 1991).
+def align_positions(source: Array, target: Array, orientations: Array | None = None) -> Alignment:
+    """The motion that takes positions `source` (N, D) nearest to `target` (N, D), D = 2 or 3 (Umeyama 1991).
 
     Where the positions leave a turn open (fewer than three, on one line, standing still), `orientations` (N, 3, 3)
     decide it: the products ``R_target R_sourceᵀ``, whose mean the rotation is brought nearest to. Without them it is
@@ -280,11 +276,10 @@ def align_positions(
         rank, R = int((d > 1e-12 * d[0]).sum()), U @ np.diag(signs) @ Vt
         if rank == 1 and dimensions == 3:
             R = _turn_about(U[:, 0], R, guide)
-    scale = float((d * signs).sum() / (s**2).sum(axis=1).mean()) if with_scale and rank else 1.0
-    return Alignment(R, centre_t - scale * R @ centre_s, scale, rank)
+    return Alignment(R, centre_t - R @ centre_s, rank)
 
 
-def align(estimate: Trajectory, truth: Trajectory, with_scale: bool = False) -> Alignment:
+def align(estimate: Trajectory, truth: Trajectory) -> Alignment:
     """The alignment of an estimated path with the true one, row by row; orientations decide what is left open.
 
     Raises:
@@ -293,7 +288,7 @@ def align(estimate: Trajectory, truth: Trajectory, with_scale: bool = False) -> 
     if len(estimate) != len(truth):
         raise TrajectoryError(f"alignment: {len(estimate)} estimated poses, {len(truth)} true ones")
     orientations = truth.poses[:, :3, :3] @ np.swapaxes(estimate.poses[:, :3, :3], 1, 2)
-    return align_positions(estimate.positions, truth.positions, with_scale, orientations)
+    return align_positions(estimate.positions, truth.positions, orientations)
 
 
 def _turn_about(axis: Array, R: Array, guide: Array) -> Array:

@@ -5,8 +5,8 @@ The colours are those of paper B, Fig. 10. Beside a frame, `GrowingMap` draws th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,12 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult, StereoFrame
 from slam.errors import SlamError
-from slam.files import reason, require_utf8, write_png
+from slam.files import require_utf8, write_png
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import MovingObject
 from slam.outputs import Output
+from slam.run.outputs import naming_folder
 from slam.run.schema import body_colour
 
 _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR, as all colours here
@@ -225,7 +226,7 @@ class FramePictures(ExitStack):
         if self._film:
             require_utf8(path)
             self.callback(self._end)
-        with _written(path):
+        with naming_folder(path):
             (path.parent if self._film else path).mkdir(parents=True, exist_ok=True)
 
     def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
@@ -238,7 +239,7 @@ class FramePictures(ExitStack):
         picture = with_legend(picture, result.objects)
         if not self._film:
             file = self.path / f"{frame.index:0{_DIGITS}d}.png"
-            with _written(file):
+            with naming_folder(file):
                 write_png(file, picture)
         elif self._first is None:
             self._first = (frame.stamp, picture)
@@ -262,11 +263,3 @@ class FramePictures(ExitStack):
             self._open(1.0, self._first[1])
         if self._video is not None:
             self._video.release()
-
-
-@contextmanager
-def _written(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be written: {reason(error)}") from error

@@ -77,9 +77,9 @@ def _counted(statuses: Sequence[str], missed: int) -> str:
     every, first = len(statuses), statuses[0] == _STARTED
     if missed == every - 1:
         return "no frame after the first was tracked" if first else "no frame was tracked"
-    if 2 * missed <= every - 1:
-        return f"{missed + (not first)} of {every} frames were not tracked"
-    return f"only {every - missed - (not first)} of {every} frames were tracked"
+    few, of_all = 2 * missed > every - 1, missed + (not first)
+    count, word = (every - of_all, "tracked") if few else (of_all, "not tracked")
+    return f"{'only ' if few else ''}{count} of {every} frames {'was' if count == 1 else 'were'} {word}"
 
 
 def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:

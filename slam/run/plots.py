@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slam.errors import ConfigurationError, SlamError
-from slam.files import noting_inputs, reason, whole_file
+from slam.files import noting_inputs, whole_file
 from slam.geometry.se3 import Array, inverse, transform
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
+from slam.run.outputs import naming_folder
 from slam.run.results import facts
 from slam.run.run_data import RunData, place_of_truth, pose_errors, well_known
 from slam.run.schema import STAGE_NAMES, body_colour
@@ -117,13 +118,11 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
     from matplotlib import rc_context
 
     figure = drawn(runs, kind)
-    try:
+    with naming_folder(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as file, rc_context(_STYLE):
-            metadata = {"Title": _title(runs), **_METADATA[suffix]}
-            figure.savefig(file, format=suffix[1:], dpi=110, metadata=metadata)
-    except OSError as error:
-        raise SlamError(f"cannot write to {path}: {reason(error)}") from error
+    with whole_file(path) as file, rc_context(_STYLE):
+        metadata = {"Title": _title(runs), **_METADATA[suffix]}
+        figure.savefig(file, format=suffix[1:], dpi=110, metadata=metadata)
 
 
 def drawn(runs: Sequence[RunData], kind: str) -> Figure:

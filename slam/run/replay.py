@@ -22,15 +22,16 @@ _STAGES = ("predict", "associate", "update", "manage", "estimate")
 
 
 def replay(
-    recording: Recording, backend: Backend, guess: bool = True, association: AssociationConfig | None = None
+    recording: Recording, backend: Backend, association: AssociationConfig | None = None
 ) -> Iterator[FrameResult]:
     """Give a back end what was recorded, frame by frame; what it made of it comes back frame by frame.
+
+    `Backend.update` is given the pose on which the observations agree, as the system does; it is found again from this
+    back end's own map. All observations are given, also those that do not agree.
 
     Args:
         recording: what to give.
         backend: a new back end for the recording's rectified pair, ``recording.rig.rectified.rig``.
-        guess: give `Backend.update` the pose on which the observations agree, as the system does; it is found again
-            from this back end's own map. All observations are given, also those that do not agree.
         association: settings of that search; None for the defaults.
 
     Yields:
@@ -45,13 +46,13 @@ def replay(
     inside.require_fits(backend)
     for k, frame in enumerate(recording):
         with named_failures(f"frame {frame.number}", backend):
-            result = _step(recording, inside, backend, k, frame, config if guess else None)
+            result = _step(recording, inside, backend, k, frame, config)
         yield result
 
 
 def _step(
     recording: Recording, inside: Rectification, backend: Backend, k: int, frame: RecordedFrame,
-    config: AssociationConfig | None,
+    config: AssociationConfig,
 ) -> FrameResult:  # fmt: skip
     """One frame."""
     times, guess = [time.perf_counter()], None
@@ -60,7 +61,7 @@ def _step(
         backend.revise(frame.revision.rows)
     prediction = checked(backend, "predict", backend.predict(frame.stamp))
     times.append(time.perf_counter())
-    if config is not None and len(seen):
+    if len(seen):
         points, measured = backend.positions(seen.ids), measurement_rows(seen.uv_left, seen.uv_right)
         threshold = config.consistency_sigmas * inside.models(recording.models).pixel_sigma
         expected, tries = prediction.T_world_left, config.hypotheses

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -181,7 +182,8 @@ class _Run:
         ended, stopped_by = "completed", None
         with RunFiles(out) as files:
             write_json(out / "config.json", origin(options) | names | self._config())
-            self._try(lambda: write_json(out / "schema.json", schema()))
+            with self._each():
+                write_json(out / "schema.json", schema())
             try:
                 for number, result in results:
                     record.add(number, result)
@@ -218,11 +220,12 @@ class _Run:
         """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
         return "" if step is None else self.record.numbers[step] if step >= 0 else "map"
 
-    def _try(self, write: Callable[[], None]) -> None:
-        """Write one of the last files, although another one failed; `_raise_failures` raises what goes wrong."""
+    @contextmanager
+    def _each(self) -> Iterator[None]:
+        """One of the last files: it is written although another one failed."""
         try:
-            write()
-        except Exception as error:  # noqa: BLE001
+            yield
+        except Exception as error:  # noqa: BLE001 `_raise_failures` raises it
             self.failures.append(error)
 
     def _raise_failures(self, stopped_by: BaseException | None) -> None:
@@ -243,39 +246,37 @@ class _Run:
             raise next(defects, SlamError("; ".join(lines)))
 
     def _write_last(self, files: RunFiles, summary: dict[str, Any], score: Any) -> None:
-        """Write the files that are made at the end; the summary is the last, and says how good the run was."""
+        """Write the files that are made at the end; the summary says how good the run was."""
         system, record, sequence, options = self.system, self.record, self.sequence, self.options
-        final = Trajectory.empty()
-
-        def write_final() -> None:
-            nonlocal final
-            final = system.trajectory()
-            write_trajectory(options.out / "trajectory_final.txt", final)
-
-        def write_truth() -> None:
-            if (pairs := with_truth(record.trajectory, sequence)) is not None:
-                write_trajectory(options.out / "truth.txt", pairs[1])
-
-        def write_summary() -> None:
-            write_json(options.out / "summary.json", summary)
-
+        out, final = options.out, Trajectory.empty()
         if record.stamps:
-            self._try(write_final)
-            self._try(write_truth)
-            self._try(lambda: files.write_landmarks(system.estimate(), system.landmarks, record.numbers))
-            if isinstance(system, StereoSlam) and (landmarks := system.landmarks) is not None:
-                self._try(lambda: files.write_old_landmarks(system.atlas, landmarks.ids))
-            self._try(lambda: summary.update(results_of(sequence, system, record, final, score)))
+            with self._each():
+                final = system.trajectory()
+                write_trajectory(out / "trajectory_final.txt", final)
+            with self._each():
+                if (pairs := with_truth(record.trajectory, sequence)) is not None:
+                    write_trajectory(out / "truth.txt", pairs[1])
+            with self._each():
+                files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
+            with self._each():
+                if isinstance(system, StereoSlam) and system.landmarks is not None:
+                    files.write_old_landmarks(system.atlas, system.landmarks.ids)
+            with self._each():
+                summary |= results_of(sequence, system, record, final, score)
         summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # nothing else is random
-        summary |= {"configuration": options.config.to_json(), "versions": versions()}
-        self._try(write_summary)
-        if (path := options.record) is not None:
-            self._try(lambda: save_recording(self._recording(), path))
-        if (place := options.save_map) is not None and record.stamps and isinstance(system, StereoSlam):
-            self._try(lambda: save_map(place, system))
+        summary["versions"] = versions()
+        with self._each():
+            write_json(out / "summary.json", summary)
+        with self._each():
+            if options.record is not None:
+                save_recording(self._recording(), options.record)
+        with self._each():
+            if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
+                save_map(options.save_map, system)
         if self.failures:
             summary["failures"] = list(map(_said, self.failures))
-            self._try(write_summary)
+            with self._each():
+                write_json(out / "summary.json", summary)
 
     def _recording(self) -> Recording:
         """What was given to the back end of a run; raises SlamError where it was given to more than one."""
@@ -291,7 +292,8 @@ class _Run:
     def _tracking(self) -> dict[str, Any]:
         """The part of the summary on the tracking, which is known of every run."""
         options, record, rig = self.options, self.record, self.sequence.rig
-        warnings, driving = getattr(self.system, "warnings", ()), options.kind == "driving"
+        warnings = getattr(self.system, "warnings", ())
+        driving = options.kind == "driving"
         doubt = scale_doubt(record, rig, driving) or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
         tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving)

@@ -52,7 +52,7 @@ def test_the_smoother_is_nearly_as_good_as_the_optimum():
     errors = []
     for make, options in ((BatchBackend, {}), (SmootherBackend, whole), (SmootherBackend, {})):
         backend = make(recording.rig, recording.models, **options)
-        for _ in replay(recording, backend, guess=False):
+        for _ in replay(recording, backend):
             pass
         errors.append(absolute_errors(backend.trajectory(), sequence.ground_truth).rmse)
     best, whole, ours = errors

@@ -17,9 +17,7 @@ from slam.calibration.config import SelfCalibrationConfig
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, one_line
 from slam.models import EstimatorModels, MotionModel, ObjectModels
-from slam.system import StereoSlam
 from slam.tracks.config import AssociationConfig, MapConfig
-from tests.slam.scene import RIG
 
 
 def test_settings_reach_their_place():
@@ -76,14 +74,6 @@ def test_json_and_back(kind):
 def test_bad_settings(setting, message):
     with pytest.raises(ConfigurationError, match=re.escape(message)):
         SystemConfig.for_kind("handheld").with_settings([setting])
-
-
-def test_a_kind_beside_a_configuration_is_refused():
-    """It was ignored, also where the configuration was that of another kind."""
-    config = SystemConfig.for_kind("driving")
-    with pytest.raises(ConfigurationError, match="kind does not go with config"):
-        StereoSlam(RIG, kind="handheld", config=config)
-    assert StereoSlam(RIG, config=config).config.map == config.map
 
 
 def test_unknown_kind_and_unknown_key_in_a_file():

@@ -94,13 +94,8 @@ def test_wrong_variables_of_libraries_end_in_one_line_or_do_no_harm(tmp_path):
 
 def test_a_run_without_any_pose_says_why_there_is_no_picture(capsys, tmp_path):
     """It warned that this was not the folder of a finished run."""
-    summary = {
-        "sequence": "s",
-        "backend": "ekf",
-        "frames": 2,
-        "status": {"lost": 2},
-        "tracking": "no frame was tracked",
-    }
+    summary = {"sequence": "s", "backend": "ekf", "frames": 2, "status": {"lost": 2}}
+    summary["tracking"] = "no frame was tracked"
     with pytest.raises(typer.Exit) as ended:
         finish(summary, [Output(tmp_path, "--out", [])], picture=True, quiet=True)
     assert ended.value.exit_code == 1

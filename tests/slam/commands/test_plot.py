@@ -35,11 +35,8 @@ def runs(tmp_path_factory):
 def test_runs_with_and_without_truth_are_drawn(runs, tmp_path, kind):
     shutil.copytree(runs / "a", tmp_path / "a")
     (tmp_path / "a" / "truth.txt").unlink()
-    for name, folders in (
-        ("a.png", [tmp_path / "a"]),
-        ("b.pdf", [tmp_path / "a", runs / "b"]),
-        ("c.svg", [runs / "b"]),
-    ):
+    without = tmp_path / "a"
+    for name, folders in (("a.png", [without]), ("b.pdf", [without, runs / "b"]), ("c.svg", [runs / "b"])):
         plot_runs(folders, tmp_path / name, kind)
         assert (tmp_path / name).stat().st_size > 1000
 

@@ -82,13 +82,19 @@ def test_settings_may_be_a_dict():
             SystemConfig().with_settings(wrong)
 
 
+def test_a_kind_beside_a_configuration_is_refused():
+    """It was ignored, also where the configuration was that of another kind."""
+    config = SystemConfig.for_kind("driving")
+    with pytest.raises(ConfigurationError, match="kind does not go with config"):
+        slam.StereoSlam(RIG, kind="handheld", config=config)
+    assert slam.StereoSlam(RIG, config=config).config.map == config.map
+
+
 def test_a_setting_of_an_earlier_version_is_one_line():
+    gone = r"^setting {}: there is no such setting in this version$".format
     for tree, words in (
-        (
-            {"association": {"hypotheses": 50}},
-            r"^setting association\.hypotheses: there is no such setting in this version$",
-        ),
-        ({"map": {"colour": 1}}, r"^setting map\.colour: there is no such setting in this version$"),
+        ({"association": {"hypotheses": 50}}, gone(r"association\.hypotheses")),
+        ({"map": {"colour": 1}}, gone(r"map\.colour")),
         *((bad, "setting") for bad in ([], "x", {"map": {"__doc__": 1}}, {"association": {"hypotheses": [1]}})),
     ):
         with pytest.raises(ConfigurationError, match=words):

@@ -19,7 +19,7 @@ def steps():
 
 def test_places_that_cannot_be_written_are_said(steps, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(SlamError, match="file/below: cannot be written"):
+    with pytest.raises(SlamError, match=r"cannot write to .*file/below: "):
         FramePictures(tmp_path / "file" / "below")
     with pytest.raises(SlamError, match=r"a folder, or to a video FILE\.mp4"):
         FramePictures(tmp_path / "frames.avi")
@@ -36,6 +36,6 @@ def test_a_body_has_one_colour_in_images_and_maps():
 
 def test_a_picture_is_whole_or_not_there(steps, tmp_path):
     system, ((frame, result), _) = steps
-    with pytest.raises(SlamError, match=r"png: cannot be written: File too large"), disk_of(500):
+    with pytest.raises(SlamError, match=r"cannot write to .*png: File too large"), disk_of(500):
         FramePictures(tmp_path / "out").show(frame, result, system)
     assert list((tmp_path / "out").iterdir()) == []
