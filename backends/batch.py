@@ -16,8 +16,9 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.graph import FAILURES, GraphProblem, Tracks, minimised
+from backends.smoother.graph import FAILURES, minimised
 from backends.smoother.state import SmootherState
+from backends.smoother.tracks import GraphProblem, Tracks
 from slam.bounds import from_options, require_not_negative
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.geometry.rig import StereoRig

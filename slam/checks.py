@@ -11,6 +11,10 @@ from slam.geometry.se3 import LEAST_VARIANCE
 #: Limits of a measurement: farthest pixel from the origin [px], latest stamp from zero [s].
 FARTHEST_PIXEL, LATEST_STAMP = 1e5, 1e12
 
+#: Likely times since 1970 [s], 1973 to 2286, and the units [1/s] that they are given in by mistake.
+SINCE_1970 = (1e8, 1e10)
+UNITS = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
+
 #: Largest coordinate of a position [m]: beyond it, a double has too few digits for what a camera sees.
 FARTHEST_POSITION = 1e8
 
@@ -21,6 +25,12 @@ _NEAREST = 1e-3  # guard: least depth [m] of a landmark that a camera sees
 _LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having
 _ROUNDING = 1e-14  # numerics: share of a covariance's largest eigenvalue below which the smallest is rounding
 _SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from its transpose
+
+
+def unit_doubt(stamp: float) -> str:
+    """What is likely wrong with a time [s] too large for one, as `` (is it in nanoseconds?)``; empty for no guess."""
+    low, high = SINCE_1970
+    return next((f" (is it in {unit}?): give it in seconds" for unit, n in UNITS if low <= abs(stamp) / n <= high), "")
 
 
 def require_stamp(owner: str, stamp: float, last: float | None) -> None:

@@ -88,8 +88,9 @@ def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceEr
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] = SequenceError) -> str:
-    """The text of a regular file in UTF-8, a byte order mark left out, other bytes replaced; raises as `read_bytes`."""
-    return read_bytes(path, limit, error).decode("utf-8-sig", errors="replace")
+    """The text of a regular file in UTF-8, or UTF-16 with its mark, other bytes replaced; raises as `read_bytes`."""
+    data = read_bytes(path, limit, error)
+    return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", errors="replace")
 
 
 def read_object(path: str | Path) -> dict[str, Any]:

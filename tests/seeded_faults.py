@@ -45,7 +45,7 @@ FAULTS = (
     ),
     Fault(
         "what has left the state keeps its old correlation", "backends/ekf/covariance.py",
-        "cross = self.cross - lost[h:].T + shift @ head[:POSE, n:]", "cross = self.cross + shift @ head[:POSE, n:]",
+        "self.marks[b:, :b] - V_marks @ V_left.T + shift", "self.marks[b:, :b] + shift",
         "tests/backends/test_ekf_parts.py tests/backends/test_rest.py tests/backends/test_ekf.py",
     ),
     Fault(

@@ -26,7 +26,7 @@ MAY_IMPORT = {
     "data": {"geometry"},
     "window": {"data", "geometry", "kernels", "runtime"},
     "tracks": {"data", "geometry", "kernels", "runtime"},
-    "calibration": {"data", "geometry", "kernels", "runtime"},
+    "calibration": {"tracks", "data", "geometry", "kernels", "runtime"},
     "atlas": {"tracks", "window", "data", "geometry", "runtime"},
     "bodies": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
     "papers": {"bodies", "tracks", "data", "geometry", "runtime"},

@@ -6,9 +6,9 @@ Schmidt, whose covariance is exact for what it does. With the gain of such a lan
 The camera's last poses, as they were believed in their time, are kept in the same way (stochastic clones).
 What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
 
-Errors of the rig (`slam.interfaces.ConsideringBackend`) are such states, too: they are considered, but not estimated.
-Their columns hold the derivatives of the state by them, which the same gain moves: a landmark's measurement is off by
-``H x − F δ``, with a field F. Their own covariance is not needed here.
+Errors of the rig (`slam.interfaces.ConsideringBackend`) are considered, too, but not estimated. What is kept are the
+derivatives of all errors by them, which the same gain moves: a landmark's measurement is off by ``H x − F δ``, with a
+field F. Their own covariance is not needed here.
 """
 
 from __future__ import annotations
@@ -28,38 +28,27 @@ POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of ``[camera (12), last poses (6K), A landmarks of the state (3A), B that left it (3B), errors of the rig (m)]``.
+    """Of ``[camera (12), last poses (6K), B landmarks that left the state (3B), A that are in it (3A)]``.
 
-    The state are the camera and its landmarks. The poses are perturbed on the right, the newest first.
+    The state are the camera and its landmarks. The poses are perturbed on the right, the newest first. Rows of the
+    table of landmarks are in this order; behind them are those that are known from elsewhere.
     """
 
-    head: Array  # (12 + 6K, 12 + 6K + 3A + 3B + m), of camera and last poses with everything: a motion changes no more
-    marks: Array  # (3A, 3A), of the state's landmarks
-    cross: Array  # (3A, 3B + m), of these with what has left
-    left: Array  # (3B, 3B + m), of landmarks that have left
+    head: Array  # (12 + 6K, 12 + 6K + 3B + 3A), of camera and last poses with everything: a motion changes no more
+    marks: Array  # (3B + 3A, 3B + 3A), of landmarks
+    by_rig: Array  # derivatives (12 + 6K + 3B + 3A, m) of all errors by those of the rig
     known: Array  # (C, 3, 3), of each landmark that is independent of all else
-    rig: int = 0  # m
+    left: int = 0  # B
 
     @classmethod
-    def of_camera(cls, P: Array) -> Covariance:
-        """Of the camera alone (12, 12)."""
-        none = np.zeros((0, 0))
-        return cls(P, none, none, none, np.zeros((0, 3, 3)))
-
-    def considering(self, by_rig: Array) -> Covariance:
-        """With errors of the rig, by derivatives (12, m) of the camera's error, of which all else is made later."""
-        m, head = by_rig.shape[1], np.concatenate([self.head, by_rig], axis=1)
-        return replace(self, head=head, cross=np.zeros((0, m)), left=np.zeros((0, m)), rig=m)
-
-    @property
-    def count(self) -> int:
-        """A: the first landmarks of the table."""
-        return len(self.marks) // 3
+    def of_camera(cls, P: Array, by_rig: Array | None = None) -> Covariance:
+        """Of the camera alone (12, 12), with derivatives (12, m) of its error by errors of the rig."""
+        return cls(P, np.zeros((0, 0)), np.zeros((CAMERA, 0)) if by_rig is None else by_rig, np.zeros((0, 3, 3)))
 
     @property
     def correlated(self) -> int:
-        """A + B: the landmarks after these are known from elsewhere."""
-        return self.count + len(self.left) // 3
+        """B + A: the landmarks after these are known from elsewhere."""
+        return len(self.marks) // 3
 
     @property
     def camera(self) -> Array:
@@ -73,30 +62,24 @@ class Covariance:
 
     def marginals(self, rows: IndexArray) -> tuple[Array, Array]:
         """Covariances (M, 3, 3) of landmarks, and theirs (M, 3, 6) with the camera's [r, φ]; by rows of the table."""
-        a, b, h = self.count, self.correlated, len(self.head)
-        blocks, state, left, known = np.empty((len(rows), 3, 3)), rows < a, (rows >= a) & (rows < b), rows >= b
-        for part, P, first in ((state, self.marks, 0), (left, self.left, a)):
-            each = 3 * (rows[part, None] - first) + np.arange(3)
-            blocks[part] = P[each[:, :, None], each[:, None, :]]
-        blocks[known] = self.known[rows[known] - b]
-        with_pose = self.head[:POSE, h + self._numbers(rows)].T.reshape(len(rows), 3, POSE)
-        with_pose[known] = 0.0
+        blocks, with_pose, known = np.empty((len(rows), 3, 3)), np.zeros((len(rows), 3, POSE)), rows >= self.correlated
+        each = numbers_of(rows[~known]).reshape(-1, 3)
+        blocks[~known] = self.marks[each[:, :, None], each[:, None, :]]
+        blocks[known] = self.known[rows[known] - self.correlated]
+        with_pose[~known] = self.head[:POSE, len(self.head) + each].transpose(1, 2, 0)
         return blocks, with_pose
 
-    def by_rig(self, rows: IndexArray) -> tuple[Array, Array]:
-        """Derivatives of the camera's error (12, m), and of some landmarks (M, 3, m), by errors of the rig."""
-        landmarks = self._part(rows, rows[:0], self.rig)
-        return self.head[:CAMERA, len(self.head.T) - self.rig :], landmarks.reshape(len(rows), 3, self.rig)
+    def landmarks_by_rig(self, rows: IndexArray) -> Array:
+        """Derivatives (M, 3, m) of some landmarks by errors of the rig."""
+        out, there = np.zeros((len(rows), 3, self.by_rig.shape[1])), rows < self.correlated
+        out[there] = self.by_rig[len(self.head) + numbers_of(rows[there])].reshape(-1, *out.shape[1:])
+        return out
 
     def displaced(self, rows: IndexArray, change: Array) -> Covariance:
         """After a change (M, 3) of some landmarks' coordinates that is none of their error: the last of the rig's."""
-        if not self.rig:
-            return self
-        numbers, cross, left = self._numbers(rows), self.cross.copy(), self.left.copy()
-        for table, first in ((cross, 0), (left, len(cross))):
-            here = (numbers >= first) & (numbers < first + len(table))
-            table[numbers[here] - first, -1] -= change.reshape(-1)[here]
-        return replace(self, cross=cross, left=left)
+        by_rig, there = self.by_rig.copy(), rows < self.correlated
+        by_rig[len(self.head) + numbers_of(rows[there]), -1:] -= change[there].reshape(-1, 1)
+        return replace(self, by_rig=by_rig)
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""
@@ -112,19 +95,23 @@ class Covariance:
         """With the present pose, J (6, 6) times [r, φ], the first of the last ones; at most so many are kept."""
         k = min(len(self.head), CAMERA + POSE * (most - 1))
         stay = np.concatenate([np.arange(k), np.arange(len(self.head), self.head.shape[1])])
-        head, new = self.head[:k, stay], J @ self.head[:POSE, stay]
+        head, rig = self.head[:k, stay], self.by_rig[stay]
+        new = J @ head[:POSE]
         own = np.concatenate([new[:, :CAMERA], J @ self.pose @ J.T, new[:, CAMERA:]], axis=1)
         rows = np.concatenate([head[:, :CAMERA], new[:, :k].T, head[:, CAMERA:]], axis=1)
-        return replace(self, head=np.concatenate([rows[:CAMERA], own, rows[CAMERA:]]))
+        return replace(
+            self, head=np.concatenate([rows[:CAMERA], own, rows[CAMERA:]]),
+            by_rig=np.concatenate([rig[:CAMERA], J @ rig[:POSE], rig[CAMERA:]]),
+        )  # fmt: skip
 
     def camera_moved(self, J: Array, noise: Array) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
-        head = self.head.copy()
-        head[:CAMERA] = J @ head[:CAMERA]
+        head, by_rig = self.head.copy(), self.by_rig.copy()
+        head[:CAMERA], by_rig[:CAMERA] = J @ head[:CAMERA], J @ by_rig[:CAMERA]
         own = head[:CAMERA, :CAMERA] @ J.T + noise
         head[:CAMERA, :CAMERA] = 0.5 * (own + own.T)
         head[CAMERA:, :CAMERA] = head[:CAMERA, CAMERA : len(head)].T
-        return replace(self, head=head)
+        return replace(self, head=head, by_rig=by_rig)
 
     # --- landmarks join and leave ---
 
@@ -133,69 +120,73 @@ class Covariance:
 
         They are the last ones of the state. With the pose known, errors of the rig move them by `by_rig` (M, 3, m).
         """
-        by_pose, n, h = J.reshape(-1, POSE), len(self.marks), len(self.head)
-        rows, each = by_pose @ self.head[:POSE], np.arange(len(J))
+        by_pose, n, h, each = J.reshape(-1, POSE), len(self.marks), len(self.head), np.arange(len(J))
+        rows = by_pose @ self.head[:POSE]
         own = rows[:, :POSE] @ by_pose.T
         own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
-        marks, old = np.empty((n + len(rows), n + len(rows))), rows[:, h : h + n]
-        marks[:n, :n], marks[n:, :n], marks[:n, n:] = self.marks, old, old.T
+        marks = np.empty((n + len(rows), n + len(rows)))
+        marks[:n, :n], marks[n:, :n], marks[:n, n:] = self.marks, rows[:, h:], rows[:, h:].T
         marks[n:, n:] = positive(0.5 * (own + own.T), own.diagonal(), POSE)
-        head = np.concatenate([self.head[:, : h + n], rows[:, :h].T, self.head[:, h + n :]], axis=1)
-        rows[:, len(self.head.T) - self.rig :] += by_rig.reshape(len(rows), self.rig)
-        return replace(self, head=head, marks=marks, cross=np.concatenate([self.cross, rows[:, h + n :]]))
+        head = np.concatenate([self.head, rows[:, :h].T], axis=1)
+        rig = by_pose @ self.by_rig[:POSE] + by_rig.reshape(len(rows), self.by_rig.shape[1])
+        return replace(self, head=head, marks=marks, by_rig=np.concatenate([self.by_rig, rig]))
 
-    def rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> Covariance:
+    def rearranged(self, left: IndexArray, state: IndexArray, known: IndexArray) -> Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
-        h, first_known, new = len(self.head), self.correlated, np.flatnonzero(dense >= self.correlated)
-        columns = np.concatenate([np.arange(h), h + self._numbers(dense), h + self._numbers(left)])
-        head = np.concatenate([self.head[:, columns], self.head[:, len(self.head.T) - self.rig :]], axis=1)
-        marks, rows = self._part(dense, dense, 0), 3 * new[:, None] + np.arange(3)
-        head[:, h + rows.reshape(-1)] = 0.0
-        marks[rows[:, :, None], rows[:, None, :]] = self.known[dense[new] - first_known]
-        cross, own = self._part(dense, left, self.rig), self._part(left, left, self.rig)
-        return Covariance(head, marks, cross, own, self.known[known - first_known], self.rig)
-
-    def _numbers(self, rows: IndexArray) -> IndexArray:
-        """Of landmarks' coordinates (3M,) in ``[A, B, rig]``; −1 for those that are known."""
-        numbers = 3 * rows[:, None] + np.arange(3)
-        numbers[rows >= self.correlated] = -1
-        return numbers.reshape(-1)
-
-    def _part(self, rows: IndexArray, columns: IndexArray, rig: int) -> Array:
-        """Of landmarks' coordinates with others', and with so many errors of the rig."""
-        return np.asarray(kernels.gather(self.marks, self.cross, self.left, rows, columns, rig))
+        h, order, first = len(self.head), np.concatenate([left, state]), self.correlated
+        numbers = np.where(np.repeat(order, 3) < first, numbers_of(order), -1)
+        marks, new = kernels.gather(self.marks, numbers, numbers), np.flatnonzero(order >= first)
+        each = numbers_of(new).reshape(-1, 3)
+        marks[each[:, :, None], each[:, None, :]] = self.known[order[new] - first]
+        head = kernels.gather(self.head[:, h:], np.arange(h), numbers)
+        by_rig = kernels.gather(self.by_rig[h:], numbers, np.arange(self.by_rig.shape[1]))
+        return Covariance(
+            np.concatenate([self.head[:, :h], head], axis=1), marks, np.concatenate([self.by_rig[:h], by_rig]),
+            self.known[known - first], len(left),
+        )  # fmt: skip
 
     # --- an update ---
 
-    def corrected(self, V: tuple[Array, Array, Array], J: Array, shift: Array) -> Covariance:
+    def corrected(self, V: tuple[Array, Array, Array], lost_by_rig: Array, J: Array, shift: Array) -> Covariance:
         """After an update, in the coordinates of the corrected state: ``P − K S Kᵀ = P − V Vᵀ`` (paper A, Eq. 11).
 
         Args:
-            V: ``P Hᵀ L⁻ᵀ`` of camera and last poses, of the state's landmarks, in Fortran's order, of what has left.
+            V: ``P Hᵀ L⁻ᵀ`` of camera and last poses, of what has left, of the state's landmarks, in Fortran's order.
+            lost_by_rig: L⁻¹ times derivatives (3M, m) of the innovation by errors of the rig.
             J: the camera's error becomes J (12, 12) times what it was,
             shift: and then to those of the landmarks this (A, 3, 6) times that of the pose is added.
         """
-        V_head, V_marks, V_left = V
-        h, n, terms = len(self.head), len(self.head) + len(self.marks), len(V_marks.T)
-        head, shift = self.head.copy(), np.asfortranarray(shift.reshape(-1, POSE))
-        lost = np.concatenate([V_head, V_left]) @ V_marks.T
-        head[:, h:n] -= lost[:h]
+        V_head, V_left, V_marks = V
+        h, b, terms = len(self.head), 3 * self.left, len(V_marks.T)
+        head, by_rig, shift = self.head.copy(), self.by_rig.copy(), np.asfortranarray(shift.reshape(-1, POSE))
         head[:CAMERA, :h] -= V_head[:CAMERA] @ V_head.T
-        head[:CAMERA, n:] -= V_head[:CAMERA] @ V_left.T
-        head[:CAMERA] = J @ head[:CAMERA]
+        head[:CAMERA, h : h + b] -= V_head[:CAMERA] @ V_left.T
+        head[:, h + b :] -= V_head @ V_marks.T
+        by_rig[:CAMERA] -= V_head[:CAMERA] @ lost_by_rig
+        head[:CAMERA], by_rig[:CAMERA] = J @ head[:CAMERA], J @ by_rig[:CAMERA]
         moved = head[:CAMERA, :CAMERA] @ J.T
         own = positive(0.5 * (moved + moved.T), self.camera.diagonal(), terms)
         head[:CAMERA, :CAMERA], head[CAMERA:, :CAMERA] = own, head[:CAMERA, CAMERA:h].T
-        marks = self.marks
+        marks = self.marks[b:, b:]
         if len(marks):
             marks = dsyrk(-1.0, V_marks, beta=1.0, c=marks.T, lower=1)  # a copy, of which the lower triangle counts
-            half = head[:POSE, h:n].T + 0.5 * shift @ own[:POSE, :POSE]
+            half = head[:POSE, h + b :].T + 0.5 * shift @ own[:POSE, :POSE]
             marks = dsyr2k(1.0, shift, half, beta=1.0, c=marks, lower=1, overwrite_c=1).T
             kernels.mirror(marks)
-            positive(marks, self.marks.diagonal() + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1), terms)
-        cross = self.cross - lost[h:].T + shift @ head[:POSE, n:]
-        head[:, h:n] += head[:, :POSE] @ shift.T
-        return replace(self, head=head, marks=marks, cross=cross)
+            summands = self.marks.diagonal()[b:] + ((shift @ own[:POSE, :POSE]) * shift).sum(axis=1)
+            positive(marks, summands, terms)
+        if b:
+            cross, state = self.marks[b:, :b] - V_marks @ V_left.T + shift @ head[:POSE, h : h + b], marks
+            marks = self.marks.copy()
+            marks[b:, b:], marks[b:, :b], marks[:b, b:] = state, cross, cross.T
+        by_rig[h + b :] += shift @ by_rig[:POSE] - V_marks @ lost_by_rig
+        head[:, h + b :] += head[:, :POSE] @ shift.T
+        return replace(self, head=head, marks=marks, by_rig=by_rig)
+
+
+def numbers_of(rows: IndexArray) -> IndexArray:
+    """Of landmarks' coordinates (3M,) among those of all."""
+    return np.asarray((3 * rows[:, None] + np.arange(3)).reshape(-1))
 
 
 def positive(P: Array, summands: Array, terms: int) -> Array:

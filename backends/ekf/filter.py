@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from backends.ekf.covariance import CAMERA, POSE, positive
+from backends.ekf.covariance import CAMERA, POSE, Covariance, positive
 from backends.ekf.landmarks import COORDINATES, Coordinates, FilterLandmarks, distant_anchors
 from backends.ekf.motion import EulerCamera, Motion, motion_noise
 from backends.ekf.recovery import agreement
@@ -243,15 +243,14 @@ class EkfBackend:
         if pose is not None:
             by_rig[:POSE] = np.linalg.solve(s.camera.by_error(), pose)
         self._measure = replace(self._measure, field=field)
-        self.state = replace(s, covariance=s.covariance.considering(by_rig))
+        self.state = replace(s, covariance=Covariance.of_camera(s.covariance.camera, by_rig))
 
     def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
         """See `slam.interfaces.ConsideringBackend.sensitivities`."""
         s = self._started("sensitivities")
         rows = s.landmarks.rows_of(ids)
-        camera, marks = s.covariance.by_rig(rows)
         D = self._coordinates.jacobian(s.landmarks.anchors[rows], s.landmarks.c[rows])
-        return s.camera.by_error() @ camera[:POSE], D @ marks
+        return s.camera.by_error() @ s.covariance.by_rig[:POSE], D @ s.covariance.landmarks_by_rig(rows)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 

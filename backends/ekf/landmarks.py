@@ -96,14 +96,12 @@ COORDINATES: dict[str, Coordinates] = {"inverse_depth": InverseDepth(), "euclide
 
 @dataclass(frozen=True, eq=False)
 class FilterLandmarks(LandmarkRows):
-    """The map in rows: landmarks of the filter's state, in its order; those that left it; those that are only known."""
+    """The map in rows, in the order of `backends.ekf.covariance.Covariance`."""
 
     anchors: Array  # (N, 3, 4), constants
     c: Array  # coordinates (N, 3)
     points: Array  # positions (N, 3) [m] in the world, which follow from the two
-    gauge: (
-        Array  # derivatives (N, 3, 6) of the coordinates by a displacement of the world: shift, turn about its origin
-    )
+    gauge: Array  # derivatives (N, 3, 6) of the coordinates by one of the world [shift, turn about its origin]
     seen: IndexArray  # number of the frame (N,) that measured each last; that of its first sight at least
 
     @classmethod
@@ -117,10 +115,6 @@ class FilterLandmarks(LandmarkRows):
     def none(cls) -> FilterLandmarks:
         """No landmarks."""
         return cls.at(Euclidean(), np.zeros(0, np.int64), np.zeros((0, 3, 4)), np.zeros((0, 3)), 0)
-
-    def with_rows(self, at: int, new: FilterLandmarks) -> FilterLandmarks:
-        """With more rows, which begin at `at`."""
-        return self.select(slice(at)).joined(new).joined(self.select(slice(at, None)))
 
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""

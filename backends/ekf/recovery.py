@@ -46,8 +46,8 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     """
     found, error, most = None, None, (len(update.z) + 1) // 2
     try:
-        for tried, gated in _gated(update, noises, max(MIN_OBSERVATIONS, most)):
-            found = _agreed(tried, gated) or found
+        for gated in _gated(update, noises, max(MIN_OBSERVATIONS, most)):
+            found = _agreed(gated) or found
             if found is not None and found.used.sum() >= most:
                 return found
     except UnsolvableError as reason:
@@ -58,7 +58,7 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     if T is not None:
         there = replace(update, guess=T).wider(restart_noise(update.camera.pose, T, models))
         try:
-            restarted = solve(there, gate(there, at_guess=True))
+            restarted = solve(gate(there, at_guess=True))
             if restarted is not None and restarted.used.sum() >= least:
                 return restarted
         except UnsolvableError:
@@ -68,7 +68,7 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     return found
 
 
-def _gated(update: Update, noises: Iterable[Array], most: int) -> Iterable[tuple[Update, Gated]]:
+def _gated(update: Update, noises: Iterable[Array], most: int) -> Iterable[Gated]:
     """The first prior, with more noise or seen from the guess, with which most pass the gate; then it as it is.
 
     What still disagrees is taken out later by `solve`.
@@ -80,22 +80,22 @@ def _gated(update: Update, noises: Iterable[Array], most: int) -> Iterable[tuple
         for one, at_guess in tries:
             gated = gate(one, at_guess)
             if gated.used.sum() >= most:
-                yield one, gated
+                yield gated
                 break
-    yield update, first
+    yield first
 
 
-def _agreed(update: Update, gated: Gated) -> Posterior | None:
+def _agreed(gated: Gated) -> Posterior | None:
     """What agrees with a prediction, if it is more than might agree by chance at the gate's own level."""
-    found = solve(update, gated)
-    used, count = 0 if found is None else int(found.used.sum()), len(update.z)
+    found = solve(gated)
+    used, count = 0 if found is None else int(found.used.sum()), len(gated.used)
     if count < MIN_OBSERVATIONS or ONE_AGREES_IN * used >= count:
         return found
     rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
     if not len(rejected):
         return None
     share = share_by_chance(rejected, float(gated.limits.max()))
-    return None if bdtrc(used - 1, count, share) > 1 - update.gate_probability else found
+    return None if bdtrc(used - 1, count, share) > 1 - gated.innovation.at.update.gate_probability else found
 
 
 def restart_noise(before: Array, after: Array, models: EstimatorModels) -> Array:

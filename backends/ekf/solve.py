@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from backends.ekf.covariance import CAMERA, POSE, Covariance
+from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
@@ -50,8 +50,8 @@ class Update:
 
     camera: Any  # `backends.ekf.motion.EulerCamera`, or another
     covariance: Covariance
-    landmarks: FilterLandmarks  # those that were measured (M,)
-    marks: IndexArray  # which of the state these are (M,)
+    landmarks: FilterLandmarks  # those that were measured (M,); all are in the state
+    rows: IndexArray  # their rows (M,) in the table of all
     z: Array  # measurements (M, 3) [px], NaN where a component is not measured
     sigma: float  # pixel noise [px]
     stereo: RectifiedStereo
@@ -68,7 +68,7 @@ class Update:
     @cached_property
     def numbers(self) -> IndexArray:
         """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
-        return (3 * self.marks[:, None] + np.arange(3)).reshape(-1)
+        return numbers_of(self.rows - self.covariance.left)
 
     def among_measured(self, change: Array) -> Array:
         """The part (6 + 3M,) of a change of the state (n,) that the measurements depend on."""
@@ -87,20 +87,22 @@ class Update:
     def at(self, camera: Any = None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
         """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose."""
         there, J, mean = self.camera, np.eye(CAMERA), np.zeros(CAMERA)
-        change = np.zeros(CAMERA + len(self.covariance.marks)) if change is None else change.copy()
+        size = CAMERA + len(self.covariance.marks) - 3 * self.covariance.left
+        change = np.zeros(size) if change is None else change.copy()
         if camera is not None:
             there = self.camera.at(camera.pose)
             J = self.camera.transport(there)
             mean = np.linalg.solve(J, self.camera.seen_from(there))
             change[:CAMERA] = np.concatenate([np.zeros(POSE), camera.seen_from(there)[POSE:]])
         lever = self.landmarks.gauge @ (there.world() @ J[:POSE, :POSE])
-        return Linearisation(there, J, mean, change, *self.seen(there.pose, change), lever, from_prior)
+        return Linearisation(self, there, J, mean, change, *self.seen(there.pose, change), lever, from_prior)
 
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Where measurements are linearised."""
+    """An update's measurements, linearised somewhere."""
 
+    update: Update
     camera: Any  # the prior's at another pose
     J: Array  # (12, 12): an error of the prior's camera is J times that, as an error of this one
     mean: Array  # the error (12,) of the prior's camera less that of this one
@@ -110,21 +112,36 @@ class Linearisation:
     lever: Array  # (M, 3, 6), see the module
     from_prior: float  # squared distance from the prior
 
-    def cost(self, update: Update, rows: BoolArray) -> float:
+    def cost(self, rows: BoolArray) -> float:
         """Squared distance from prior and measurements; ∞ where one cannot be seen."""
-        residual = np.where(rows, update.z - self.z, 0.0)
-        cost = self.from_prior + float(np.vdot(residual, residual)) / update.sigma**2
+        residual = np.where(rows, self.update.z - self.z, 0.0)
+        cost = self.from_prior + float(np.vdot(residual, residual)) / self.update.sigma**2
         return cost if math.isfinite(cost) else math.inf
 
     def camera_after(self, change: Array) -> Any:
         """The camera after a change of the state (n,), from here."""
         return self.camera.moved(self.J @ change[:CAMERA])
 
+    def innovation(self, rows: BoolArray) -> Innovation:
+        """ν and S of some rows (M, 3)."""
+        update, P = self.update, self.update.covariance
+        numbers, b, h = 3 * P.left + update.numbers, 3 * P.left, len(P.head)
+        own = self.own if rows.all() else np.where(rows[:, :, None], self.own, 0.0)
+        by_pose, moved = -(own @ self.lever).reshape(-1, POSE), self.change[CAMERA + update.numbers]
+        nu = np.where(rows, update.z - self.z, 0.0).reshape(-1)
+        nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) - by_pose @ self.mean[:POSE]
+        with_camera = _times(own, by_pose, P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
+        with_marks = _times(own, by_pose, P.head[:POSE, h + b :], P.marks[numbers][:, b:])
+        S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, update.numbers].T)
+        S[np.diag_indices(len(S))] += update.sigma**2
+        return Innovation(self, rows, own, by_pose, (with_camera, with_marks), nu, S)
+
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """ν and its covariance S, linearised somewhere (paper A, Eq. 11)."""
+    """ν and its covariance S (paper A, Eq. 11)."""
 
+    at: Linearisation
     rows: BoolArray  # mask of its rows (M, 3)
     own: Array  # H: derivatives (M, 3, 3) of each landmark's measurement by its own coordinates
     by_pose: Array  # and (3M, 6) by the pose's error
@@ -132,33 +149,36 @@ class Innovation:
     nu: Array  # innovation of the prior's mean (3M,)
     S: Array  # its covariance (3M, 3M)
 
-    @classmethod
-    def of(cls, update: Update, rows: BoolArray, at: Linearisation) -> Innovation:
-        """Linearised at an iterate."""
-        P, numbers, moved = update.covariance, update.numbers, update.among_measured(at.change)[POSE:]
-        own = at.own if rows.all() else np.where(rows[:, :, None], at.own, 0.0)
-        by_pose, h = -(own @ at.lever).reshape(-1, POSE), len(P.head)
-        nu = np.where(rows, update.z - at.z, 0.0).reshape(-1)
-        nu += (own @ moved.reshape(-1, 3, 1)).reshape(-1) - by_pose @ at.mean[:POSE]
-        with_camera = _times(own, by_pose, P.camera[:POSE], P.head[:CAMERA, h + numbers].T)
-        with_marks = _times(own, by_pose, P.head[:POSE, h : h + len(P.marks)], P.marks[numbers])
-        S = _times(own, by_pose, with_camera[:, :POSE].T, with_marks[:, numbers].T)
-        S[np.diag_indices(len(S))] += update.sigma**2
-        return cls(rows, own, by_pose, (with_camera, with_marks), nu, S)
-
-    def with_rest(self, update: Update) -> Array:
-        """``H P`` with the last poses and with what has left the state; less ``F δ`` with errors of the rig."""
-        P, h = update.covariance, len(update.covariance.head)
-        with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h + len(P.marks) :]], axis=1)
-        with_marks = np.concatenate([P.head[CAMERA:, h + update.numbers].T, P.cross[update.numbers]], axis=1)
-        rest = _times(self.own, self.by_pose, with_pose, with_marks)
-        if P.rig:
-            rest[:, -P.rig :] -= np.where(self.rows[:, :, None], update.field(update.z), 0.0).reshape(-1, P.rig)
-        return rest
+    def with_rest(self) -> tuple[Array, Array]:
+        """``H P`` with the last poses and what has left the state; derivatives (3M, m) of ν by errors of the rig."""
+        update, P = self.at.update, self.at.update.covariance
+        numbers, h, b = 3 * P.left + update.numbers, len(P.head), 3 * P.left
+        with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h : h + b]], axis=1)
+        with_marks = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[numbers][:, :b]], axis=1)
+        by_rig = _times(self.own, self.by_pose, P.by_rig[:POSE], P.by_rig[h + numbers])
+        by_rig -= np.where(self.rows[:, :, None], update.field(update.z), 0.0).reshape(by_rig.shape)
+        return _times(self.own, self.by_pose, with_pose, with_marks), by_rig
 
     def transposed_times(self, y: Array) -> Array:
         """``Hᵀ y`` (6 + 3M,) of [pose, measured landmarks], for y (3M,); it is zero elsewhere."""
         return np.concatenate([y @ self.by_pose, (y.reshape(-1, 1, 3) @ self.own).reshape(-1)])
+
+    def whitened(self, used: BoolArray) -> Whitened:
+        """That of some landmarks (mask (M,)), whitened.
+
+        Raises:
+            UnsolvableError: S is not positive definite.
+        """
+        nu, S, out = self.nu, self.S, np.flatnonzero(np.repeat(~used, 3))
+        if len(out):
+            nu, S = nu.copy(), S.copy()
+            nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
+        upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
+        if info != 0:
+            raise UnsolvableError("the innovation covariance is not positive definite")
+        inverse = _inverse(upper).T
+        inverse[out, out] = 0.0
+        return Whitened(self, used, nu, inverse)
 
 
 def _times(own: Array, by_pose: Array, of_pose: Array, of_marks: Array) -> Array:
@@ -177,24 +197,6 @@ class Whitened:
     nu: Array  # (3M,), zero for the others
     inverse: Array  # L⁻¹ (3M, 3M), lower triangular, with zero rows for the others
 
-    @classmethod
-    def of(cls, innovation: Innovation, used: BoolArray) -> Whitened:
-        """Of some landmarks (mask (M,)).
-
-        Raises:
-            UnsolvableError: S is not positive definite.
-        """
-        nu, S, out = innovation.nu, innovation.S, np.flatnonzero(np.repeat(~used, 3))
-        if len(out):
-            nu, S = nu.copy(), S.copy()
-            nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
-        upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
-        if info != 0:
-            raise UnsolvableError("the innovation covariance is not positive definite")
-        inverse = _inverse(upper).T
-        inverse[out, out] = 0.0
-        return cls(innovation, used, nu, inverse)
-
     @cached_property
     def w(self) -> Array:
         """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
@@ -210,13 +212,13 @@ class Whitened:
         """The whitened innovation's covariance (3M, 6) with the pose."""
         return np.asarray(self.inverse @ self.innovation.HP[0][:, :POSE])
 
-    def lost(self, update: Update) -> tuple[Array, Array, Array]:
-        """``P Hᵀ L⁻ᵀ``, see `Covariance.corrected`."""
-        with_camera, with_marks = self.innovation.HP
-        narrow = np.concatenate([with_camera, self.innovation.with_rest(update)], axis=1)
+    def lost(self) -> tuple[tuple[Array, Array, Array], Array]:
+        """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
+        (with_camera, with_marks), (rest, by_rig) = self.innovation.HP, self.innovation.with_rest()
+        narrow = np.concatenate([with_camera, rest], axis=1)
         V, V_marks = (dtrmm(1.0, self.inverse.T, HX.T, side=1) for HX in (narrow, with_marks))
-        h = len(update.covariance.head)
-        return V[:h], V_marks, V[h:]
+        h = len(self.innovation.at.update.covariance.head)
+        return (V[:h], V[h:], V_marks), self.inverse @ by_rig
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -236,10 +238,18 @@ class Whitened:
 class Posterior:
     """The maximum of the posterior (or one step towards it)."""
 
-    update: Update
-    at: Linearisation  # the last linearisation
-    change: Array  # of the state (n,), see `Linearisation.camera_after`
     whitened: Whitened  # the last innovation, from which the covariance follows
+    change: Array  # of the state (n,), see `Linearisation.camera_after`
+
+    @property
+    def update(self) -> Update:
+        """What it is of."""
+        return self.whitened.innovation.at.update
+
+    @property
+    def camera(self) -> Any:
+        """The corrected camera."""
+        return self.whitened.innovation.at.camera_after(self.change)
 
     @property
     def used(self) -> BoolArray:
@@ -254,7 +264,6 @@ class Gated:
     used: BoolArray  # (M,)
     limits: Array  # of the gate (M,)
     distances: Array  # squared, of the innovations (M,); NaN where none is predicted
-    start: Linearisation  # where they were linearised
     innovation: Innovation
 
 
@@ -269,17 +278,17 @@ def gate(update: Update, at_guess: bool = False) -> Gated:
     if not (np.isfinite(start.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
         raise UnsolvableError("the predicted state is not finite")
     visible = np.asarray(np.isfinite(start.z).all(axis=1))
-    innovation = Innovation.of(update, measured & visible[:, None], start)
+    innovation = start.innovation(measured & visible[:, None])
     m, limits = len(visible), chi_square_limits(measured.sum(axis=1), update.gate_probability)
     blocks = innovation.S.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)]
     own = squared_distances(innovation.nu.reshape(m, 3), blocks)
     if not np.isfinite(own).all():
         raise UnsolvableError("the predicted innovations are not finite or not positive definite")
     distances = np.where(visible, own, np.nan)
-    return Gated(np.asarray(distances <= limits), limits, distances, start, innovation)
+    return Gated(np.asarray(distances <= limits), limits, distances, innovation)
 
 
-def solve(update: Update, gated: Gated) -> Posterior | None:
+def solve(gated: Gated) -> Posterior | None:
     """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
@@ -290,11 +299,11 @@ def solve(update: Update, gated: Gated) -> Posterior | None:
     """
     used = gated.used
     while used.any():
-        found = _iterate(update, gated.start, Whitened.of(gated.innovation, used))
+        found = _iterate(gated.innovation.whitened(used))
         excess = found.whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            left = update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
+            left = found.update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
             return found
@@ -302,8 +311,8 @@ def solve(update: Update, gated: Gated) -> Posterior | None:
     return None
 
 
-def _iterate(update: Update, now: Linearisation, whitened: Whitened) -> Posterior:
-    """An update whose first linearisation is `whitened`.
+def _iterate(whitened: Whitened) -> Posterior:
+    """An update whose first linearisation is that of `whitened`.
 
     Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. The prior is
     transported from its own coordinates, not from those of the iterate: where landmarks move by much, the result is not
@@ -311,22 +320,22 @@ def _iterate(update: Update, now: Linearisation, whitened: Whitened) -> Posterio
     iteration is taken as it is: the papers' filter.
     """
     rows, reached = whitened.innovation.rows & whitened.used[:, None], None
+    now, update = whitened.innovation.at, whitened.innovation.at.update
     for iteration in range(1, update.iterations + 1):
         HP, y = whitened.innovation.HP, whitened.y
         change = np.concatenate([now.mean + y @ HP[0], y @ HP[1]])
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
-        if update.iterations == 1 or _linear(update, whitened, now, change):
-            return Posterior(update, now, change, whitened)
-        following, step = _descend(update, rows, now, whitened.innovation.transposed_times(y), change)
+        if update.iterations == 1 or _linear(whitened, change):
+            return Posterior(whitened, change)
+        following, step = _descend(now, rows, whitened.innovation.transposed_times(y), change)
         if iteration == 1 and update.guess is not None:
-            following = min(following, _at_guess(update), key=lambda iterate: iterate.cost(update, rows))
+            following = min(following, _at_guess(update), key=lambda iterate: iterate.cost(rows))
         if following is now:
             break
-        reached = Posterior(update, now, step, whitened)
+        reached = Posterior(whitened, step)
         if iteration < update.iterations:
-            now = following
-            whitened = Whitened.of(Innovation.of(update, rows, now), whitened.used)
+            now, whitened = following, following.innovation(rows).whitened(whitened.used)
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
@@ -344,8 +353,9 @@ def _inverse(U: Array) -> Array:
     return out
 
 
-def _linear(update: Update, whitened: Whitened, now: Linearisation, change: Array) -> bool:
+def _linear(whitened: Whitened, change: Array) -> bool:
     """Whether the measurements change by a step as the Jacobian says, as far as the pose depends on it."""
+    now, update = whitened.innovation.at, whitened.innovation.at.update
     z, _ = update.seen(now.camera_after(change).pose, change)
     step = update.among_measured(change - now.change)
     seen = step[POSE:].reshape(-1, 3) - now.lever @ step[:POSE]
@@ -367,22 +377,20 @@ def _at_guess(update: Update) -> Linearisation:
     return replace(there, from_prior=distance)
 
 
-def _descend(
-    update: Update, rows: BoolArray, now: Linearisation, s: Array, change: Array
-) -> tuple[Linearisation, Array]:
+def _descend(now: Linearisation, rows: BoolArray, s: Array, change: Array) -> tuple[Linearisation, Array]:
     """The longest of the steps 1, 1/2, 1/4, ... towards ``change = mean + P s`` that does not raise the cost, else now.
 
     Where it ends, and the step (n,). The next linearisation is at the pose reached: the camera turns, and the landmarks
     stay. On the way the distance from the prior, with d at the start and d' at the end, is that of (1 − a) d + a d'.
     """
-    mean = np.concatenate([now.mean, np.zeros(len(change) - CAMERA)])
+    update, mean = now.update, np.concatenate([now.mean, np.zeros(len(change) - CAMERA)])
     end, between = (float(s @ update.among_measured(x - mean)) for x in (change, now.change))
-    cost = now.cost(update, rows)
+    cost = now.cost(rows)
     for halving in range(_HALVINGS):
         a = 0.5**halving
         step = now.change + a * (change - now.change)
         distance = (1 - a) ** 2 * now.from_prior + 2 * a * (1 - a) * between + a * a * end
         following = update.at(now.camera_after(step), step, distance)
-        if following.cost(update, rows) <= cost * (1 + 1e-9):
+        if following.cost(rows) <= cost * (1 + 1e-9):
             return following, step
     return now, change

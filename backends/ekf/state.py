@@ -85,9 +85,10 @@ class FilterState:
         new = FilterLandmarks.at(coordinates, ids, anchors, self.pose[:3, 3] + h @ R.T, self.frame)
         D = coordinates.inverse_jacobian(anchors, new.c) @ R
         noise = D @ covariances @ D.transpose(0, 2, 1)
-        by_rig = np.zeros((len(h), 3, self.covariance.rig)) if by_rig is None else D @ by_rig
+        by_rig = np.zeros((len(h), 3, self.covariance.by_rig.shape[1])) if by_rig is None else D @ by_rig
         covariance = self.covariance.appended(new.gauge @ self.camera.world(), noise, by_rig)
-        landmarks = self.landmarks.with_rows(self.covariance.count, new)
+        end = self.covariance.correlated
+        landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
         return replace(self, measured=True, landmarks=landmarks, covariance=covariance).relieved()
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
@@ -106,32 +107,32 @@ class FilterState:
 
     def with_all_of(self, ids: IdArray) -> FilterState:
         """With some landmarks (M,), which may have left it or be known from elsewhere, in the state."""
-        rows, (dense, left, known) = self.landmarks.rows_of(ids), self._parts()
-        back = np.sort(rows[rows >= len(dense)])
+        rows, (left, state, known) = self.landmarks.rows_of(ids), self._parts()
+        back = np.sort(rows[(rows < len(left)) | (rows >= len(left) + len(state))])
         if not len(back):
             return self
-        return self._rearranged(np.concatenate([dense, back]), np.setdiff1d(left, back), np.setdiff1d(known, back))
+        return self._rearranged(np.setdiff1d(left, back), np.concatenate([state, back]), np.setdiff1d(known, back))
 
     def relieved(self) -> FilterState:
         """Where the state is too large, without those not measured for longest."""
-        if self.covariance.count <= _MOST:
+        (left, state, known), seen = self._parts(), self.landmarks.seen
+        if len(state) <= _MOST:
             return self
-        (dense, left, known), seen = self._parts(), self.landmarks.seen
-        old = np.flatnonzero(seen[dense] < self.frame)
-        leave = np.sort(old[np.argsort(seen[old], kind="stable")][: max(len(dense) - _LEAST, 0)])
+        old = state[seen[state] < self.frame]
+        leave = np.sort(old[np.argsort(seen[old], kind="stable")][: max(len(state) - _LEAST, 0)])
         if not len(leave):
             return self
-        return self._rearranged(np.setdiff1d(dense, leave), np.concatenate([left, leave]), known)
+        return self._rearranged(np.concatenate([left, leave]), np.setdiff1d(state, leave), known)
 
     def _parts(self) -> tuple[IndexArray, IndexArray, IndexArray]:
-        """Rows of the landmarks that are in the state, have left it, or are known from elsewhere."""
-        rows, a, b = np.arange(len(self.landmarks)), self.covariance.count, self.covariance.correlated
+        """Rows of the landmarks that have left the state, are in it, or are known from elsewhere."""
+        rows, a, b = np.arange(len(self.landmarks)), self.covariance.left, self.covariance.correlated
         return rows[:a], rows[a:b], rows[b:]
 
-    def _rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> FilterState:
+    def _rearranged(self, left: IndexArray, state: IndexArray, known: IndexArray) -> FilterState:
         """With the landmarks of these rows of the table in each part."""
-        landmarks = self.landmarks.select(np.concatenate([dense, left, known]))
-        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(dense, left, known))
+        landmarks = self.landmarks.select(np.concatenate([left, state, known]))
+        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(left, state, known))
 
     # --- updates ---
 
@@ -149,12 +150,12 @@ class FilterState:
         Raises:
             UnsolvableError: the new state is not finite.
         """
-        update, before, P = found.update, self.landmarks, found.update.covariance
-        camera = found.at.camera_after(found.change)
-        marks = before.moved(update.coordinates, slice(P.count), found.change[CAMERA:].reshape(-1, 3))
+        update, before, P = found.update, self.landmarks, self.covariance
+        camera, state = found.camera, slice(P.left, P.correlated)
+        marks = before.moved(update.coordinates, state, found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
-        marks.seen[update.marks[found.used]] = self.frame
-        shift = (marks.gauge - before.gauge)[: P.count] @ camera.world() * camera.transports
-        covariance = P.corrected(found.whitened.lost(update), self.camera.transport(camera), shift)
+        marks.seen[update.rows[found.used]] = self.frame
+        shift = (marks.gauge - before.gauge)[state] @ camera.world() * camera.transports
+        covariance = update.covariance.corrected(*found.whitened.lost(), self.camera.transport(camera), shift)
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()

@@ -18,7 +18,7 @@ class SmootherConfig:
             with the run. Null (in Python None) keeps all poses and revises the whole path.
         landmarks: most landmarks that are variables of the graph. Where a frame measures no more than these, those that
             are measured for longer than a smart factor spans become variables, and keep what it says of them; but only
-            while they are at least 30 of their standard deviations away, so that they are linear in space.
+            while they are linear in space to less than a pixel's noise.
         past: number of poses, at least, whose measurements are kept, to revise the path when measurements are mended.
 
     Raises:

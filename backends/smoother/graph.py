@@ -1,22 +1,18 @@
-"""The factor graph in gtsam's fixed-lag smoother: poses, and smart factors that grow with every measurement."""
+"""The factor graph in gtsam's fixed-lag smoother."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import SupportsFloat, SupportsIndex, SupportsInt
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.landmarks import VARIABLE
+from backends.smoother.factors import FactorMaker, landmark_key, pose_key
 from backends.smoother.state import SmootherState
+from backends.smoother.tracks import GraphProblem, Stamps, Tracks
 from slam.data import IdArray
 from slam.errors import SlamError
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
-
-#: Times of variables, as gtsam's stubs have them.
-Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
 
 #: What gtsam throws when it cannot solve.
 FAILURES = (RuntimeError, ValueError, LookupError)
@@ -30,31 +26,6 @@ class SolverError(SlamError):
     """The solver failed; the message is gtsam's, in one line."""
 
 
-@dataclass
-class Track:
-    """A landmark's smart factor."""
-
-    begun: int  # see `SmootherLandmarks.begun`
-    poses: list[int] = field(default_factory=list)  # numbers of the poses that measured it
-    keys: list[int] = field(default_factory=list)  # their variables, and the measurements
-    points: list[gtsam.StereoPoint2] = field(default_factory=list)
-    # whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only
-    stereo: bool = False
-    slot: int = -1  # of the factor in the solver, −1 while there is none
-
-
-@dataclass
-class GraphProblem:
-    """Factors and first values, and what grew."""
-
-    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)  # for gtsam
-    values: gtsam.Values = field(default_factory=gtsam.Values)
-    removed: list[int] = field(default_factory=list)  # slots of factors that others replace
-    grown: dict[tuple[int, int], Track] = field(default_factory=dict)  # smart factors with new measurements
-    # times of variables for the fixed lag: numbers of poses
-    stamps: Stamps = field(default_factory=dict)
-
-
 @dataclass(frozen=True, eq=False)
 class Solved:
     """The last poses as the graph has them."""
@@ -63,140 +34,8 @@ class Solved:
     poses: Array  # (L, 4, 4)
     serials: IdArray  # of landmarks that are variables (V,)
     points: Array  # and where they are (V, 3)
+    linearised: Array  # and where they are linearised (V, 3)
     covariance: Array  # joint covariance (12, 12) of the last two poses; (6, 6) of a single one
-
-
-class Tracks:
-    """Landmarks as factors: which measurement goes into which. Each is used once.
-
-    A landmark is a smart factor that grows until the landmark goes on in a new one (`SmootherLandmarks.measured`):
-    factors end before their first pose leaves the lag. A landmark of which more is known than what was measured is a
-    variable of its own, and so are some that were measured for longer: those take over what is in their smart factor.
-
-    Args:
-        make: makes the factors.
-        lag: number of poses that are smoothed; None for all.
-    """
-
-    def __init__(self, make: FactorMaker, lag: int | None) -> None:
-        self._make, self._lag = make, lag
-        self._smart: dict[int, Track] = {}
-        self._variables: dict[int, int] = {}  # numbers of the poses as long as which they stay
-        self._solved = -1  # number of the newest pose that was solved for
-
-    def add_pose(self, problem: GraphProblem, s: SmootherState, number: int, first: int) -> None:
-        """A pose, and its tie to the one before it, if it is not the first one."""
-        row = s.of(number)
-        tie = s.ties[row]
-        if tie is not None and number != first:
-            unknown = tie.times is not None and np.isnan(tie.times[0])
-            if tie.times is None or (not unknown and number - 2 < first):
-                factor = self._make.tie(number - 1, number, tie.relative, tie.covariance)
-            else:
-                keys = [pose_key(i) for i in range(number - (1 if unknown else 2), number + 1)]
-                factor = self._make.motion(keys, np.diff(tie.times))
-            problem.factors.add(factor)
-        problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
-        problem.stamps[pose_key(number)] = float(number)
-
-    def add_rows(self, problem: GraphProblem, s: SmootherState, number: int, first: int, begin: int = 0) -> None:
-        """What was measured from a pose, from some row on."""
-        sight, make, known = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
-        key = pose_key(number)
-        rows = (column[begin:].tolist() for column in (sight.serials, sight.begun, sight.z))
-        for serial, begun, z in zip(*rows):
-            point = make.point(z)
-            if known and self._is_variable(problem, s, serial, begun, number, first):
-                self._stays(problem, serial, number)
-                problem.factors.add(make.explicit(point, number, serial))
-                continue
-            track = self._smart.get(serial)
-            goes_on = track is not None and (track.poses[0] >= first - 1 if begun == VARIABLE else track.begun == begun)
-            if track is None or not goes_on:
-                self._smart[serial] = track = Track(begun)
-            track.poses.append(number)
-            track.keys.append(key)
-            track.points.append(point)
-            track.stereo = track.stereo or z[2] == z[2]  # not NaN
-            problem.grown[serial, track.begun] = track
-            if begun == VARIABLE and track.stereo:
-                self._turn(problem, s, serial, number)
-
-    def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
-        """Variables that the state keeps do not leave; their serial numbers."""
-        serials = s.landmarks.serial[s.landmarks.begun == VARIABLE].tolist()
-        kept = [serial for serial in serials if self._is_there(serial)]
-        for serial in kept:
-            self._stays(problem, serial, s.number)
-        return kept
-
-    def _is_there(self, serial: int) -> bool:
-        """Whether a variable has not left the lag."""
-        return serial in self._variables and (self._lag is None or self._variables[serial] >= self._solved - self._lag)
-
-    def _stays(self, problem: GraphProblem, serial: int, number: int) -> None:
-        """A variable stays for as long as a pose."""
-        self._variables[serial] = number
-        problem.stamps[landmark_key(serial)] = float(number)
-
-    def _turn(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
-        """A landmark becomes a variable, if the state has it as one, with the measurements of its smart factor."""
-        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.begun == VARIABLE))
-        if not len(row):
-            return
-        track = self._smart.pop(serial)
-        del problem.grown[serial, track.begun]
-        if track.slot >= 0:
-            problem.removed.append(track.slot)
-        for pose, point in zip(track.poses, track.points):
-            problem.factors.add(self._make.explicit(point, pose, serial))
-        problem.values.insert(landmark_key(serial), s.landmarks.position[row[0]])
-        self._stays(problem, serial, number)
-
-    def _is_variable(
-        self, problem: GraphProblem, s: SmootherState, serial: int, begun: int, number: int, first: int
-    ) -> bool:
-        """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
-        known = s.known.get(serial)
-        if serial in self._variables and (begun == VARIABLE or known is not None):
-            return self._is_there(serial)
-        if known is None or 0 <= known.pose < first:
-            return False
-        self.add_known(problem, s, serial)
-        return True
-
-    def add_known(self, problem: GraphProblem, s: SmootherState, serial: int) -> None:
-        """A landmark of which something is known, as a variable."""
-        known = s.known[serial]
-        if known.pose < 0:
-            problem.factors.add(self._make.known(serial, known.position, known.covariance))
-            place = known.position
-        else:
-            problem.factors.add(self._make.known_from(known.pose, serial, known.position, known.covariance))
-            place = transform(s.poses[s.of(known.pose)], known.position[None])[0]
-        problem.values.insert(landmark_key(serial), place)
-
-    def make_smart(self, problem: GraphProblem, careful: bool = True) -> list[tuple[Track, int]]:
-        """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""
-        made = []
-        for track in problem.grown.values():
-            if track.stereo and len(track.poses) > 1:
-                if track.slot >= 0:
-                    problem.removed.append(track.slot)
-                made.append((track, problem.factors.size()))
-                problem.factors.add(self._make.smart(track.points, track.keys, careful))
-        return made
-
-    def forget(self, s: SmootherState) -> None:
-        """After its newest pose was solved for: forget what will not grow or come back; once in a while.
-
-        Of a landmark of which more is known it stays known that this is used up.
-        """
-        self._solved = s.number
-        if self._lag is not None and not s.number % self._lag:
-            oldest = s.number - self._lag
-            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] > oldest}
-            self._variables = {n: last for n, last in self._variables.items() if last >= oldest or n in s.known}
 
 
 class Graph:
@@ -306,9 +145,12 @@ class Graph:
         values = self._solver.calculateEstimate()
         poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)])
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
-        points = np.array([values.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3)
+        points, linearised = (
+            np.array([v.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3)
+            for v in (values, self._solver.getLinearizationPoint())
+        )
         joint = self._joint(list(range(max(oldest, s.number - 1), s.number + 1)))
-        solved = Solved(oldest, poses, np.array(kept, np.int64), points, joint)
+        solved = Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint)
         if not (np.isfinite(poses).all() and np.isfinite(solved.covariance).all()):
             raise ValueError("the solution is not finite")
         if (np.diag(solved.covariance) <= 0).any():

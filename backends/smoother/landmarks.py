@@ -15,10 +15,6 @@ from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
 VARIABLE = -(10**9)  #: in place of the number of the pose with which a smart factor begins: a variable of the graph
-#: Least distance of a landmark that becomes a variable, in its standard deviations. A variable is linearised in space,
-#: and so off by one such part of its deviation, to the same side for all: of 20 together by a seventh of theirs.
-_LINEAR = 30.0
-_NEARER = 0.5  # share of the distance at which a landmark became a variable, below which it is one no more
 _GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
 _DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
 _BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
@@ -38,7 +34,7 @@ class SmootherLandmarks(LandmarkRows):
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
     begun: IndexArray  # number of the pose from which its smart factor counts (S,), or later; or VARIABLE
-    far: Array  # distance from the camera [m] at which it became a variable (S,)
+    linearised: Array  # where the graph has it linearised, if it is a variable (S, 3) [m]
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
     @classmethod
@@ -49,7 +45,7 @@ class SmootherLandmarks(LandmarkRows):
         n = len(ids)
         return cls(
             ids, first + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
-            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), np.zeros(n), by_rig,
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1), np.zeros(n, np.intp), position, by_rig,
         )  # fmt: skip
 
     @classmethod
@@ -96,37 +92,45 @@ class SmootherLandmarks(LandmarkRows):
         zs[rows, oldest], poses[rows, oldest] = z, pose
         return replace(self, z=zs, pose=poses, away=away, begun=begun)
 
-    def with_variables(self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array) -> Self:
+    def with_variables(
+        self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array, linear: float
+    ) -> Self:
         """With more landmarks as variables, of those that a pose T (4, 4) is about to measure (M, 3); at most so many.
 
         None where it measures more: these hold the path well enough as they come and go, at half the cost.
         These are landmarks whose smart factor is full: as variables they keep what it says of them, as its measurements
-        go over. They are close enough to be linear in their position: far ones made a path metres off, unnoticed, and
-        Gauss-Newton steps might put them behind the camera. What is known of one from afar is linear there: one that
-        the camera has come near goes on in a smart factor. Variables that were not measured for longer than a factor
-        spans make room, the oldest first.
+        go over. Variables that were not measured for longer than a factor spans make room, the oldest first.
+
+        gtsam linearises a variable no more once a pose that measured it has left the lag. At an offset δ from there and
+        a distance d a pixel is wrong by f (δ/d)²: less than its noise σ where d > δ `linear`, with ``linear² = f/σ``.
+        So a landmark becomes a variable where that holds for its deviation, and goes on in a smart factor where it
+        holds no more for its offset. Else landmarks that are known from afar carry the path away as it passes them.
         """
         if len(rows) > most:
             return self
         last, variable = self.pose.max(axis=1), self.begun == VARIABLE
-        distance = np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
-        sure = _LINEAR * np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2)) < distance
+        deviation = np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2))
+        offset = np.linalg.norm(self.position[rows] - self.linearised[rows], axis=1)
+        apart = linear * np.where(variable[rows], offset, deviation)
+        close = apart >= np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
         full = ~variable[rows] & (self.begun[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
-        new = rows[full & sure & np.isfinite(z[:, 2])]
+        new = rows[full & ~close & np.isfinite(z[:, 2])]
         away = np.flatnonzero(variable & (last < pose - track))
         away = away[np.argsort(last[away], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
-        begun, far = self.begun.copy(), self.far.copy()
+        begun = self.begun.copy()
         begun[away] = 0
-        begun[rows[variable[rows] & (distance < _NEARER * far[rows])]] = 0
-        begun[np.sort(new)[: most - int(variable.sum()) + len(away)]] = VARIABLE
-        far[rows] = np.where(variable[rows], far[rows], distance)
-        return replace(self, begun=begun, far=far)
+        begun[rows[variable[rows] & close]] = 0
+        new = np.sort(new)[: most - int(variable.sum()) + len(away)]
+        begun[new] = VARIABLE
+        linearised = self.linearised.copy()
+        linearised[new] = self.position[new]
+        return replace(self, begun=begun, linearised=linearised)
 
-    def at(self, serials: IdArray, points: Array) -> Self:
-        """With some landmarks (V,), by serial number, at points (V, 3)."""
-        position = self.position.copy()
-        position[np.searchsorted(self.serial, serials)] = points
-        return replace(self, position=position)
+    def solved(self, serials: IdArray, points: Array, linearised: Array) -> Self:
+        """With variables (V,), by serial number, at points (V, 3), and where the graph has them linearised (V, 3)."""
+        rows, position, at = np.searchsorted(self.serial, serials), self.position.copy(), self.linearised.copy()
+        position[rows], at[rows] = points, linearised
+        return replace(self, position=position, linearised=at)
 
     def without_variables(self, pose: int) -> Self:
         """With smart factors that begin at pose number `pose` in place of all variables."""

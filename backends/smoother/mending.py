@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, pose_key
-from backends.smoother.graph import Graph, GraphProblem, SolverError, Tracks, held, minimised
+from backends.smoother.graph import Graph, SolverError, held, minimised
 from backends.smoother.state import SmootherState
 from backends.smoother.steps import Steps
+from backends.smoother.tracks import GraphProblem, Tracks
 from slam.geometry.se3 import Array, inverse, transform
 from slam.window.stereo import RectifiedStereo
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -133,7 +134,8 @@ class Steps(RectifiedMeasurement):
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
         marks.by_rig[seen] = landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
-        marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T)
+        linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
+        marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
         marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number), graph.newest)
         sight = Sight.of(marks, seen, z[used])
         if s.inside:
@@ -162,9 +164,8 @@ class Steps(RectifiedMeasurement):
             pair[:6, :6] = relative_covariance(newest_first, poses[-1], last[0])
         last[1] = poses[-1]
         spread = np.concatenate([s.spread[:-1], P[None, -6:, -6:]])
-        marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses).at(
-            solved.serials, solved.points
-        )
+        marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses)
+        marks = marks.solved(solved.serials, solved.points, solved.linearised)
         s = replace(s, poses=poses, last=last, pair=pair, spread=spread, landmarks=marks)
         if self.past is None or self.config.lag is None or len(s.poses) < 1.5 * self.past:
             return s

@@ -12,12 +12,19 @@ from slam.atlas.atlas import Atlas
 from slam.atlas.config import AtlasConfig
 from slam.atlas.keyframes import Loop, distance
 from slam.atlas.pose_graph import Chain, PoseGraph
+from slam.chi_square import chi_square_limit
 from slam.data import CommonError
 from slam.geometry.se3 import Array, adjoint, inverse
 from slam.geometry.trajectory import Trajectory
 
 _DIMENSIONS = 6  # fixed: mean of χ² of a pose
-_LIMIT = AtlasConfig.gate_sigmas**2  # largest squared Mahalanobis distance of a loop from the pose graph
+#: Largest squared Mahalanobis distance of a loop from the path alone: a number beyond five sigma is as rare. Drift
+#: grows by errors that neighbouring frames share, of which the path's covariance is a model, so it may be somewhat too
+#: small; and where right loops are refused the path stays wrong.
+_FROM_PATH = chi_square_limit(_DIMENSIONS, 1 - 5.7e-7)
+#: The same where loops speak, each a measurement of its own: one right loop in 3,000 is farther off, for which others
+#: of its place stand in, while a lookalike that is let in bends the map.
+_AMONG_LOOPS = chi_square_limit(_DIMENSIONS, 1 - 1 / 3000)
 
 
 def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool) -> Atlas:
@@ -34,6 +41,7 @@ def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Traject
             the path between is then as much too small as the two disagree.
     """
     given, common = atlas, None if atlas.solved is None else atlas.solved.belief(rig)[0]
+    limit = _AMONG_LOOPS if atlas.loops else _FROM_PATH
 
     def without_it(atlas: Atlas) -> tuple[Chain, PoseGraph, float]:
         """The path, the pose graph without the loop, and the loop's distance from it."""
@@ -43,19 +51,19 @@ def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Traject
 
     try:
         chain, graph, off = without_it(atlas)
-        if off > _LIMIT and not (same_view and np.isfinite(off)):
+        if off > limit and not (same_view and np.isfinite(off)):
             return _refused(atlas, chain, loop, rig)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if not _agree(chain, before, loop):
             return atlas.with_inactive_loop(loop)
         atlas = replace(atlas, confirmed=True)
-        if off > _LIMIT:
+        if off > limit:
             atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
             chain, graph, _ = without_it(atlas)
         elif atlas.loops and not is_informative(graph, loop):
             return atlas.with_inactive_loop(loop)
         graph = graph.with_loop(loop)
-        if (graph.disagreement() > _LIMIT).any():
+        if (graph.disagreement() > _AMONG_LOOPS).any():
             return _refused(replace(atlas, pending=None), chain, loop, rig)
         return atlas.with_loop(loop).solved_by(graph, rig)
     except np.linalg.LinAlgError:
@@ -88,7 +96,7 @@ def _agree(chain: Chain, before: Loop | None, loop: Loop) -> bool:
     expected = inverse(T_old) @ before.T_first_second @ T_new
     back, far = adjoint(inverse(T_new)), adjoint(inverse(expected))
     P = back @ before.covariance @ back.T + P_new + loop.covariance + far @ P_old @ far.T
-    return distance(expected, loop.T_first_second, P) < _LIMIT
+    return distance(expected, loop.T_first_second, P) < _AMONG_LOOPS
 
 
 def is_informative(graph: PoseGraph, loop: Loop) -> bool:
@@ -117,17 +125,17 @@ def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array) -> l
     others = sorted((x for x in loops if x is not seed), key=lambda x: (abs(x.second - seed.second), x.first))
     also = [k for x in others for k in x.pair]
     graph = PoseGraph.solved(chain, [], start, [*also, *seed.pair])
-    if disagreement(graph, seed) > _LIMIT:
+    if disagreement(graph, seed) > _FROM_PATH:
         return []
     members, begin, size = [seed], 0, 1
     graph = PoseGraph.solved(chain, members, start, also)
     while begin < len(others):
-        joined = [x for x in others[begin : begin + size] if disagreement(graph, x) <= _LIMIT]
+        joined = [x for x in others[begin : begin + size] if disagreement(graph, x) <= _AMONG_LOOPS]
         begin, size = begin + size, 2 * size
         while joined:
             whole = PoseGraph.solved(chain, [*members, *joined], start, also)
             off = whole.disagreement()
-            if (off <= _LIMIT).all():
+            if (off <= _AMONG_LOOPS).all():
                 members, graph = [*members, *joined], whole
                 break
             del joined[int(np.argmax(off[len(members) :]))]

@@ -36,7 +36,7 @@ class AtlasConfig:
     inliers: ClassVar[int] = 15
     #: Least standard deviation of their pixels, along the direction of largest spread, as a share of the image's width.
     spread: ClassVar[float] = 0.1
-    #: A loop farther from the path than this many standard deviations is refused.
+    #: Places farther off than this many standard deviations of the position are not compared, beyond drift and view.
     gate_sigmas: ClassVar[float] = 5.0
 
     __pydantic_config__ = FORBID_UNKNOWN

@@ -7,11 +7,6 @@ With δ the error of the applied correction and ``Σ`` its covariance, poses and
 Measurements of a path have been corrected by different corrections c_k. With θ the true parameters, the error that
 they leave is ``Σ_k G_k F_k (θ − c_k) = J θ − Σ_k G_k F_k c_k``, with gains G_k and fields F_k. So δ is what is followed
 of θ and of the baseline's length, and 1, whose column has the field ``−F_k c_k``.
-
-Some changes of the parameters move the right row alone, which back ends do not measure: the direction of the baseline
-across, say. With V the others, orthonormal, the field of the rows (uL, vL, uR) is ``F = F V Vᵀ``, so that following
-``Vᵀ δ`` instead of δ changes no covariance. Fewer cannot be followed: combinations that hardly move pixels are those of
-which a recording teaches little, and after some seconds they are a good part of the covariance.
 """
 
 from __future__ import annotations
@@ -22,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.estimator import SelfCalibration
-from slam.calibration.model import Revision, RigModel
+from slam.calibration.model import Revision
 from slam.data import CommonError, Estimate
 from slam.geometry.arrays import Array
 from slam.geometry.se3 import adjoint
@@ -36,64 +31,17 @@ _SIGNIFICANT = 0.5
 BASELINE = 0.002
 
 
-class FollowedErrors:
-    """The k combinations of the parameters' and the baseline's errors that move the rows (uL, vL, uR) of any point.
-
-    Args:
-        model: the rig's parameters.
-    """
-
-    def __init__(self, model: RigModel) -> None:
-        self._model, far = model, model.far()
-        # (0, 0.1, 0.2): disparities [focal lengths]; with rows and columns of `far`, enough for all that fields are of
-        points = np.concatenate([far + np.array([0.0, 0.0, d * model.focal]) for d in (0.0, 0.1, 0.2)])
-        by_each = self._by(np.eye(len(model.names) + 1), points).reshape(3 * len(points), -1)
-        _, sizes, rows = np.linalg.svd(by_each, full_matrices=False)
-        # As a copy has it: of another order in memory, products would be rounded differently.
-        self._V = np.ascontiguousarray(rows[sizes > 1e-9 * sizes[0]].T)  # 1e-9: numerics, rounding
-
-    def _by(self, combinations: Array, points: Array) -> Array:
-        """Derivatives (N, 3, k) of rows (uL, vL, uR) of points ``(x, y, d)`` by combinations (n + 1, k) of errors."""
-        field = self._model.field(points)
-        field[:, 2] = field[:, 0] - field[:, 2]
-        rows = field @ combinations[:-1]
-        rows[:, 2] += points[:, 2:] * combinations[-1]  # with a longer baseline, the nominal one's disparity is smaller
-        return np.asarray(rows)
-
-    def of(self, parameters: Array) -> Array:
-        """The combinations (k,) of parameters (n,), the baseline as delivered."""
-        return np.asarray(parameters @ self._V[:-1])
-
-    def covariance(self, parameters: Array) -> Array:
-        """Covariance (k, k) of the combinations by that of the parameters (n, n)."""
-        by_baseline, V = BASELINE * self._V[-1], self._V[:-1]
-        return np.asarray(V.T @ parameters @ V + np.outer(by_baseline, by_baseline))
-
-    def field(self, z: Array, known: Array) -> Array:
-        """Derivatives (N, 3, k + 1) of rows (uL, vL, uR) (N, 3) [px] by the combinations; last, by `known` (k,).
-
-        The last are the sum of the others times `known`. A missing uR has none.
-        """
-        return self._by(np.column_stack([self._V, self._V @ known]), self._model.points(z))
-
-
 class RemainingRigError:
     """The rig's error that is left in a back end's estimate while self-calibration continues.
 
-    Args:
-        calibration: the self-calibration.
-
-    Attributes:
-        followed: the combinations of errors that back ends follow.
-        measured_with: the correction of all measurements given to the back end.
+    What back ends follow are the errors of the n parameters, that of the baseline's length, and 1.
     """
 
     def __init__(self, calibration: SelfCalibration) -> None:
-        self._calibration, self.measured_with = calibration, calibration.applied
+        self._calibration, self._measured_with = calibration, calibration.applied  # of what the back end was given
         self._revised = np.zeros(len(calibration.model.names))  # changes of the correction that the whole path followed
         self._turned = np.zeros(6)  # how the world turned as the whole path was revised: a motion, on the left
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
-        self.followed = FollowedErrors(calibration.model)
 
     def follow(self, backend: Backend, pose: Array | None = None) -> None:
         """Let a back end that can follow the errors, before its first frame; `pose` (6, m) is J of its first pose."""
@@ -101,8 +49,17 @@ class RemainingRigError:
             backend.consider(self.field, pose)
 
     def field(self, z: Array) -> Array:
-        """Derivatives (N, 3, k + 1) of true rows (uL, vL, uR) by what is followed and by 1, at corrected rows."""
-        return self.followed.field(z, -self.followed.of(self._calibration.applied.parameters - self._revised))
+        """Derivatives (N, 3, n + 2) of true rows (uL, vL, uR) by what is followed, at corrected rows (N, 3) [px]."""
+        points = self._calibration.model.points(z)
+        field = self._calibration.model.field(points)
+        field[:, 2] = field[:, 0] - field[:, 2]
+        out = np.zeros((len(z), 3, field.shape[2] + 2))
+        out[:, :, :-2], out[:, 2, -2] = (
+            field,
+            points[:, 2],
+        )  # with a longer baseline, the nominal one's disparity is smaller
+        out[:, :, -1] = -field @ (self._calibration.applied.parameters - self._revised)
+        return out
 
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by the present posterior from now on; returns the change, or None.
@@ -120,17 +77,17 @@ class RemainingRigError:
             restarted: part of the path is an earlier back end's and cannot be revised.
         """
         applied = self._calibration.applied
-        if not isinstance(backend, RevisingBackend) or applied is self.measured_with:
+        if not isinstance(backend, RevisingBackend) or applied is self._measured_with:
             return None
-        revision = Revision(self.measured_with, applied)
+        revision = Revision(self._measured_with, applied)
         whole = not restarted and backend.revises_path
         if whole:
-            step = applied.parameters - self.measured_with.parameters
+            step = applied.parameters - self._measured_with.parameters
             self._revised = self._revised + step
             if isinstance(backend, ConsideringBackend):
-                self._turned = self._turned + _adjoint_of(backend) @ _of_pose(backend)[:, :-1] @ self.followed.of(step)
+                self._turned = self._turned + _adjoint_of(backend) @ _of_pose(backend)[:, :-2] @ step
         backend.revise(revision.rows)
-        self.measured_with = applied
+        self._measured_with = applied
         return revision
 
     def added_to(self, backend: Backend, estimate: Estimate) -> Estimate:
@@ -163,28 +120,27 @@ class RemainingRigError:
         J, revised = _of_pose(backend), self._revised
         if as_reported:
             J, revised = J.copy(), 0.0 * revised
-            J[:, -1] -= J[:, :-1] @ self.followed.of(self._revised)
+            J[:, -1] -= J[:, :-2] @ self._revised
             J[:, -1] += np.linalg.solve(_adjoint_of(backend), self._turned)
         return CommonError(J, self._common_root(revised))
 
     def _common_root(self, revised: Array) -> Array:
-        """Square root (k + 1, k + 1) of the mean square of what is followed, less that of `revised` (n,), and of 1.
+        """Square root (n + 2, n + 2) of the mean square of what is followed, less that of `revised` (n,).
 
         It is the symmetric root, so that its columns mean the same in all frames.
         """
         covariance = self._calibration.covariance
         if self._root is None or not np.array_equal(self._root[0], covariance):
-            values, vectors = np.linalg.eigh(self.followed.covariance(covariance))
-            root: Array = np.eye(len(values) + 1)
-            root[:-1, :-1] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
-            self._root = covariance, root
-        root = self._root[1].copy()
-        root[:-1, -1] = self.followed.of(self._calibration.applied.parameters - revised)
+            values, vectors = np.linalg.eigh(covariance)
+            self._root = covariance, vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
+        n = len(covariance)
+        root = np.diag(np.append(np.zeros(n), [BASELINE, 1.0]))
+        root[:n, :n], root[:n, -1] = self._root[1], self._calibration.applied.parameters - revised
         return root
 
 
 def _of_pose(backend: ConsideringBackend) -> Array:
-    """J (6, k + 1) of the newest pose."""
+    """J (6, n + 2) of the newest pose."""
     return backend.sensitivities(np.zeros(0, np.int64))[0]
 
 

@@ -7,19 +7,9 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence, row_evidence
+from slam.calibration.evidence import Accumulator, Evidence, RigEvidence, row_evidence
 from slam.calibration.model import Revision, RigCorrection, RigModel
-from slam.calibration.pairs import (
-    NO_MATCHES,
-    Pair,
-    Rows,
-    View,
-    match,
-    noise_variances,
-    pair_evidence,
-    pair_of,
-    parallax,
-)
+from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
     FOCALS,
     RigPosterior,
@@ -37,6 +27,7 @@ from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.rig_numbers import rig_numbers
 from slam.geometry.se3 import Array
+from slam.tracks.follow import Matches
 
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
@@ -89,8 +80,6 @@ class SelfCalibration:
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
         self._scattered = 4  # 4: number of pairs that the configured noise counts for
         self._waiting: list[View] = []
-        self._open: Evidence | None = None  # of a pair that is not complete
-        self._frames, self._solved = 0, 0  # frames of the incomplete pair: now, and when last solved
         self._seen = 0
         self._looked: Array | None = None  # pose of the last frame that was used
         self.unsolved = 0
@@ -110,6 +99,22 @@ class SelfCalibration:
     def posterior(self) -> RigPosterior:
         """The present posterior of the rig's error in this recording."""
         return RigPosterior(self._own.mean.copy(), self.covariance)
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong with focal lengths that the motion contradicts by far, in a line; empty where it does not.
+
+        Errors beyond 5 standard deviations of what is allowed to a calibration are none of it: the true ones are larger
+        still, as the prior holds them back.
+        """
+        error = float(self._focal @ self._own.mean)
+        allowed = np.sqrt(self._focal @ (self._prior.covariances[-1] + self.covariance) @ self._focal)
+        if abs(error - self._focal @ self._prior.mean) <= 5 * allowed:
+            return ""
+        return (
+            f"the images fit a focal length at least {abs(100 * error):.0f} % {'shorter' if error > 0 else 'longer'} "
+            "than the calibration's: is the calibration of this camera, and for images of this size?"
+        )
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.
@@ -141,10 +146,9 @@ class SelfCalibration:
 
     def _motion_agrees(self) -> bool:
         """Whether the evidence of motion is likelier with the posterior mean than with the calibration as delivered."""
-        motion, mean = self._moved(), self._own.mean
-        if motion is None:
-            return False
-        return bool(motion.e @ mean - 0.5 * mean @ motion.S @ mean > 1)  # a fitted parameter's gain (Akaike)
+        motion, mean = self._motion.total(), self._own.mean
+        gain = 0.0 if motion is None else motion.e @ mean - 0.5 * mean @ motion.S @ mean
+        return bool(gain > 1)  # 1: a fitted parameter's gain (Akaike)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
         """Features with the applied correction."""
@@ -173,7 +177,7 @@ class SelfCalibration:
         self._rows.add(rows)
         self._fields = fields if self._fields is None else self._fields + fields
         self._compare(view)
-        if self.pairs or self._open is not None:
+        if self.pairs:
             self._update()
 
     def _has_turned(self, T_world_left: Array) -> bool:
@@ -186,52 +190,35 @@ class SelfCalibration:
 
     def _compare(self, view: View) -> None:
         """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""
-        c = self.config
-        waiting = self._waiting
-        newest = match(waiting[-1], view) if waiting else NO_MATCHES
+        c, waiting = self.config, self._waiting
         # 0.5: a new view is taken when the last one has lost this share of the features it may lose
-        apart = not waiting or len(newest[0]) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
+        apart = not waiting or len(match(waiting[-1], view)) < (1 - 0.5 * (1 - c.kept_share)) * len(waiting[-1])
         ended = 0
         for first in waiting:
-            matched = newest if first is waiting[-1] else match(first, view)
-            n = len(matched[0])
-            if n > max(c.kept_share * len(first), c.minimum_common):
+            matched = match(first, view)
+            if len(matched) > max(c.kept_share * len(first), c.minimum_common):
                 break
             ended += 1
-            evidence = self._evidence(first, view, matched) if n >= c.minimum_common else None
+            evidence = self._evidence(first, view, matched) if len(matched) >= c.minimum_common else None
             if evidence is not None:
                 self._motion.add(evidence)
-        if waiting and not ended and self.pairs < 6:  # 6: with fewer pairs, an incomplete one counts provisionally
-            self._frames += 1
-            # 1.25: an incomplete pair is solved again after so many times the frames: parallax grows no faster
-            if self._frames >= 1.25 * self._solved:
-                self._open, self._solved = self._evidence(waiting[0], view, matched), self._frames
-        else:
-            self._open, self._frames, self._solved = None, 0, 0
         self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
-    def evidence(self) -> RecordingEvidence | None:
+    def evidence(self) -> RigEvidence | None:
         """The evidence of this recording alone, without any prior; None if no motion was seen."""
-        moved, rows = self._moved(), self._rows.total()
+        moved, rows = self._motion.total(), self._rows.total()
         if moved is None or rows is None or self._fields is None:
             return None
-        return RecordingEvidence(rows + moved, residual_likelihoods(self._prior, self._fields))
-
-    def _moved(self) -> Evidence | None:
-        """The evidence of motion: of the pairs, and of the incomplete one."""
-        complete = self._motion.total()
-        if self._open is None:
-            return complete
-        part = self._open.scaled(1 / self._motion.inflation)
-        return part if complete is None else complete + part
+        whole, scales = rows + moved, residual_likelihoods(self._prior, self._fields)
+        return RigEvidence(whole, whole.with_error(self._systematic), scales)
 
     def kept(self) -> SavedCalibration:
         """What is known of the rig, as a prior for further recordings of it."""
         found = self.evidence()
         if found is None:
             return self._kept or SavedCalibration(self.posterior, rig_numbers(self.rig))
-        before = None if self._kept is None else self._kept.evidence
-        return joint_calibration(self.model, factory_prior(self.model), [found], self.config.systematic, before)
+        before = [] if self._kept is None or self._kept.evidence is None else [self._kept.evidence]
+        return joint_calibration(self.model, factory_prior(self.model), [*before, found])
 
     def summary(self) -> dict[str, Any]:
         """The result as plain types."""
@@ -243,7 +230,7 @@ class SelfCalibration:
         pixel, disparity = np.exp(self._variances)
         return np.diag([pixel, pixel, disparity])
 
-    def _evidence(self, first: View, second: View, matched: Rows) -> Evidence | None:
+    def _evidence(self, first: View, second: View, matched: Matches) -> Evidence | None:
         """The evidence of a pair of views with matched features; None without a solution."""
         mean = self._own.mean
         pair = pair_of(self.model, first, second, mean, self._noise, self._seen, matched)
@@ -252,9 +239,8 @@ class SelfCalibration:
             return None
         if parallax(self.model, pair) < self.config.minimum_parallax:
             return None
-        one, two = (points + self.model.shift(points, mean) for points in (pair.first, pair.second))
         self._scattered += 1
-        scatter = np.log(noise_variances(Pair(one, two, pair.R, pair.t), self.model.focal, self._noise))
+        scatter = np.log(noise_variances(pair, self.model.focal, self._noise))
         self._variances = self._variances + (scatter - self._variances) / self._scattered
         evidence = pair_evidence(self.model, pair, mean, self._noise)
         self.unsolved += evidence is None
@@ -264,15 +250,13 @@ class SelfCalibration:
         """Update the posterior by Bayes' rule from all pairs of views and all rows so far."""
         for part in (self._rows, self._motion):
             part.update_inflation(self._own.mean, self._own.covariance)
-        moved = self._moved()
-        assert moved is not None  # because there are pairs
-        found = self.evidence()
-        assert found is not None
+        moved, found = self._motion.total(), self.evidence()
+        assert moved is not None and found is not None  # because there are pairs
         # The correction is to explain this recording, so it may take up what the residual fields do here.
-        self._own = solve(self._own_prior, moved, found.whole)
+        self._own = solve(self._own_prior, moved, found.plain)
         # What is still from the prior has no bias of this recording: the gain is the evidence's weight.
         gain = np.eye(len(self._systematic)) - self._own.covariance @ self._before
-        effect = self._own.covariance @ found.whole.cross
+        effect = self._own.covariance @ found.plain.cross
         self._by_bias = gain * self._systematic @ gain.T + found.fields * effect @ effect.T
 
 

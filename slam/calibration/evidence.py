@@ -48,29 +48,18 @@ class Evidence(NamedTuple):
         return Evidence(self.S + other.S, self.e + other.e, self.cross + other.cross)
 
 
-class RecordingEvidence(NamedTuple):
-    """The evidence of one recording, without any prior."""
+class RigEvidence(NamedTuple):
+    """The evidence of recordings of one rig, without any prior; the residual fields are still in it."""
 
-    whole: Evidence  # of its rows and its motion
-    scales: Array  # log-likelihoods (K,) of the scales of the residual fields by its rows
+    plain: Evidence  # of rows and motion, as it is
+    apart: Evidence  # each recording with a systematic error of its own, which averages out over recordings
+    scales: Array  # log-likelihoods (K,) of the scales of the residual fields, by the rows
 
     @property
     def fields(self) -> float:
         """Variance of each coefficient of the residual fields [focal lengths²]."""
-        return field_variance(residual_scale(self.scales))
-
-
-class RigEvidence(NamedTuple):
-    """The evidence of any number of recordings of one rig, without any prior; the residual fields are still in it."""
-
-    plain: Evidence  # as it is
-    apart: Evidence  # each recording with a systematic error of its own, which averages out over recordings
-    scales: Array  # log-likelihoods (K,) of the scales of the residual fields
-
-    @classmethod
-    def of(cls, recording: RecordingEvidence, variance: Array) -> RigEvidence:
-        """Of one recording, whose systematic error has this variance (n,)."""
-        return cls(recording.whole, recording.whole.with_error(variance), recording.scales)
+        weights = np.exp(self.scales - self.scales.max())
+        return field_variance(float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum())))
 
     def __add__(self, other: RigEvidence) -> RigEvidence:  # type: ignore[override]
         """Of the recordings of both."""
@@ -104,12 +93,6 @@ def field_variance(scale: float = 1.0) -> float:
     """Variance of each coefficient of the residual fields [focal lengths²], at their scale."""
     # 2e-4: root mean square over the image at a scale of 1 [focal lengths]: a fifth of a pixel at 1000 px
     return (scale * 2e-4) ** 2 / len(RESIDUAL)
-
-
-def residual_scale(logs: Array) -> float:
-    """Root mean square of the possible scales of residual fields, weighted by their log-likelihoods (K,)."""
-    weights = np.exp(logs - logs.max())
-    return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
 
 
 class Accumulator:

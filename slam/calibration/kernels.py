@@ -62,18 +62,6 @@ def field(points, focal):
 
 
 @kernel
-def shift(points, focal, parameters):
-    """`field` times parameters and turn (n + 3,): (N, 4)."""
-    out, rows = np.zeros((len(points), 4)), np.zeros((4, 24))
-    for p in range(len(points)):
-        _field_at(points[p, 0] / focal, points[p, 1] / focal, points[p, 2] / focal, focal, rows)
-        for i in range(4):
-            for column in range(24):
-                out[p, i] += rows[i, column] * parameters[column]
-    return out
-
-
-@kernel
 def linearise(first, second, points, R, t, focal, noise):
     """The fields of `slam.calibration.pairs.Linear`; see `slam.calibration.pairs.linearised` for the arguments."""
     n = len(points)

@@ -85,15 +85,8 @@ class RigModel:
         return np.asarray(field[:, :3, :n] + field[:, :3, n:] @ self._gauge)
 
     def shift(self, points: Array, parameters: Array) -> Array:
-        """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,): ``field(points) @ parameters``."""
-        return self.shift_with_vertical(points, parameters)[:, :3]
-
-    def shift_with_vertical(self, points: Array, parameters: Array) -> Array:
-        """Change (N, 4) [px] as of `shift`, then of the vertical disparity: ``vertical(points) @ parameters``."""
-        from slam.calibration.kernels import shift
-
-        both = np.concatenate([parameters, self._gauge @ parameters])
-        return np.asarray(shift(np.ascontiguousarray(points, float), self.focal, both))
+        """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,)."""
+        return np.asarray(self.field(points) @ parameters)
 
     @cached_property
     def _gauge(self) -> Array:
@@ -182,9 +175,9 @@ class RigCorrection:
     def pixels(self, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
         """Corrected rectified pixels (N, 2) of measured ones; the right row keeps the remaining vertical disparity."""
         points = self.model.points(np.column_stack([uv_left, uv_right[:, 0]]))
-        change = self.model.shift_with_vertical(points, self.parameters)
-        z = self.model.rows(points + change[:, :3])
-        return z[:, :2], np.column_stack([z[:, 2], z[:, 1] + uv_right[:, 1] - uv_left[:, 1] + change[:, 3]])
+        z = self.model.rows(points + self.model.shift(points, self.parameters))
+        vertical = uv_right[:, 1] - uv_left[:, 1] + self.model.vertical(points) @ self.parameters
+        return z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,9 @@ way of its own, whatever the motion was.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
@@ -20,15 +18,12 @@ from slam.data import StereoFeatures
 from slam.geometry.arrays import median
 from slam.geometry.pnp import find_consensus
 from slam.geometry.se3 import Array, inverse
+from slam.tracks.config import AssociationConfig
+from slam.tracks.follow import Matches, match_everywhere
 
 _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
 _EACH = _AGREES / np.sqrt(2)  # the same of each coordinate in each of the two views, all equally exact
-
-
-#: Rows of features in one view and in another, in pairs.
-Rows = tuple[NDArray[np.intp], NDArray[np.intp]]
-NO_MATCHES: Rows = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,103 +32,71 @@ class View:
 
     points: Array  # ``(x, y, d)`` (N, 3), rectified pixel from the principal point and disparity [px]
     vertical: Array  # right row less left row (N,) [px]
-    descriptors: NDArray[np.float32]  # (N, D)
-    laplacian: NDArray[np.int8]  # (N,)
+    features: StereoFeatures
     T_world_left: Array  # pose of the rectified left camera (4, 4) as the system has it
 
     def __len__(self) -> int:
         return len(self.points)
 
-    @cached_property
-    def by_sign(self) -> dict[int, tuple[NDArray[np.intp], NDArray[np.float32]]]:
-        """Rows and descriptors of the features with each sign of the Laplacian."""
-        rows = {int(sign): np.flatnonzero(self.laplacian == sign) for sign in np.unique(self.laplacian)}
-        return {sign: (of_sign, self.descriptors[of_sign]) for sign, of_sign in rows.items()}
-
     @classmethod
     def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array, most: int) -> View:
-        """Of the strongest features as measured, in rectified pixels, `most` at the most, at a pose (4, 4)."""
+        """Of the strongest features, `most` at the most, in rectified pixels."""
         rows = np.flatnonzero(features.has_stereo)
         if len(rows) > most:
             rows = np.sort(rows[np.argsort(-features.response[rows], kind="stable")[:most]])
-        left, right = features.uv_left[rows], features.uv_right[rows]
-        points = model.points(np.column_stack([left, right[:, 0]]))
-        return cls(points, right[:, 1] - left[:, 1], features.descriptors[rows], features.laplacian[rows], T_world_left)
+        seen = features.select(rows)
+        points = model.points(np.column_stack([seen.uv_left, seen.uv_right[:, 0]]))
+        return cls(points, seen.uv_right[:, 1] - seen.uv_left[:, 1], seen, T_world_left)
 
 
-def match(first: View, second: View) -> Rows:
-    """Rows of features matched in two views: mutual nearest neighbours that pass the ratio test."""
-    if min(len(first), len(second)) < 2 or not first.descriptors.shape[1]:
-        return NO_MATCHES
-    found = []
-    for sign, (rows, looks) in first.by_sign.items():
-        if sign in second.by_sign:
-            others, other_looks = second.by_sign[sign]
-            i, j = _nearest(looks, other_looks)
-            found.append((rows[i], others[j]))
-    a, b = (np.concatenate([pair[k] for pair in found] or [np.zeros(0, np.intp)]) for k in (0, 1))
-    order = np.argsort(a)
-    return a[order], b[order]
+def match(first: View, second: View) -> Matches:
+    """Rows of features of two views that look alike; those of the first are the tracks."""
+    looks = first.features
+    return match_everywhere(looks.descriptors, looks.laplacian, second.features, AssociationConfig.wide_d_match, _RATIO)
 
 
-def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """`match` of unit descriptors (N, D) and (M, D), with the same sign of the Laplacian."""
-    likeness = first @ second.T
-    every, best = np.arange(len(first)), likeness.argmax(axis=1)
-    nearest, most = likeness[every, best], likeness.max(axis=0)
-    likeness[every, best] = -1.0
-    clear = 1 - nearest < _RATIO**2 * (1 - likeness.max(axis=1))  # of unit vectors, |a - b|² = 2 (1 - a·b)
-    rows = np.flatnonzero((nearest == most[best]) & clear)
-    first = np.empty(len(second), np.intp)
-    first[best[rows[::-1]]] = rows[::-1]
-    rows = rows[first[best[rows]] == rows]  # of equally near ones, the first
-    return rows, best[rows]
+class Pair(NamedTuple):
+    """The same still points in two views, corrected by what is known of the rig, and a first guess of the motion."""
+
+    first: Array  # ``(x, y, d)`` (N, 3) [px], d the disparity
+    second: Array
+    R: Array  # (3, 3), (3,) [baselines]: takes the first view's points to the second's
+    t: Array
 
 
 def pair_of(
-    model: RigModel, first: View, second: View, parameters: Array, noise: Array, seed: int, matched: Rows
+    model: RigModel, first: View, second: View, parameters: Array, noise: Array, seed: int, matched: Matches
 ) -> Pair:
     """Matches of two views that agree on one motion, and that motion.
 
-    The motion of the system's poses is tried first; others are tried only if most matches disagree with it.
-
-    The rig is corrected by `parameters` (n,). Of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
-    `seed` is of the random choice in the geometric check; `matched` are features that look alike.
+    The motion of the system's poses is tried first; others are tried only if most matches disagree with it. The rig is
+    corrected by `parameters` (n,). Of the `noise`, a point's covariance (3, 3) [px²], only the form matters. `seed` is
+    of the random choice in the geometric check.
     """
-    one, two = first.points[matched[0]], second.points[matched[1]]
-    ideal = [p + model.shift(p, parameters) for p in (one, two)]
+    seen = first.points[matched.tracks], second.points[matched.features]
+    one, two = (points + model.shift(points, parameters) for points in seen)
     T: Array = inverse(second.T_world_left) @ first.T_world_left
-    # 1.0: least disparity of a point that helps to find the motion [px]
-    near = (ideal[0][:, 2] > 1.0) & (ideal[1][:, 2] > 1.0)
+    near = (one[:, 2] > 1.0) & (two[:, 2] > 1.0)  # 1.0: least disparity of a point that helps to find the motion [px]
     rig = model.rig.rectified.rig
     if near.sum() >= 3:
-        before, after = (model.rows(p[near]) for p in ideal)
+        before, after = model.rows(one[near]), model.rows(two[near])
         local = rig.triangulate(before[:, :2], before[:, [2, 1]])
         # 100: poses tried in the geometric check of a pair of views
         found = find_consensus(rig, local, after, inverse(T), _AGREES, 100, seed)
         T = np.asarray(inverse(found.T_world_left))
     R, t = T[:3, :3], T[:3, 3] / rig.baseline
-    moved, J, _ = move(ideal[0], R, t, model.focal)
+    moved, J, _ = move(one, R, t, model.focal)
     with np.errstate(invalid="ignore"):
-        agree = (np.abs(moved - ideal[1]) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
+        agree = (np.abs(moved - two) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
     for _ in range(2):  # 2: times that motion and inliers are recomputed
-        fitted = fit_motion(ideal[0][agree], ideal[1][agree], R, t, model.focal, noise) if agree.sum() >= 3 else None
+        fitted = fit_motion(one[agree], two[agree], R, t, model.focal, noise) if agree.sum() >= 3 else None
         if fitted is None:
             break
         R, t = fitted.R, fitted.t
-        distance = linearised(ideal[0], ideal[1], ideal[0], R, t, model.focal, noise).squared
+        distance = linearised(one, two, one, R, t, model.focal, noise).squared
         # 16.3: χ²(3) at 99.9 %, largest squared distance of a match that agrees
         agree = distance <= 16.3 * median(distance[agree]) / chi_square_limit(3, 0.5)
     return Pair(one[agree], two[agree], R, t)
-
-
-class Pair(NamedTuple):
-    """The same still points in two views."""
-
-    first: Array  # ``(x, y, d)`` (N, 3) [px], d the disparity, as measured
-    second: Array
-    R: Array  # first guess of the motion (3, 3), (3,) [baselines] that takes the first view's points to the second's
-    t: Array
 
 
 class Linear(NamedTuple):
@@ -182,14 +145,11 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
 def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) -> Evidence | None:
     """The likelihood of the parameters from two views, with motion and points eliminated; None without a solution.
 
-    The problem is linearised in all of them at the motion and the points of `fit_motion`. Fields are taken at the
-    estimated points, not at the measured ones: else the noise would be correlated with the Jacobian, and the result
-    biased.
-
-    It is linearised at `parameters` (n,). Of the `noise`, a point's covariance (3, 3) [px²], only the form matters.
+    The problem is linearised at `parameters` (n,), of which the pair was corrected, and at the motion and the points of
+    `fit_motion`: at measured points, the noise would be correlated with the Jacobian, and the result biased. Of the
+    `noise`, a point's covariance (3, 3) [px²], only the form matters.
     """
-    first, second = (points + model.shift(points, parameters) for points in (pair.first, pair.second))
-    fit = fit_motion(first, second, pair.R, pair.t, model.focal, noise)
+    fit = fit_motion(*pair, model.focal, noise)
     if fit is None:
         return None
     at = fit.linear

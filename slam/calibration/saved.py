@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from slam.calibration.evidence import RecordingEvidence, RigEvidence, field_variance, residual_scale
+from slam.calibration.evidence import RigEvidence
 from slam.calibration.model import RigModel
-from slam.calibration.posterior import Prior, RigPosterior, factory_prior, solve, systematic_variance
+from slam.calibration.posterior import Prior, RigPosterior, factory_prior, solve
 from slam.errors import CalibrationError
 from slam.files import expanded, read_text, write_text
 from slam.geometry.rig import StereoRig
@@ -100,46 +100,28 @@ class SavedCalibration:
 _AGREES, CERTAIN = 2.0, 3.0
 
 
-def joint_calibration(
-    model: RigModel,
-    prior: Prior,
-    evidence: Sequence[RecordingEvidence],
-    systematic: float,
-    before: RigEvidence | None = None,
-) -> SavedCalibration:
-    """The calibration of a rig from several recordings.
+def joint_calibration(model: RigModel, prior: Prior, evidence: Sequence[RigEvidence]) -> SavedCalibration:
+    """The calibration of a rig from the evidence of several recordings, or of what saved calibrations hold.
 
-    Each recording has a systematic error of its own, which is added to its evidence and averages out over recordings.
     The residual fields are the rig's: all recordings share them, so they are marginalised after the recordings have
     been added up, and before the prior comes in. Left out until then, they would make recordings contradict each other
     in combinations that each of them hardly shows, such as a focal length that both cameras share.
 
-    Args:
-        model: the parameters' meaning.
-        prior: of the parameters.
-        evidence: of each recording, without any prior.
-        systematic: error of rows and disparities that all frames of a recording may share [px].
-        before: of earlier recordings, as a saved calibration holds it.
-
     Raises:
         CalibrationError: there is no evidence at all.
     """
-    variance = systematic_variance(model, systematic)
-    parts = [*([] if before is None else [before]), *(RigEvidence.of(one, variance) for one in evidence)]
-    if not parts:
+    if not evidence:
         raise CalibrationError("calibration: in no recording was there a motion that shows the rig's errors")
-    total = reduce(add, parts)
+    total = reduce(add, evidence)
     # The scales of the prior follow from the evidence as it is: the systematic errors would excuse a bad calibration.
-    fields = field_variance(residual_scale(total.scales))
-    together, known = (part.with_error(0.0 * variance, fields) for part in (total.plain, total.apart))
+    together, known = (part.with_error(np.zeros(len(part.e)), total.fields) for part in (total.plain, total.apart))
     return SavedCalibration(solve(prior, together, known), rig_numbers(model.rig), total)
 
 
-def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> Array | None:
+def agreement(model: RigModel, evidence: Sequence[RigEvidence]) -> Array | None:
     """The largest difference of two recordings in each parameter (n,) [standard deviations], by their own evidence.
 
-    NaN where fewer than two determine the parameter; None for a single recording. For the arguments see
-    `joint_calibration`.
+    NaN where fewer than two determine the parameter; None for a single recording.
 
     The prior, which they share, is no evidence of agreement. So each parameter's marginal posterior is divided by the
     prior, which gives that parameter's likelihood by the recording alone, with the others marginalised. A recording
@@ -147,11 +129,11 @@ def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic
     """
     if len(evidence) < 2:
         return None
-    prior, variance = factory_prior(model).covariances[-1], systematic_variance(model, systematic)
+    prior = factory_prior(model).covariances[-1]
     before = 1 / np.diag(prior)
     means, informations = [], []
     for recording in evidence:
-        part = recording.whole.with_error(variance, recording.fields)
+        part = recording.apart.with_error(np.zeros(len(before)), recording.fields)
         covariance = np.linalg.inv(np.linalg.inv(prior) + part.S)
         after = 1 / np.diag(covariance)
         said = np.where(after > 2 * before, after - before, np.nan)  # more than the prior does

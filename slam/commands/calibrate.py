@@ -22,6 +22,10 @@ from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 from slam.settings import require_settable
 
+_SIGN = (
+    "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the\n"
+    "calibration's principal point and focal length are too large."
+)
 _NARROW, _COLUMN = 42, 17  # characters of the table, and of each recording's column in it
 
 
@@ -57,7 +61,7 @@ def calibrate(
         _print(done)
         if opencv:
             print(f"The corrected calibration holds the corrections to {done.off:.3f} px, and no uncertainty.")
-        print(f"Use it: slam run SEQUENCE --calibration {out}")
+        print(f"Use it: slam run SEQUENCE --calibration {out}" if done.worth else f"File: {out}")
 
 
 def _print(done: Calibrated) -> None:
@@ -79,6 +83,7 @@ def _print(done: Calibrated) -> None:
             cells.append(f"{apart[row]:.1f} σ" if np.isfinite(apart[row]) else "–")
         table.add_row(name, unit, *cells)
     console.print(table)
+    print(_SIGN)
     for number, one in enumerate(done.found, 1):
         tells = "" if one.evidence is not None else ": no motion that shows anything, left out"
         console.print(f"({number}) {one.name}: {one.frames} frames, {one.pairs} pairs of views{tells}", markup=False)

@@ -30,7 +30,7 @@ RowArray = NDArray[np.intp]
 
 _EVEN = 0.01  # of the large changes of the turn from step to step: chance makes this in one of some 100,000
 _NEARLY = 0.1  # the same beside such a one, where a gap begins or ends between two poses: one of some 200
-_LARGE = 0.9  # quantile of the changes: even where most of a short path was interpolated, some tenth was not
+_LARGE = 0.9  # quantile of the changes: where most of a path was interpolated, some tenth was not; if all, see below
 _LEVER, _LEVER_SIGMA = 1.5, 1.0  # from the axle that does not steer forward to the camera [m]
 _SIGMAS = 3.0  # of what may seem to be a slip
 _LEAST = 1e-12  # numerics: change of the turn [rad] below which nothing can be told
@@ -135,7 +135,8 @@ def _slip(true: Trajectory, noise: TruthNoise) -> tuple[Array, Array]:
 def interpolated(true: Trajectory, noise: TruthNoise) -> BoolArray:
     """Which poses (N,) of a moving vehicle or camera were not measured: the steps to and from them turn by the same.
 
-    Without motion, by less than the noise of the truth, equal turns are no sign of it.
+    Without motion, by less than the noise of the truth, equal turns are no sign of it. What was measured turns by this
+    noise at least, so that a path of which every pose was interpolated is known without one that was not.
     """
     made_up = np.zeros(len(true), bool)
     if len(true) < 3 or not noise.covariance.any():
@@ -146,7 +147,7 @@ def interpolated(true: Trajectory, noise: TruthNoise) -> BoolArray:
     large = float(np.quantile(change, _LARGE))
     if large < _LEAST:
         return made_up
-    ratio = np.where(moves[:-1] & moves[1:], change / large, np.inf)
+    ratio = np.where(moves[:-1] & moves[1:], change / max(large, noise.rotation), np.inf)
     run = np.cumsum(ratio >= _NEARLY)  # the number of each run of nearly even changes
     made_up[1:-1] = (ratio < _NEARLY) & np.isin(run, run[ratio < _EVEN])
     made_up[0], made_up[-1] = made_up[1], made_up[-2]

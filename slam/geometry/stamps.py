@@ -65,6 +65,13 @@ def trim(partner: IntArray) -> slice:
     return slice(int(paired[0]), int(paired[-1]) + 1) if len(paired) else slice(0, 0)
 
 
+def require_frame(name: str, k: int, length: int) -> int:
+    """The number of a frame of the sequence `name` of so many frames; SequenceError where there is no frame k."""
+    if not isinstance(k, Integral) or not 0 <= k < length:
+        raise SequenceError(f"{name}: there is no frame {k}; it has {length}, from 0 on")
+    return int(k)
+
+
 def frame_range(start: int, stop: int | None, length: int) -> tuple[int, int]:
     """A checked range of frames: `stop` None or beyond the end means the end.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.checks import LATEST_STAMP
+from slam.checks import LATEST_STAMP, unit_doubt
 from slam.data import BoolArray, Estimate, FrameResult, ImagePair, Observations, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry.rig import StereoRig
@@ -36,7 +36,9 @@ def documented(features: Any, rig: StereoRig) -> StereoFeatures:
         raise MeasurementError(f"features must be StereoFeatures, got {type(features).__name__}")
     stamp, threshold = _number("stamp", features.stamp), _number("threshold", features.threshold)
     if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP:
-        raise MeasurementError(f"features: the stamp must be finite and within {LATEST_STAMP:g} s, got {stamp}")
+        raise MeasurementError(
+            f"features: the stamp must be finite and within {LATEST_STAMP:g} s, got {stamp}{unit_doubt(stamp)}"
+        )
     rows = len(features) if isinstance(features.uv_left, np.ndarray) and features.uv_left.ndim else 0
     columns: dict[str, Any] = {name: _column(name, getattr(features, name), rows) for name in _COLUMNS}
     size = np.array([rig.left.width, rig.left.height])

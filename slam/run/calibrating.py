@@ -12,7 +12,7 @@ import numpy as np
 
 from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
-from slam.calibration.evidence import RecordingEvidence
+from slam.calibration.evidence import RigEvidence
 from slam.calibration.posterior import factory_prior
 from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
@@ -60,7 +60,7 @@ class Found:
     unsolved: int  # pairs of views for which no motion was found
     matched: float  # number of landmarks found again in a frame, the median
     posterior: RigPosterior  # from this recording alone
-    evidence: RecordingEvidence | None  # without any prior; None where no motion was seen
+    evidence: RigEvidence | None  # without any prior; None where no motion was seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +72,7 @@ class Calibrated:
     apart: Array | None  # how far two differ at most, see `agreement`; None where one alone shows motion
     agreed: str  # the same in a line; empty for None
     judgement: str  # how good the calibration was, in a line; empty where that cannot be said
+    worth: bool  # whether correcting is expected to help
     off: float  # RMS distance [px] of the corrected calibration's pixels from the corrected pixels
     warning: str  # why little can be expected of it; empty for none
     units: Sequence[tuple[float, str]]  # of each parameter, a factor for people, and the unit that it then has
@@ -104,17 +105,17 @@ def calibrate(
     require_outputs([Output(file, option) for file, option in files if file is not None], inputs, overwrite)
     configs = [_config(sequence, settings) for sequence in sequences]
     found = [_run(sequence, config, frames, show) for sequence, config in zip(sequences, configs)]
-    model, systematic = RigModel(rig), configs[0].self_calibration.systematic
+    model = RigModel(rig)
     evidence = [one.evidence for one in found if one.evidence is not None]
-    kept = joint_calibration(model, factory_prior(model), evidence, systematic)
-    apart = agreement(model, evidence, systematic)
+    kept = joint_calibration(model, factory_prior(model), evidence)
+    apart = agreement(model, evidence)
     agreed = "" if apart is None else agreement_in_words(apart)
     corrected = corrected_rig(model, kept.posterior.mean)
     pairs, unsolved = sum(one.pairs for one in found), sum(one.unsolved for one in found)
     warning = _UNSOLVED.format(pairs=pairs, unsolved=unsolved) if unsolved > pairs else "" if pairs else _NO_PAIRS
     matched = float(np.median([one.matched for one in found]))
     noise = configs[0].models.pixel_sigma
-    judgement = "" if unsolved > pairs else _judged(model, kept.posterior, noise, matched, apart)
+    judgement, worth = ("", False) if unsolved > pairs else _judged(model, kept.posterior, noise, matched, apart)
     tree = kept.to_json() | {
         "recordings": [
             {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
@@ -128,11 +129,13 @@ def calibrate(
         write_opencv(opencv, corrected.rig)
     off = float(np.hypot(corrected.left_off, corrected.right_off))
     units = [_unit(name, unit, model.focal) for name, unit in zip(model.names, model.units)]
-    return Calibrated(found, kept, apart, agreed, judgement, off, warning, units)
+    return Calibrated(found, kept, apart, agreed, judgement, worth, off, warning, units)
 
 
-def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: float, apart: Array | None) -> str:
-    """What the errors of a calibration do to pixels and depths, and whether correcting them is expected to help.
+def _judged(
+    model: RigModel, posterior: RigPosterior, noise: float, matched: float, apart: Array | None
+) -> tuple[str, bool]:
+    """What the errors of a calibration do to pixels and depths, in words, and whether correcting is expected to help.
 
     The noise [px] of a feature averages out over those of a frame, `matched` of them; the rig's error is in all alike.
     Recordings that are `apart`, see `agreement`, do not speak of one rig; a single one may speak of itself.
@@ -142,7 +145,7 @@ def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: flo
     off = np.sqrt(np.square(fields @ posterior.mean).mean(axis=1))
     sigma = np.sqrt((fields @ posterior.covariance * fields).sum(axis=2).mean(axis=1))
     left = noise / np.sqrt(max(matched, 1.0))
-    beside = f"the noise of a frame's {matched:.0f} features leaves {left:.2f} px"
+    worth, beside = False, f"the noise of a frame's {matched:.0f} features leaves {left:.2f} px"
     if max(off) < left:
         word = f"This is good: {beside}."
     elif off[0] <= CERTAIN * sigma[0]:
@@ -158,14 +161,15 @@ def _judged(model: RigModel, posterior: RigPosterior, noise: float, matched: flo
     elif np.nanmax(apart, initial=0.0) > CERTAIN:
         word = "It is not worth correcting by these recordings, which do not agree."
     elif max(off) < noise:
-        word = f"This is worth correcting: {beside}."
+        worth, word = True, f"This is worth correcting: {beside}."
     else:
-        word = f"This is bad: calibrate anew. The noise of one feature is {noise:g} px."
-    return (
+        worth, word = True, f"This is bad: calibrate anew. The noise of one feature is {noise:g} px."
+    text = (
         f"By this the calibration is off by {off[0]:.2f} ± {sigma[0]:.2f} px in disparity and {off[1]:.2f} ± "
         f"{sigma[1]:.2f} px in rows (RMS over the image), so that at {_AWAY:g} baselines depths are "
         f"{100 * off[0] * _AWAY / model.focal:.1f} % wrong. {word}"
     )
+    return text, worth
 
 
 def _unit(name: str, unit: str, focal: float) -> tuple[float, str]:

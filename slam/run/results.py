@@ -135,6 +135,7 @@ _NOT_JUDGED = (
     "covariances cannot be judged: they leave none for the motion between two poses, as where a back end claims the "
     "same one for every frame"
 )
+_DOUBTFUL = "covariances cannot be judged: the true path is doubtful, as where it was interpolated over a gap"
 
 
 def figures(summary: Mapping[str, Any]) -> dict[str, float]:
@@ -230,10 +231,17 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
 def verdict_of_run(summary: Mapping[str, Any]) -> str:
     """`verdict` on a run by its summary, with what it leaves out; empty where no true path is known."""
     text, honest = verdict(figures(summary)), summary.get("consistency") or {}
+    doubtful = {over: honest.get(f"doubtful truth {over}", 0.0) for over in _NEES.values()}
+    doubtful = {over: share for over, share in doubtful.items() if share}
     if not text:
-        return "" if not honest.get("dof") else _IN_MAP if _at(summary, "loops/known") else _NOT_JUDGED
+        if not honest.get("dof"):
+            return ""
+        return _IN_MAP if _at(summary, "loops/known") else _DOUBTFUL if doubtful else _NOT_JUDGED
     if "are too large" in text and honest.get(EXACT):
         text += "; they count errors of the calibration, and this world's cameras have none"
+    if doubtful:
+        over, share = next(iter(doubtful.items()))
+        text += f"; not judged: {100 * share:.0f} % of the stretches {over}, where the true path is doubtful"
     if left_out := summary["frames"] - _measured(summary):
         text += f"; not judged: {left_out} of {summary['frames']} frames, whose pose was not measured"
     return text

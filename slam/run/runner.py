@@ -294,7 +294,9 @@ class _Run:
         options, record, rig = self.options, self.record, self.sequence.rig
         warnings = getattr(self.system, "warnings", ())
         driving = options.kind == "driving"
-        doubt = scale_doubt(record, rig, driving) or motion_doubt(record, options.config.models.motion, driving)
+        calibration = getattr(self.system, "calibration", None)
+        doubt = scale_doubt(record, rig, driving) or getattr(calibration, "doubt", "")
+        doubt = doubt or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
         tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving)
         if doubt and not tracking:

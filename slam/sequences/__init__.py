@@ -146,7 +146,7 @@ def _format(folder: Path, query: str, text: str) -> str | None:
         raise SequenceError(f"{folder}: there is no such {what}{hints.near_name(folder, text)}")
     if not folder.is_dir() and "layout" not in named:
         film = folder.suffix.lower() in VIDEO_SUFFIXES
-        hint = "; unpack it first" if folder.suffix.lower() in _PACKED else ""
+        hint = "; unpack it first" if folder.suffix.lower() in _PACKED else hints.of_run(folder.parent)
         if film:
             hint = f"; a video with both images side by side is {folder}?layout=sbs, two are {folder.parent}"
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}{'?left=…&right=…' * film}")

@@ -15,7 +15,7 @@ from slam.errors import ConfigurationError, SequenceError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig, quarter_turn
 from slam.geometry.se3 import Array
-from slam.geometry.stamps import frame_range
+from slam.geometry.stamps import frame_range, require_frame
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import sequence_line
 from slam.sequences.faults import FaultLog
@@ -136,6 +136,16 @@ class RecordedSequence:
             with FaultLog(self.warnings) as faults:
                 faults.report("frames", f"{self.name}: frames {start}:{stop} asked for, it has {len(self)}")
         return self._read(first, last)
+
+    def frame(self, k: int) -> StereoFrame:
+        """Frame k alone, as ``sequence[k]``; SequenceError where there is none, or its left image is unreadable."""
+        first = require_frame(self.name, k, len(self))
+        found = next(self._read(first, first + 1), None)
+        if found is None:
+            raise SequenceError(f"{self.name}: the left image of frame {first} cannot be read (see its warnings)")
+        return found
+
+    __getitem__ = frame
 
     def _read(self, start: int, stop: int) -> Iterator[StereoFrame]:
         """Decode lazily and sum up repeated faults at the end, also where the caller stops early.

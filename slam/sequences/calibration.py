@@ -1,12 +1,13 @@
-"""Calibration files of all forms as nested entries, and the matrices in them.
+"""Calibration files of any program as one table of entries: their names, and the readers of every form.
 
-Files may be hostile: YAML is bounded in depth and read without aliases and tags, XML without entities.
+Every form says the same few things under other names, which `_SPELLINGS` has. Files may be hostile: YAML is bounded in
+depth and read without aliases and tags, XML without entities.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from configparser import ConfigParser
 from configparser import Error as ConfigParserError
 from contextlib import contextmanager
@@ -18,13 +19,61 @@ import numpy as np
 
 from slam.errors import CalibrationError
 from slam.files import read_text
-from slam.geometry.camera import PinholeCamera
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, pose
 from slam.sequences.images import Size, size_text
 
-#: What making an array of numbers raises where the values are none: text, ragged lists, numbers of 400 digits.
-NO_NUMBERS = (ValueError, TypeError, OverflowError)
+#: Names of entries, in lower case, letters and digits only, without the side: K1, cameraMatrix1, camera_matrix_left,
+#: LEFT.K, cam0/intrinsics and Camera1.fx are all found.
+_SPELLINGS: dict[str, tuple[str, ...]] = {
+    "K": ("k", "m", "kk", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix"),
+    "D": ("d", "kc", "distcoeffs", "dist", "distortion", "distortioncoeffs", "distortioncoefficients",
+          "distortioncoeff", "coeffs"),
+    "P": ("p", "projectionmatrix", "projection"),
+    "R_rect": ("r", "rectificationmatrix"),
+    "T_BS": ("tbs", "timucam", "bodyt"),
+    "T_cam_imu": ("tcamimu",),
+    "R": ("r", "rot", "om", "rotation", "rotationmatrix", "stereor", "rstereo"),
+    "T": ("t", "trans", "translation", "translationvector", "stereot", "tstereo"),
+    "T_cn_cnm1": ("cam1tcncnm1",),
+    "T_c1_c2": ("stereotc1c2",),
+    "width": ("imagewidth", "width", "cols"),
+    "height": ("imageheight", "height", "rows"),
+    "size": ("imagesize", "size", "imgsize", "resolution"),
+    "baseline": ("baseline", "base", "baselinem", "stereob"),
+    "bf": ("bf", "focalxbaseline"),
+    "fx": ("fx", "f", "focal", "focallength", "fxpx"),
+    "fy": ("fy", "f", "focal", "focallength", "fypx"),
+    "cx": ("cx", "ppx", "cu", "u0", "cxpx"),
+    "cy": ("cy", "ppy", "cv", "v0", "cypx"),
+    "distortion model": ("distortionmodel",),
+    "camera model": ("cameramodel", "model", "cameratype", "modeltype"),
+}  # fmt: skip
+_GROUPS = ("stereorectifier", "extrinsics", "extrinsic", "intrinsics", "intrinsic", "parameters",
+           "projectionparameters", "distortionparameters")  # of entries, whose names say nothing  # fmt: skip
+_OF_ONE = ("tbs", "cameramatrix", "projectionmatrix", "p")  # names that a file of one camera has
+_FROM_ZERO = ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx")  # one of these: cameras are counted from 0
+
+#: Whose a form is: entries that only it has, and what a complete file of it holds.
+_FORMS = {
+    "Kalibr's": (
+        ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel", "cam1cameramodel"),
+        "cam0 and cam1, each with intrinsics and resolution, and T_cn_cnm1 in cam1",
+    ),
+    "EuRoC's": (("lefttbs",), "intrinsics, resolution and T_BS, in two files"),
+    "ROS's": (("leftcameramatrix", "leftp"), "camera_matrix, rectification_matrix and projection_matrix, in two files"),
+    "ORB-SLAM's": (
+        ("camerabf", "stereotc1c2", "stereob", "camera1fx"),
+        "Camera.bf for rectified images, LEFT.K … and RIGHT.K …, or Camera1.fx …, Camera2.fx … and Stereo.T_c1_c2",
+    ),
+    "stella_vslam's": (("camerafocalxbaseline",), "Camera.fx … and Camera.focal_x_baseline"),
+    "VINS-Fusion's": (("bodytcam0",), "cam0_calib and cam1_calib, files that are there, body_T_cam0 and body_T_cam1"),
+    "Basalt's": (("value0intrinsics",), "other entries than are read here: write it in another form"),
+    "MATLAB's": (
+        ("cameraparameters1intrinsicmatrix", "cameraparameters1k"),
+        "matrices that are transposed, and lengths in mm: write it in another form",
+    ),
+}
+_COMPLETE = "K1, D1, K2, D2, R and T; one of rectified images P1 and P2, or fx, fy, cx, cy and baseline"
 
 _ZED_SIZES = {"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200), "HD": (1280, 720), "SVGA": (960, 600),
               "VGA": (672, 376)}  # fmt: skip
@@ -33,6 +82,8 @@ _NO_TEXT = (".npz", ".npy", ".pkl", ".mat")  # of NumPy, Python and MATLAB
 _DEEPEST = 32  # of nested entries
 _MOST = 1e9  # numbers of a calibration are smaller than this; larger ones overflow in what is made of them
 _LIMIT = 4 * 2**20  # most bytes of a file: OpenCV's sample programs keep all corners of all images in it
+
+Entry = tuple[str, Any]  # an entry's name as written, and its value
 
 
 @contextmanager
@@ -44,23 +95,18 @@ def naming(path: Path) -> Iterator[None]:
         raise CalibrationError(f"{path}: {error}") from error
 
 
-def read_calibration(path: Path) -> str:
-    """A calibration file's text; CalibrationError where it is missing, cannot be read, or is too large for one."""
-    if not path.exists():
-        raise CalibrationError(f"{path}: the calibration is missing")
-    return read_text(path, _LIMIT, CalibrationError)
-
-
 def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
-    """A finite array of the shape, flat where that is None; CalibrationError where it is none, or too large.
+    """A finite array of the shape, flat where that is None; CalibrationError where it is missing, none, or too large.
 
     Numbers may be texts. OpenCV's matrices are ``{rows, cols, data}``.
     """
+    if value is None:
+        raise CalibrationError(f"{name} is missing")
     data = value.get("data") if isinstance(value, Mapping) else value
     try:
         numbers = np.array(data.split() if isinstance(data, str) and shape != () else data, dtype=float)
         numbers = numbers.reshape(-1 if shape is None else shape)
-    except NO_NUMBERS:
+    except (ValueError, TypeError, OverflowError):  # text, ragged lists, numbers of 400 digits
         what = "no number" if shape == () else "no matrix" + (f" of shape {shape}" if shape else "")
         raise CalibrationError(f"{name} is {what}") from None
     if not np.isfinite(numbers).all():
@@ -70,18 +116,126 @@ def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
     return numbers
 
 
-def rigid(T: Array, name: str) -> Array:
-    """The rigid motion (4, 4); CalibrationError where its rotation is none."""
-    R = T[:3, :3]
-    if np.abs(R).max() > 1.01 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise CalibrationError(f"{name} is not a rigid motion: its rotation is {R.tolist()}")
-    return T
+class Entries:
+    """The entries of calibration files by their names in lower case, letters and digits only.
+
+    Of two files of one camera each the first is the left one's. Whose `form` it is, as ``"Kalibr's"``, the entries tell
+    where it is empty. OpenCV's, and five plain numbers, have none: of these alone unit and lens may be another one.
+    """
+
+    def __init__(self, files: Sequence[Mapping[str, Entry]], form: str = "") -> None:
+        self._values: dict[str, Entry] = {}
+        single = len(files) == 2 and any(all(n in f for f in files) for n in _OF_ONE)
+        for side, file in zip(("left", "right"), files):
+            self._values |= {(side + name if single else name): entry for name, entry in file.items()}
+        found = (known for known, (names, _) in _FORMS.items() if any(name in self._values for name in names))
+        self.form = form or next(found, "")
+        counts = ("0", "1") if any(name in self._values for name in _FROM_ZERO) else ("1", "2")
+        self._sides = [
+            (word, word[0], count, f"cam{side}", f"camera{count}", f"{word}camera")
+            for side, (word, count) in enumerate(zip(("left", "right"), counts))
+        ]
+
+    def find(self, role: str, side: int | None = None) -> Entry | None:
+        """An entry, of a camera (0 left, 1 right) or of the pair; None where there is none."""
+        spellings = _SPELLINGS.get(role, (role,))
+        if side is None:
+            names = [*spellings, *(f"camera{s}" for s in spellings)]
+        else:
+            names = [name for s in spellings for token in self._sides[side] for name in (s + token, token + s)]
+        least = 2 if role == "K" else 1  # words; k1 and k2 alone are coefficients of distortion
+        there = (entry for n in names if (entry := self._values.get(n)) is not None and entry[1] is not None)
+        return next((e for e in there if not isinstance(e[1], str) or len(e[1].split()) >= least), None)
+
+    def numbers(self, role: str, side: int | None, shape: tuple[int, ...] | None) -> Array | None:
+        """A finite array of this shape, flat where that is None; None where there is no such entry."""
+        found = self.find(role, side)
+        return None if found is None else array(found[1], found[0], shape)
+
+    def number(self, role: str, side: int | None = None, default: float | None = None) -> float:
+        """One finite number; CalibrationError where it is none, or missing and there is no default."""
+        name, value = self.find(role, side) or (role, default)
+        return float(array(value, name, ())[()])
+
+    def incomplete(self, missing: Sequence[str]) -> CalibrationError:
+        """The error where roles are missing, in the words of the form; all entries are named as they are written."""
+        there = f"in it: {', '.join(sorted(name for name, _ in self._values.values())) or 'nothing'}"
+        if self.form in _FORMS:
+            return CalibrationError(f"it looks like {self.form}, which has {_FORMS[self.form][1]}; {there}")
+        one = " (it is one camera's: name both files, calibration=LEFT,RIGHT)" * ("cameramatrix" in self._values)
+        verb = "is" if len(missing) == 1 else "are"
+        return CalibrationError(
+            f"{', '.join(missing)} {verb} missing{one}; {there}. A stereo calibration has {_COMPLETE}"
+        )
+
+
+def read_entries(paths: Sequence[Path], images: Size | None) -> Entries:
+    """The entries of one file or two, read by the XML, INI and YAML libraries: OpenCV's reader can crash.
+
+    The size of the images, where it is known, chooses one of several resolutions. CalibrationError where a file is
+    missing or unreadable.
+    """
+    read = [_read(path, images) for path in paths]
+    return Entries([dict(_flat(root, "", "")) for root, _ in read], read[0][1] if len(read) == 1 else "")
+
+
+def _flat(node: Mapping[str, Any], written: str, plain: str) -> Iterator[tuple[str, Entry]]:
+    """Entries of nested mappings, their names joined; matrices are values."""
+    for key, value in node.items():
+        name = plain_name(key)
+        if isinstance(value, Mapping) and "data" not in value:
+            yield from _flat(value, f"{written}{key}/", plain + ("" if name in _GROUPS else name))
+        else:
+            yield plain + name, (f"{written}{key}", value)
+
+
+def plain_name(name: Any) -> str:
+    """A name in lower case, letters and digits only."""
+    return "".join(filter(str.isalnum, str(name).lower()))
+
+
+def _read(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
+    """What a file holds, and whose form it is where its entries do not tell; CalibrationError where it is no rig's."""
+    if path.suffix.lower() in _NO_TEXT:
+        raise CalibrationError(f"{path}: no text: write K1, D1, K2, D2, R and T with cv2.FileStorage (docs/guide.md)")
+    text = _text(path).strip()
+    with naming(path):
+        if text.startswith("<"):
+            return _read_xml(text), ""
+        if text.startswith("[") and "[STEREO]" in text.upper():
+            return _read_zed(text, images), "ZED's"
+    if kitti := _KITTI.search(text):
+        rows = read_kitti(path)
+        return {f"P{i}": rows.get(f"{kitti[1]}{i}") for i in (0, 1)} | {"size": rows.get("S_rect_00")}, "KITTI's"
+    root = read_yaml(path)
+    with naming(path):
+        if {"evidence", "residual_scale", "self_calibration"} & set(root):
+            what = "errors of a rig, as `slam calibrate` or a run found them, not a rig: see --calibration"
+            raise CalibrationError(what)
+        if "cameraData" in root:
+            return _read_depthai(root), "depthai's"
+    cameras = {side: path.parent / str(root.get(f"cam{at}_calib", "")) for at, side in enumerate(("left", "right"))}
+    if all(file.is_file() for file in cameras.values()):  # VINS-Fusion's, with a file for each camera
+        return {**root, **{side: read_yaml(file) for side, file in cameras.items()}}, ""
+    return root, ""
+
+
+def _text(path: Path) -> str:
+    """A calibration file's text; CalibrationError where it is missing, cannot be read, or is too large for one."""
+    if not path.exists():
+        raise CalibrationError(f"{path}: the calibration is missing")
+    return read_text(path, _LIMIT, CalibrationError)
+
+
+def is_kitti(path: Path) -> bool:
+    """Whether a file is of KITTI's form; CalibrationError where it cannot be read."""
+    return _KITTI.search(_text(path)) is not None
 
 
 def read_kitti(path: Path) -> dict[str, Array]:
     """The rows ``name: numbers`` of a file of KITTI's, colons or none; CalibrationError where there are none."""
     rows: dict[str, Array] = {}
-    for line in read_calibration(path).splitlines():
+    for line in _text(path).splitlines():
         name, _, rest = line.replace(":", " ", 1).strip().partition(" ")
         try:
             rows[name] = np.array([float(word) for word in rest.split()])
@@ -92,61 +246,6 @@ def read_kitti(path: Path) -> dict[str, Array]:
     return rows
 
 
-def kitti_matrix(rows: Mapping[str, Array], name: str, shape: tuple[int, ...]) -> Array:
-    """One finite matrix of a KITTI calibration; CalibrationError where it is missing or none."""
-    if name not in rows:
-        raise CalibrationError(f"{name} is missing")
-    return array(rows[name], name, shape)
-
-
-def rig_from_projections(P_left: Array, P_right: Array, size: tuple[int, int]) -> StereoRig:
-    """The rig of two rectified projections ``P = K [I | t]`` (3, 4) from one frame of reference."""
-    b = projection_offset(P_right) - projection_offset(P_left)
-    b[np.abs(b) < 1e-3 * np.abs(b).max()] = 0  # across the baseline: rounding of the file
-    left, right = (PinholeCamera(P[0, 0], P[1, 1], P[0, 2], P[1, 2], *size) for P in (P_left, P_right))
-    return StereoRig.side_by_side(left, right, np.eye(3), b)
-
-
-def projection_offset(P: Array) -> Array:
-    """``K⁻¹ p₄`` (3,) [m], the frame of reference's place in this camera's axes; CalibrationError for no such P."""
-    K = P[:, :3]
-    zeros = np.abs([K[0, 1], K[1, 0], K[2, 0], K[2, 1]]).max()
-    if not (K[0, 0] > 0 and K[1, 1] > 0) or K[2, 2] != 1 or zeros > 0:
-        raise CalibrationError(f"not a rectified projection matrix: {P.tolist()}")
-    return np.asarray(np.linalg.solve(K, P[:, 3]), np.float64)
-
-
-def read_form(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
-    """What a file holds, and whose form it is where its entries do not tell; CalibrationError where it is no rig's."""
-    if path.suffix.lower() in _NO_TEXT:
-        raise CalibrationError(f"{path}: no text: write K1, D1, K2, D2, R and T with cv2.FileStorage (docs/guide.md)")
-    text = read_calibration(path).strip()
-    if text.startswith("<"):
-        return _read_xml(path, text), ""
-    with naming(path):
-        if text.startswith("[") and "[STEREO]" in text.upper():
-            return _read_zed(text, images), "ZED's"
-        if kitti := _KITTI.search(text):
-            rows = read_kitti(path)
-            return {f"P{i}": rows.get(f"{kitti[1]}{i}") for i in (0, 1)} | {"size": rows.get("S_rect_00")}, "KITTI's"
-    root = read_yaml(path)
-    if {"evidence", "residual_scale", "self_calibration"} & set(root):
-        what = "errors of a rig, as `slam calibrate` or a run found them, not a rig: see --calibration"
-        raise CalibrationError(f"{path}: {what}")
-    if "cameraData" in root:
-        with naming(path):
-            return _read_depthai(root), "depthai's"
-    cameras = {side: path.parent / str(root.get(f"cam{at}_calib", "")) for at, side in enumerate(("left", "right"))}
-    if all(file.is_file() for file in cameras.values()):  # VINS-Fusion's, with a file for each camera
-        return {**root, **{side: read_yaml(file) for side, file in cameras.items()}}, ""
-    return root, ""
-
-
-def is_kitti(path: Path) -> bool:
-    """Whether a file is of KITTI's form; CalibrationError where it cannot be read."""
-    return _KITTI.search(read_calibration(path)) is not None
-
-
 def read_yaml(path: Path) -> Mapping[str, Any]:
     """The mapping in a YAML (or JSON) file, all values as texts; CalibrationError where there is none, or too much.
 
@@ -154,7 +253,7 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
     """
     import yaml
 
-    text = read_calibration(path)
+    text = _text(path)
     if text.startswith("%YAML:"):
         text = "\n" + text.partition("\n")[2]  # rows keep their numbers
     text = re.sub(r"(?i)(?<!\w)\.(nan|inf)\b", r"\1", text)
@@ -176,15 +275,14 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
     return root
 
 
-def _read_xml(path: Path, text: str) -> dict[str, Any]:
+def _read_xml(text: str) -> dict[str, Any]:
     """The entries of a storage in XML: texts, and the parts of matrices."""
     if "<!" in text.replace("<!--", ""):  # OpenCV writes no entities, which may stand for gigabytes
-        raise CalibrationError(f"{path}: a calibration has no document type and no entities")
+        raise CalibrationError("a calibration has no document type and no entities")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:  # ValueError: a declared encoding that is none
-        row = f", row {error.position[0]}" if isinstance(error, ElementTree.ParseError) else ""
-        raise CalibrationError(f"{path}{row}: no valid XML") from error
+        raise CalibrationError(f"no valid XML: {error}") from error
     return {node.tag: {part.tag: part.text or "" for part in node} if len(node) else node.text or "" for node in root}
 
 
@@ -195,20 +293,17 @@ def _read_zed(text: str, images: Size | None) -> dict[str, Any]:
         parser.read_string(text)
     except ConfigParserError as error:
         raise CalibrationError(f"no valid file of a ZED: {error}") from error
-    there = [name for name in _ZED_SIZES if parser.has_section(f"LEFT_CAM_{name}")]
-    name = next((n for n in there if images is None or _ZED_SIZES[n] == images), None)
-    if name is None or (images is None and len(there) > 1):
-        sizes = ", ".join(size_text(_ZED_SIZES[n]) for n in there) or "none that is known"
+    there = {name: size for name, size in _ZED_SIZES.items() if parser.has_section(f"LEFT_CAM_{name}")}
+    fitting = [name for name, size in there.items() if images in (None, size)]
+    if len(fitting) != 1:
+        sizes = ", ".join(map(size_text, there.values())) or "none that is known"
         given = f"another size than {size_text(images)}" if images else "several sizes: give size=(width, height)"
         raise CalibrationError(f"it is a ZED's, for images of {given}; it has {sizes}")
-    stereo = parser["STEREO"]
-    keys = (*((key, key) for key in ("baseline", "ty", "tz")), *((f"{key}_{name}", key) for key in ("rx", "cv", "rz")))
-    try:
-        baseline, ty, tz, *turn = (float(stereo.get(own, stereo.get(key, "0"))) for own, key in keys)
-    except ValueError as error:
-        raise CalibrationError(f"[STEREO]: {error}") from error
+    (name,), stereo = fitting, parser["STEREO"]
+    T = [array(stereo.get(key, "0"), key, ()) * sign for key, sign in (("baseline", -1e-3), ("ty", 1e-3), ("tz", 1e-3))]
+    turn = [array(stereo.get(f"{key}_{name}", stereo.get(key, "0")), key, ()) for key in ("rx", "cv", "rz")]
     sides = {side: dict(parser[f"{side}_CAM_{name}"]) for side in ("LEFT", "RIGHT") if f"{side}_CAM_{name}" in parser}
-    return sides | {"R": turn, "T": [-0.001 * baseline, 0.001 * ty, 0.001 * tz], "size": list(_ZED_SIZES[name])}
+    return sides | {"R": turn, "T": T, "size": list(there[name])}
 
 
 def _read_depthai(root: Mapping[str, Any]) -> dict[str, Any]:
@@ -216,8 +311,7 @@ def _read_depthai(root: Mapping[str, Any]) -> dict[str, Any]:
     T, named = None, {}
     try:
         cameras = {int(socket): camera for socket, camera in root["cameraData"]}
-        pair = root.get("stereoRectificationData")
-        pair = pair if isinstance(pair, Mapping) else {}
+        pair = root.get("stereoRectificationData") or {}
         sockets = [int(pair.get(f"{side}CameraSocket", default)) for side, default in (("left", 1), ("right", 2))]
         for side, (own, other) in (("left", sockets), ("right", sockets[::-1])):
             camera, extrinsics = cameras[own], cameras[own]["extrinsics"]
@@ -225,9 +319,9 @@ def _read_depthai(root: Mapping[str, Any]) -> dict[str, Any]:
             named[side]["camera_model"] = "fisheye" if camera.get("cameraType") == "1" else "pinhole"
             if int(extrinsics["toCameraSocket"]) == other and T is None:
                 t = [0.01 * float(extrinsics["translation"][axis]) for axis in "xyz"]
-                T = pose(np.array(extrinsics["rotationMatrix"], float).reshape(3, 3), np.array(t))
+                T = pose(array(extrinsics["rotationMatrix"], "rotationMatrix", (3, 3)), np.array(t))
                 T = T if side == "left" else inverse(T)
-    except (LookupError, AttributeError, *NO_NUMBERS) as error:
+    except (LookupError, AttributeError, ValueError, TypeError, OverflowError) as error:
         raise CalibrationError(f"it is depthai's, but a camera of the pair is missing or damaged ({error})") from error
     if T is None:
         raise CalibrationError("it is depthai's, but says nothing of how the pair stands to each other")

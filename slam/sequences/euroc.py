@@ -9,13 +9,12 @@ import numpy as np
 from slam.errors import CalibrationError, SequenceError, TrajectoryError
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence
-from slam.sequences.calibration import naming
-from slam.sequences.calibration_keys import body_pose, read_entries
+from slam.sequences.calibration import naming, read_entries
 from slam.sequences.faults import FaultLog
 from slam.sequences.names import stem
 from slam.sequences.options import Options
 from slam.sequences.pairs import Listing, image_names, image_pairs, in_order, listed, pair_up, told_times
-from slam.sequences.rigs import calibration_files, read_rig
+from slam.sequences.rigs import body_pose, calibration_files, read_rig
 from slam.sequences.tables import MOST_NANOSECONDS, read_rows, require_truth, shorten
 
 #: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
@@ -109,7 +108,8 @@ def _ground_truth(root: Path, calibration: list[Path], faults: FaultLog) -> Traj
                 with naming(calibration[0]):
                     T_body_camera = body_pose(read_entries(calibration, None), 0)
                 bodies = Trajectory.read_euroc(path)
-                return require_truth(Trajectory(bodies.stamps, bodies.poses @ T_body_camera), path)
+                poses = bodies.poses if T_body_camera is None else bodies.poses @ T_body_camera
+                return require_truth(Trajectory(bodies.stamps, poses), path)
             except (TrajectoryError, SequenceError, CalibrationError) as error:
                 faults.report("ground truth", f"{error}; there is no ground truth")
     return None

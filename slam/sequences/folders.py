@@ -97,20 +97,33 @@ def _two_cameras(folder: Path) -> list[Side] | None:
     inside = _inside(folder)
     places = [p.name for p in inside if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES]
     for words in SIDES:  # these alone, before names that hold them
-        exact = [[name for name in places if name.lower().partition(".")[0] == word] for word in words]
+        exact = [[name for name in places if _word(name) == word] for word in words]
         if all(exact):
             return [Side(folder / min(names)) for names in exact]
     found = of_sides(places)
     if found and len(found[0]) == len(found[1]) == 1:
         return [Side(folder / names[0]) for names in found]
-    images = of_sides([p.name for p in inside if p.suffix.lower() in IMAGE_SUFFIXES])
-    return None if images is None else [Side(folder, sorted(names, key=natural)) for names in images]
+    names = [p.name for p in inside if p.suffix.lower() in IMAGE_SUFFIXES]
+    images = of_sides(names)
+    few = images is not None and 2 * sum(map(len, images)) < len(names)  # cam0.png and cam1.png of cam0.png … cam99.png
+    return None if images is None or few else [Side(folder, sorted(names, key=natural)) for names in images]
+
+
+def _word(name: str) -> str:
+    """A name without its ending as `SIDES` has it: ``Camera_0`` is ``camera0``."""
+    return name.lower().partition(".")[0].replace("_", "").replace("-", "").replace(" ", "")
+
+
+def is_side(path: Path) -> bool:
+    """Whether a folder is one of the two cameras of the folder that it is in."""
+    both = _two_cameras(path.parent)
+    return both is not None and path in [side.path for side in both]
 
 
 def _called(folder: Path, side: int) -> Path | None:
     """What is called as the cameras of one side usually are, though the other side is missing."""
     names = {words[side] for words in SIDES} - {words[1 - side] for words in SIDES}
-    usual = (path for path in sorted(_inside(folder)) if path.stem.lower() in names)
+    usual = (path for path in sorted(_inside(folder)) if _word(path.name) in names)
     return next((path for path in usual if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES), None)
 
 

@@ -7,7 +7,8 @@ from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
-from slam.errors import SequenceError
+from slam.errors import SequenceError, SlamError
+from slam.files import read_object
 from slam.naming import nearest
 from slam.sequences.images import IMAGE_SUFFIXES
 
@@ -30,8 +31,23 @@ def near_name(folder: Path, text: str) -> str:
     return "" if there == folder.parent else f": {there} has no {folder.relative_to(there).parts[0]!r}"
 
 
+def of_run(folder: Path) -> str:
+    """What a folder that a run left was a run of, and what shows it."""
+    files = folder / "config.json", folder / "frames.csv"
+    if not all(file.is_file() for file in files):
+        return ""
+    with suppress(SlamError):
+        source = read_object(files[0]).get("source") or "something"
+        return f"; it is what a run of {source} left: give that, or look at the run with `slam view {folder.name}`"
+    return ""
+
+
 def sequences_near(folder: Path, format_of: Format) -> str:
     """Which sequences lie below a folder, or it is a part of; else how to name the two cameras in it."""
+    from slam.sequences.folders import is_side
+
+    if run := of_run(folder):
+        return run
     below = sorted(str(path.relative_to(folder)) for path in _below(folder, format_of))
     if below:
         more = f", … ({len(below)})" if len(below) > _LISTED else ""
@@ -41,8 +57,9 @@ def sequences_near(folder: Path, format_of: Format) -> str:
             else f"is {below[0]}: give that"
         )
         return f"; below it {there}"
-    for parent in islice(folder.parents, _LEVELS):
-        if (name := _format(parent, format_of)) is not None:
+    for part in islice((folder, *folder.parents), _LEVELS):
+        parent, name = part.parent, _format(part.parent, format_of)
+        if name is not None and (name != "folders" or is_side(part)):
             return f"; it is a part of one: give {parent} (format {name})"
     if any(path.suffix.lower() in IMAGE_SUFFIXES for path in _inside(folder)):
         return f"; where each image holds both cameras: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"

@@ -17,20 +17,13 @@ from slam.geometry.se3 import Array, about, inverse, pose
 from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence
-from slam.sequences.calibration import (
-    kitti_matrix,
-    naming,
-    projection_offset,
-    read_kitti,
-    rig_from_projections,
-    rigid,
-)  # fmt: skip
+from slam.sequences.calibration import array, naming, read_kitti
 from slam.sequences.faults import FaultLog
 from slam.sequences.images import Size, size_text
 from slam.sequences.names import stem
 from slam.sequences.options import Options
-from slam.sequences.pairs import image_names, image_pairs, listed, pair_up, told_times
-from slam.sequences.rigs import calibration_files, read_rig
+from slam.sequences.pairs import Times, image_names, image_pairs, listed, pair_up, told_times
+from slam.sequences.rigs import calibration_files, projection_offset, read_rig, rig_from_projections, rigid
 from slam.sequences.tables import date_time, numbers, read_rows, require_truth, shorten
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 2 cm, 0.03° in roll and pitch, and 0.1°
@@ -82,11 +75,12 @@ def open_drive(folder: Path, options: Options, faults: FaultLog) -> RecordedSequ
 
 def _open(folder: Path, where: Layout, options: Options, faults: FaultLog) -> RecordedSequence:
     left, right = listed(where.folders, [image_names(images) for images in where.folders], faults)
-    origin, times = None, None
+    origin = None
     if where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options):
         dates = read_rows(where.times, date_time, faults)
         origin = next(date for date in dates if date is not None)
-        times = where.times, np.array([np.nan if date is None else (date - origin) * 1e-9 for date in dates])
+        seconds = np.array([np.nan if date is None else (date - origin) * 1e-9 for date in dates])
+        times: Times | None = Times(where.times, seconds, [])
     else:
         times = told_times(folder, options, faults, where.times)
     pairs = pair_up(left, right, options, faults, times, by_number=True)
@@ -160,15 +154,15 @@ def _rig(folder: Path, where: Layout, size: Size, options: Options) -> tuple[Ste
     rows = read_kitti(where.calibration)
     with naming(where.calibration):
         name = "P" if where.drive is None else "P_rect_"
-        P_left, P_right = (kitti_matrix(rows, f"{name}{camera}", (3, 4)) for camera in where.cameras)
+        P_left, P_right = (array(rows.get(f"{name}{camera}"), f"{name}{camera}", (3, 4)) for camera in where.cameras)
         if where.drive is not None:
-            expected = kitti_matrix(rows, f"S_rect_{where.cameras[0]}", (2,)).astype(int)
+            expected = array(rows.get(f"S_rect_{where.cameras[0]}"), f"S_rect_{where.cameras[0]}", (2,)).astype(int)
             if tuple(expected) != size:  # perhaps those of an unrectified drive
                 text = f"images are {size_text(size)}, S_rect_{where.cameras[0]} says {size_text(tuple(expected))}"
                 if tuple(rows.get(f"S_{where.cameras[0]}", ())) == size:
                     text += ": this is an unrectified (extract) drive, take the rectified (sync) one"
                 raise CalibrationError(text)
-            T = rigid(pose(kitti_matrix(rows, "R_rect_00", (3, 3)), np.zeros(3)), "R_rect_00")
+            T = rigid(pose(array(rows.get("R_rect_00"), "R_rect_00", (3, 3)), np.zeros(3)), "R_rect_00")
         T = pose(np.eye(3), projection_offset(P_left)) @ T
         return read_rig(named, size, options) if named else rig_from_projections(P_left, P_right, size), T
 
@@ -272,4 +266,4 @@ def _extrinsics(path: Path) -> Array:
     """The rigid motion (4, 4) of a file with rows R and T."""
     rows = read_kitti(path)
     with naming(path):
-        return rigid(pose(kitti_matrix(rows, "R", (3, 3)), kitti_matrix(rows, "T", (3,))), "R")
+        return rigid(pose(array(rows.get("R"), "R", (3, 3)), array(rows.get("T"), "T", (3,))), "R")

@@ -15,7 +15,10 @@ from slam.geometry.stamps import IntArray
 from slam.sequences.tables import MOST_NANOSECONDS
 
 #: Words for the left and the right camera, in names of folders, videos, images and topics.
-SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("cam1", "cam2"))
+SIDES = (
+    ("left", "right"), ("lcam", "rcam"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"),
+    ("infrared1", "infrared2"), ("ir1", "ir2"), ("cam1", "cam2"),
+)  # fmt: skip
 
 _MOST_FRAMES = 10**12  # numbers of frames go up to this: as floating-point numbers they are still told apart
 _SHORTEST = 10**6  # [ns] between frames: no camera is faster, and no count of frames has such steps
@@ -74,7 +77,10 @@ def of_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
     """The left and the right ones of some names by words such as left and right in them; None for neither."""
     for words in (*SIDES, ("l", "r")):
         around = "A-Za-z" if words == ("l", "r") else "a-z"
-        ends = (rf"(?<![{around}])(?i:{word})(?![{'0-9' if word[-1].isdigit() else around}])" for word in words)
+        ends = (
+            rf"(?<![{around}])(?i:{re.sub('(?=[0-9])', '[-_ ]?', word)})(?![{'0-9' if word[-1].isdigit() else around}])"
+            for word in words
+        )
         left, right = ([n for n in names if re.search(end, n)] for end in ends)
         if left and right and not set(left) & set(right):
             return left, right

@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -172,21 +173,26 @@ def in_order(listing: Listing, what: str, faults: FaultLog) -> Listing:
     return listing.select(rows)
 
 
-def told_times(folder: Path, options: Options, faults: FaultLog, *usual: Path) -> tuple[Path, Array] | None:
-    """The file of times, by option or by convention, and the times in it by row [s], NaN for unreadable ones.
+class Times(NamedTuple):
+    """A file of times."""
 
-    None where there is no file, or ``fps`` is given in its place.
-    """
+    path: Path
+    rows: Array  # times by row [s], NaN for unreadable ones
+    names: list[str]  # of the images by row, where the file has them
+
+
+def told_times(folder: Path, options: Options, faults: FaultLog, *usual: Path) -> Times | None:
+    """The file of times, by option or by convention; None where there is none, or ``fps`` is given in its place."""
     if "times" in options:
         path: Path | None = folder / expanded(options["times"])
     else:
         path = None if "fps" in options else next((path for path in usual if path.is_file()), None)
-    return None if path is None else (path, read_times(path, faults))
+    return None if path is None else Times(path, *read_times(path, faults))
 
 
 def pair_up(
     left: Listing, right: Listing | None, options: Options, faults: FaultLog,
-    times: tuple[Path, Array] | None = None, by_number: bool = False,
+    times: Times | None = None, by_number: bool = False,
 ) -> Pairs:  # fmt: skip
     """The images of two cameras that belong together by their keys, the option ``tolerance`` apart at most.
 
@@ -195,8 +201,8 @@ def pair_up(
     Without a right listing both images are in one file, side by side.
 
     Time is by the file of `times`, else by ``fps``, else by stamps, else by numbers at `RATE`. Rows of the file belong
-    to the left images in order; with `by_number` a row's number is a frame's. SequenceError where nothing pairs, or
-    hardly a frame has a time.
+    to the left images that they name, else to those in order; with `by_number`, or where there are more rows than
+    images, a row's number is a frame's. SequenceError where nothing pairs, or hardly a frame has a time.
     """
     rate = None if times else options.get("fps")
     partner = np.full(len(left), -1)
@@ -212,11 +218,7 @@ def pair_up(
         kept = kept[partner[kept] >= 0] if swap else kept
     pairs = Pairs(left.keys[kept], np.stack([kept, partner[kept]], axis=1), 1e-9 * left.keys[kept])
     if times is not None:
-        path, rows = times
-        if not by_number and len(rows) != len(left):
-            faults.report("stamps", f"{path} has {len(rows)} rows, {left.folder} has {len(left)} images")
-        numbers = pairs.keys if by_number and not left.stamped else kept
-        return pairs.select(*_stamped(numbers, rows, path, faults))
+        return pairs.select(*_stamped(_rows_of(left, times, by_number, faults)[kept], times.rows, times.path, faults))
     if left.stamped and rate is None:
         good = increasing(pairs.stamps)
         if len(good) < len(pairs.stamps):
@@ -227,6 +229,22 @@ def pair_up(
         faults.report("times", f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
     numbers = kept if left.stamped else pairs.keys - (0 if by_number else pairs.keys[0])
     return replace(pairs, stamps=numbers / (rate or RATE))
+
+
+def _rows_of(left: Listing, times: Times, by_number: bool, faults: FaultLog) -> IntArray:
+    """The row of each left image in a file of times, see `pair_up`; one beyond its end for none."""
+    count = len(times.rows)
+    named = {stem(name): row for row, name in enumerate(times.names)}
+    rows = np.array([named.get(stem(name), count) for name in left.names])
+    if (rows < count).any():
+        return rows
+    if not left.stamped and (by_number or len(left) < count):
+        first = int(not by_number and left.keys[-1] == count)  # numbers from 1 on
+        if by_number or left.keys[0] - first >= 0 <= count - 1 - (left.keys[-1] - first):
+            return left.keys - first
+    if not by_number and count != len(left):
+        faults.report("stamps", f"{times.path} has {count} rows, {left.folder} has {len(left)} images")
+    return np.arange(len(left))
 
 
 def _tolerance(left: Listing, options: Options, told: bool) -> float:

@@ -15,21 +15,13 @@ from slam.errors import SequenceError
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
 from slam.sequences.base import Images, RecordedSequence
-from slam.sequences.calibration import naming
 from slam.sequences.faults import FaultLog
 from slam.sequences.images import Size, halves
 from slam.sequences.options import Options
 from slam.sequences.pairs import Listing, in_order, pair_up
-from slam.sequences.rigs import calibration_files, read_rig, require_size
-from slam.sequences.ros_bag import (
-    Bag,
-    Message,
-    camera_info,
-    choose_topics,
-    is_rectified,
-    open_bag,
-    rig_by_messages,
-)  # fmt: skip
+from slam.sequences.rigs import calibration_files, read_rig
+from slam.sequences.ros_bag import Bag, open_bag
+from slam.sequences.ros_topics import image_topics, rig_of_topics
 
 #: Options besides those of all formats.
 OPTIONS = frozenset({"left_info", "right_info"})
@@ -56,22 +48,18 @@ def matches_folder(path: Path) -> bool:
 def open_folder(path: Path, options: Options, faults: FaultLog) -> RecordedSequence:
     """Open a recording; all of it is read once, for the stamps."""
     with open_bag(path) as bag:
-        topics = choose_topics(bag, options)
-        infos = [camera_info(bag, topic) for topic in topics.infos]
-        messages = [_stamps(bag, topic, faults) for topic in topics.images]
-        image = bag.first_image(topics.images[0])
+        topics = image_topics(bag, options)
+        messages = [_stamps(bag, topic, faults) for topic in topics]
+        image = bag.first_image(topics[0])
+        one = image if len(topics) == 2 else halves(image, topics[0])[0]
+        size = one.shape[1], one.shape[0]
+        if "calibration" in options:
+            home = path if path.is_dir() else path.parent
+            rig = read_rig(calibration_files(home, options), size, options)
+        else:
+            rig = rig_of_topics(bag, topics, size, options)
     left, *right = _in_time(messages, faults)
     pairs = pair_up(left, right[0] if right else None, options, faults)
-    one = image if right else halves(image, topics.images[0])[0]
-    size = one.shape[1], one.shape[0]
-    if "calibration" in options:
-        rig = read_rig(calibration_files(path if path.is_dir() else path.parent, options), size, options)
-    else:
-        where = Path(" and ".join(topics.infos))
-        rectified = options.get("rectified", all(map(is_rectified, topics.images)))
-        with naming(where):
-            rig = rig_by_messages(infos, rectified, options.get("unit", 1.0))
-        require_size(size, rig, where)
     rows = [np.array([*listing.names, -1], int)[pairs.rows[:, side]] for side, listing in enumerate([left, *right])]
     source = RosPairs(pairs.stamps, path, messages, np.stack(rows, axis=1), (image.shape[1], image.shape[0]))
     return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source)
@@ -101,7 +89,7 @@ class RosPairs:
             [(m.topic, row) for m, row in zip(self.topics, rows) if row >= 0] for rows in self.rows[start:stop].tolist()
         ]
         wanted = {place for frame in frames for place in frame}
-        ahead: dict[tuple[str, int], Message] = {}  # read before their turn, where messages are out of order
+        ahead: dict[tuple[str, int], bytes] = {}  # read before their turn, where messages are out of order
         recorded = {m.topic: m.recorded for m in self.topics}
         since, counts = None, dict.fromkeys(recorded, 0)  # where to begin, and each topic's first row there
         if all((np.diff(times) >= 0).all() for times in recorded.values()):
@@ -111,19 +99,19 @@ class RosPairs:
             messages = bag.messages(counts, since)
             for frame in frames:
                 while not all(place in ahead for place in frame):
-                    message = next(messages, None)
-                    if message is None:
+                    topic, _, data = next(messages, ("", 0, b""))
+                    if not topic:
                         return
-                    place = message.topic, counts[message.topic]
-                    counts[message.topic] += 1
+                    place = topic, counts[topic]
+                    counts[topic] += 1
                     if place in wanted:
-                        ahead[place] = message
+                        ahead[place] = data
                 images = [self._image(bag, ahead.pop(place), place) for place in frame]
                 yield *images, *[None] * (len(self.topics) - len(images))
 
-    def _image(self, bag: Bag, message: Message, place: tuple[str, int]) -> np.ndarray | SequenceError:
+    def _image(self, bag: Bag, data: bytes, place: tuple[str, int]) -> np.ndarray | SequenceError:
         try:
-            return bag.image(message, f"{place[0]}, message {place[1]}", self.size)
+            return bag.image(place[0], data, f"{place[0]}, message {place[1]}", self.size)
         except SequenceError as error:
             return error
 
@@ -174,10 +162,10 @@ def _usual(ahead: IntArray, start: int) -> float:
 def _stamps(bag: Bag, topic: str, faults: FaultLog) -> Messages:
     """Stamps of all messages of a topic; where their headers hold none, when they were recorded."""
     stamps, recorded = [], []
-    for message in bag.messages([topic]):
-        stamp = bag.read(message).header.stamp
+    for _, time, data in bag.messages([topic]):
+        stamp = bag.read(topic, data).header.stamp
         stamps.append(int(stamp.sec) * 10**9 + int(stamp.nanosec))
-        recorded.append(message.time)
+        recorded.append(time)
     if not stamps:
         raise SequenceError(f"{bag.path}: topic {topic} has no messages")
     if not any(stamps):

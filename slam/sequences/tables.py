@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from slam.checks import SINCE_1970, UNITS
 from slam.errors import SequenceError, TrajectoryError
 from slam.files import read_text
 from slam.geometry.se3 import Array
@@ -25,13 +26,14 @@ LARGEST = 4.1e7
 
 _ROTATION = 1e-2  # largest error of an element of RᵀR: files have six digits and more
 _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
-_EARLIEST, _LATEST = 1e8, 1e10  # of a likely time since 1970 [s]: 1973 to 2286
-_UNITS = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
+_SLOWEST = 100.0  # [s] between frames, at most, of times in a unit that nobody named
+_HEADING = re.compile(r"\D*(time|stamp|\bt\b|\bsec|\b[num]s\b)\D*", re.IGNORECASE)  # a first row that names the columns
+_IMAGE = re.compile(r"\.(png|jpe?g|p[gp]m|bmp|tiff?|webp)$", re.IGNORECASE)
 _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
 
 
 def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T | None]:
-    """The rows of a text file; blank lines and ``#`` comments do not count.
+    """The rows of a text file; blank lines, ``#`` comments, and a first row such as ``frame,timestamp`` do not count.
 
     A row that `parse` refuses with a ValueError is reported and stands as None, so that row numbers keep their meaning.
     SequenceError where the file cannot be read or holds no row, or where more than half of its rows are refused.
@@ -40,7 +42,7 @@ def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T
     refused: list[str] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         content = line.strip()
-        if not content or content.startswith("#"):
+        if not content or content.startswith("#") or (not rows and _HEADING.fullmatch(content)):
             continue
         try:
             rows.append(parse(content))
@@ -56,22 +58,40 @@ def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T
     return rows
 
 
-def read_times(path: Path, faults: FaultLog) -> Array:
-    """The times in a file by row [s], NaN for unreadable ones.
+def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
+    """The times in a file by row [s], NaN for unreadable ones, and the images that its rows name, if all do.
 
-    A row's time is its first number, whatever names stand beside it; the second one where the first ones count rows.
+    A row's time is its first number, or a date with the time, whatever names stand beside it; the second number where
+    the first ones count rows. Times since 1970 in a finer unit are known by their size, which is said.
+
+    SequenceError where the file cannot be read, or a time is impossible.
     """
-    rows = read_rows(path, _numbers_in, faults)
+    names: list[str] = []
+
+    def row(text: str) -> list[float]:
+        names.extend(name for name in re.split(r"[,;\s/\\]+", text) if _IMAGE.search(name))
+        return _numbers_in(text)
+
+    rows = read_rows(path, row, faults)
     table = np.array([(*(row or ())[:2], np.nan, np.nan)[:2] for row in rows])
-    first, second = table.T
-    if len(table) > 1 and (np.diff(first) == 1).all() and (np.diff(second) > 0).all() and first[0] in (0, 1):
+    times, second = table.T
+    if len(table) > 1 and (np.diff(times) == 1).all() and (np.diff(second) > 0).all() and times[0] in (0, 1):
         faults.report("times", f"{path}: the first number of each row counts rows; the second one is taken as time")
-        return second
-    return first
+        times = second
+    low, high = SINCE_1970
+    for unit, size in UNITS if len(times) > 1 else ():
+        if low <= np.nanmedian(np.abs(times)) / size <= high and np.nanmedian(np.abs(np.diff(times))) < size * _SLOWEST:
+            faults.report("times", f"{path}: the times are taken as {unit}")
+            times = times / size
+    if (np.abs(times) > _MOST_SECONDS).any():
+        raise SequenceError(f"{path}: {times[np.abs(times) > _MOST_SECONDS][0]:g} is no possible time in seconds")
+    return np.asarray(times), names if len(set(names)) == len(rows) else []
 
 
 def _numbers_in(text: str) -> list[float]:
-    """The numbers of a row, of which the first is a finite number of seconds."""
+    """The numbers of a row, of which the first is finite; of one that begins with a date its time [s since 1970]."""
+    if date := _DATE_TIME.match(text):
+        return [1e-9 * date_time(date[0])]
     found: list[float] = []
     for word in re.split(r"[,;\s]+", text):
         try:
@@ -82,10 +102,6 @@ def _numbers_in(text: str) -> list[float]:
         raise ValueError(f"{shorten(text)} is not a time in seconds")
     if not np.isfinite(found[0]):
         raise ValueError(f"{shorten(text)} is not a finite time")
-    if abs(found[0]) > _MOST_SECONDS:
-        unit = next((unit for unit, size in _UNITS if _EARLIEST <= abs(found[0]) / size <= _LATEST), None)
-        hint = f" (is it in {unit}?): give it in seconds" if unit else ""
-        raise ValueError(f"{shorten(text)} is no possible time in seconds{hint}")
     return found
 
 

@@ -6,16 +6,14 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
-from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.geometry.stamps import frame_range
+from slam.geometry.stamps import frame_range, require_frame
 from slam.geometry.trajectory import Trajectory
 from slam.naming import sequence_line
 from slam.worlds.observe import Appearance, SimulatedFeatures, appearance, simulate
@@ -83,11 +81,14 @@ class WorldSequence:
         return (self.frame(k) for k in range(first, last))
 
     def frame(self, k: int) -> StereoFrame:
-        """Images of frame k."""
+        """Images of frame k, as ``sequence[k]``; SequenceError where there is none."""
+        k = require_frame(self.name, k, len(self))
         if self._images:
-            return self._images[int(k)]
-        frame = self._recorder.record(self.source(k), int(k), float(self.stamps[int(k)]))
+            return self._images[k]
+        frame = self._recorder.record(self.source(k), k, float(self.stamps[k]))
         return replace(frame, left_mask=self.masks[0], right_mask=self.masks[1])
+
+    __getitem__ = frame
 
     def keep_images(self) -> None:
         """Render all images now and keep them, for several runs on the same ones."""
@@ -143,6 +144,4 @@ class WorldSequence:
 
     def source(self, k: int) -> int:
         """The world's frame that is frame k of the recording."""
-        if not isinstance(k, Integral) or not 0 <= k < len(self):
-            raise SequenceError(f"{self.name}: there is no frame {k}; it has {len(self)}")
-        return int(self._kept[int(k)])
+        return int(self._kept[require_frame(self.name, k, len(self))])

@@ -30,9 +30,9 @@ def nees(backend: EkfBackend, truth: np.ndarray) -> float:
 
 def dense(covariance: Covariance) -> np.ndarray:
     """Of camera and landmarks of the state, as one matrix (12 + 3A, 12 + 3A)."""
-    h = len(covariance.head)
-    with_camera = covariance.head[:CAMERA, h : h + len(covariance.marks)]
-    return np.block([[covariance.camera, with_camera], [with_camera.T, covariance.marks]])
+    h, b = len(covariance.head), 3 * covariance.left
+    with_camera = covariance.head[:CAMERA, h + b :]
+    return np.block([[covariance.camera, with_camera], [with_camera.T, covariance.marks[b:, b:]]])
 
 
 def halfway(data: Scene, frames: int, models: EstimatorModels = MODELS, **options) -> tuple[EkfBackend, set[int]]:

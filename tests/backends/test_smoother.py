@@ -10,7 +10,7 @@ import pytest
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.landmarks import VARIABLE
+from backends.smoother.landmarks import RECENT, VARIABLE, SmootherLandmarks
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -95,6 +95,19 @@ def test_far_landmarks_that_soon_leave_are_not_believed_too_much(seen_at_once, s
         last = backend.estimate(landmarks=False)
         off = np.linalg.norm(last.T_world_left[:3, 3] - truth[:3, 3])
         assert off < 3 * np.sqrt(np.trace(last.covariance[3:, 3:])) and off < most, k
+
+
+def test_a_variable_stays_as_long_as_it_is_linear_to_within_the_noise():
+    """However near the camera comes: those that left at half the distance took all that was known of them along."""
+    new = np.array([[0.0, 0, 8], [0, 0, 8], [0, 0, 8]])
+    marks = SmootherLandmarks.of(np.arange(3), 0, new, np.tile(0.01 * np.eye(3), (3, 1, 1)), np.zeros((3, 3, 3)), False,
+                                 np.zeros((3, 3, 0)))  # fmt: skip
+    z, T, rows = np.array([[300.0, 200, 290]] * 3), np.eye(4), np.arange(3)
+    marks = replace(marks, pose=np.full((3, RECENT), 20)).with_variables(rows, z, 21, 20, 20, T, 30.0)
+    assert (marks.begun == VARIABLE).all()  # 30 deviations of .17 m are 5.2 m
+    marks = marks.solved(rows, new + np.outer([0.0, 0.03, 0.1], [0, 0, 1]), new)
+    T[2, 3] = 6.0  # 2 m away: 30 offsets of .06 m
+    assert (marks.with_variables(rows, z, 22, 20, 20, T, 30.0).begun == VARIABLE).tolist() == [True, True, False]
 
 
 def test_a_frame_that_saw_new_landmarks_alone_is_a_pose():

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.calibration import RigModel, RigPosterior, SelfCalibrationConfig
-from slam.calibration.consider import BASELINE, FollowedErrors
+from slam.calibration import RigCorrection, RigModel, RigPosterior, SelfCalibration, SelfCalibrationConfig
+from slam.calibration.consider import BASELINE, RemainingRigError
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import inverse, log
@@ -27,7 +27,6 @@ CONFIG = SystemConfig(
     self_calibration=NEVER_LEARNS,
 )
 MODEL = RigModel(RIG)
-FOLLOWED = FollowedErrors(MODEL)
 
 
 def with_error(features: StereoFeatures, delta: np.ndarray) -> StereoFeatures:
@@ -52,21 +51,18 @@ def run(backend: str, delta: np.ndarray, frames: int = 45) -> tuple[StereoSlam, 
     return system, truth[-1]
 
 
-def test_what_is_followed_moves_rows_as_all_errors_do():
-    """Four combinations move the right row alone: shift, scale and tilt of the right image, the baseline's way down."""
-    z = np.random.default_rng(0).uniform([0, 0, -100], [RIG.width, RIG.height, RIG.width], (50, 3))
+def test_what_is_followed_moves_rows_as_errors_of_the_rig_do():
+    """By each parameter, by a longer baseline, and by the correction that the rows have had already."""
+    rng, calibration = np.random.default_rng(0), SelfCalibration(RIG, NEVER_LEARNS)
+    z = rng.uniform([0, 0, -100], [RIG.width, RIG.height, RIG.width], (50, 3))
     z[0, 2] = np.nan
-    theta = 1e-3 * np.random.default_rng(1).normal(size=len(MODEL.names))
-    root = np.diag([*np.full(len(theta), 1e-3), BASELINE])
-    field, left = np.zeros((50, 3, len(theta) + 1)), z[:, :2] - MODEL.origin
-    points = np.column_stack([left, z[:, 0] - z[:, 2]])
-    field[:, :, :-1], field[:, 2, -1] = MODEL.field(points), -points[:, 2]
-    field[:, 2] = field[:, 0] - field[:, 2]
-    found = FOLLOWED.field(z, FOLLOWED.of(theta))
-    assert found.shape[2] - 1 == len(theta) + 1 - 4
-    np.testing.assert_allclose(found[:, :, -1], field[:, :, :-1] @ theta, atol=1e-8)
-    G, H = found[1:, :, :-1].reshape(147, -1), (field[1:] @ root).reshape(147, -1)
-    np.testing.assert_allclose(G @ FOLLOWED.covariance(root[:-1, :-1] ** 2) @ G.T, H @ H.T, atol=1e-8)
+    calibration.applied = RigCorrection(MODEL, 1e-3 * rng.normal(size=len(MODEL.names)))
+    found, size = RemainingRigError(calibration).field(z), 1e-7
+    for k in range(len(MODEL.names)):
+        off = RigCorrection(MODEL, size * np.eye(len(MODEL.names))[k]).rows(z) - z
+        np.testing.assert_allclose(found[:, :, k], off / size, atol=1e-3)
+    np.testing.assert_allclose(z[:, 2] + BASELINE * found[:, 2, -2], z[:, 2] + BASELINE * (z[:, 0] - z[:, 2]))
+    np.testing.assert_allclose(found[:, :, -1], -found[:, :, :-2] @ calibration.applied.parameters)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -76,7 +72,7 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size):
     system, T_true = run(backend, delta)
     T = system.backend.estimate(landmarks=False).T_world_left
     actual = log(inverse(T) @ T_true)
-    predicted = system.backend.sensitivities([])[0][:, :-1] @ FOLLOWED.of(delta)
+    predicted = system.backend.sensitivities([])[0][:, :-2] @ delta
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
     assert np.linalg.norm(predicted - actual) < BACKENDS[backend] * np.linalg.norm(actual)
 
@@ -94,7 +90,7 @@ def test_landmarks_move_as_their_sensitivities_say(backend):
     ids = system.landmarks.ids
     estimated, by_rig = system.backend.positions(ids), system.backend.sensitivities(ids)[1]
     actual = cloud.points[[points[i] for i in ids.tolist()]] - estimated
-    predicted = by_rig[:, :, :-1] @ FOLLOWED.of(delta)
+    predicted = by_rig[:, :, :-2] @ delta
     assert np.linalg.norm(predicted - actual) < 0.1 * np.linalg.norm(actual)
 
 
@@ -151,6 +147,6 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
     assert np.linalg.norm(error[3:]) > 1e-3
     known = result.common.jacobian @ result.common.root[:, -1]
     assert np.linalg.norm(known - error) < 0.2 * np.linalg.norm(error)
-    np.testing.assert_array_equal(result.common.root[:-1, -1], FOLLOWED.of(mean))
-    in_path = system._tracker.rig_error.common(system.backend, as_reported=False).root[:-1, -1]
-    np.testing.assert_array_equal(in_path, FOLLOWED.of(0 * mean if revises else mean))
+    np.testing.assert_array_equal(result.common.root[:-2, -1], mean)
+    in_path = system._tracker.rig_error.common(system.backend, as_reported=False).root[:-2, -1]
+    np.testing.assert_array_equal(in_path, 0 * mean if revises else mean)

@@ -80,23 +80,36 @@ def common_focal(calibration):
     return w @ posterior.mean, np.sqrt(w @ posterior.covariance @ w)
 
 
-@pytest.mark.parametrize("theta", [FOCAL, FOCAL + TURNED])
-def test_a_common_error_of_the_focal_lengths_is_found_in_a_turn(theta):
-    """A quarter turn among points all around."""
+def quarter_turn(theta, rig=CAR):
+    """The calibration of `rig` after a quarter turn of the car among points all around."""
     street = Street(4, count=4000)
     rng, count = np.random.default_rng(0), len(street.points)
     angle, radius = rng.uniform(-np.pi, np.pi, count), rng.uniform(15, 45, count)
     street.points[:, ::2] = radius[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
-    calibration = SelfCalibration(CAR, SelfCalibrationConfig())
+    calibration = SelfCalibration(rig, SelfCalibrationConfig())
     for k in range(40):
         yaw = np.deg2rad(90) * k / 39
         T = se3.exp(np.array([0, yaw, 0, 0, 0, 0]))
         T[:3, 3] = [8 - 8 * np.cos(yaw), 0, 8 * np.sin(yaw)]
         calibration.observe(street.features(0.1 * k, T, theta, noise=0.3), T)
+    return calibration
+
+
+@pytest.mark.parametrize("theta", [FOCAL, FOCAL + TURNED])
+def test_a_common_error_of_the_focal_lengths_is_found_in_a_turn(theta):
+    calibration = quarter_turn(theta)
     assert np.abs(z_scores(calibration, theta)).max() < 3
     mean, sigma = common_focal(calibration)
     assert abs(mean - 0.005) < 3 * sigma < 0.0075
     assert mean > (0.001 if theta[-4] else 0.0025)
+    assert calibration.doubt == ""
+
+
+@pytest.mark.parametrize(("share", "word"), [(1.5, "shorter"), (1.2, "shorter"), (0.7, "longer")])
+def test_a_focal_length_of_another_camera_is_doubted(share, word):
+    camera = CAR.left
+    rig = type(CAR).rectified_pair(share * camera.fu, camera.u0, camera.v0, CAR.baseline, CAR.width, CAR.height)
+    assert f"% {word} than the calibration's: is the calibration of this camera" in quarter_turn(None, rig).doubt
 
 
 def test_on_a_straight_road_a_common_error_of_the_focal_lengths_stays_unknown():
@@ -114,7 +127,7 @@ def test_a_good_calibration_is_left_as_it_is(seed):
 
 def test_what_motion_has_hardly_shown_is_not_applied():
     """Steps of five centimetres and noisy pixels: most of what is believed of the disparities is the prior's."""
-    calibration = drive(TURNED, frames=8, step=0.05, noise=1.0, settings={"minimum_parallax": 0.01})
+    calibration = drive(TURNED, frames=20, step=0.05, noise=1.0, settings={"minimum_parallax": 0.01})
     assert calibration.posterior.mean.any() and calibration.apply() is None
     assert disparity_error(calibration, TURNED) > 0.9 * disparity_error(drive(TURNED, frames=1), TURNED)
 

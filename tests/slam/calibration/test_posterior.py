@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.calibration.evidence import Accumulator, Evidence, residual_scale, row_evidence
+from slam.calibration.evidence import Accumulator, Evidence, RigEvidence, field_variance, row_evidence
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import Prior, factory_prior, residual_likelihoods, solve
 from tests.slam.calibration.drives import CAR, parameters, residual_fields
@@ -36,9 +36,12 @@ def test_how_large_the_residual_fields_are_is_seen_in_the_rows(scale):
         vertical = -model.vertical(points) @ theta - model.residual_vertical(points) @ fields
         found = row_evidence(model, points, vertical + 0.1 * rng.standard_normal(300), theta)[1]
         rows = found if rows is None else rows + found
-    said, nothing = (residual_likelihoods(factory_prior(model), rows.scaled(factor)) for factor in (1.0, 1e-9))
-    assert residual_scale(said) == pytest.approx(scale, rel=0.4)
-    assert residual_scale(nothing) > 0.4  # where they say nothing
+    said, nothing = (
+        np.sqrt(RigEvidence(rows, rows, residual_likelihoods(factory_prior(model), part)).fields / field_variance())
+        for part in (rows, rows.scaled(1e-9))
+    )
+    assert said == pytest.approx(scale, rel=0.4)
+    assert nothing > 0.4  # where they say nothing
 
 
 @pytest.mark.parametrize("length", [1, 4, 10])

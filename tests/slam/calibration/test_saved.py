@@ -8,7 +8,7 @@ import pytest
 
 import slam
 from slam.calibration import RigModel, SavedCalibration, SelfCalibration, SelfCalibrationConfig
-from slam.calibration.evidence import RESIDUAL_SCALES, Evidence, RecordingEvidence
+from slam.calibration.evidence import RESIDUAL_SCALES, Evidence, RigEvidence
 from slam.calibration.posterior import factory_prior, systematic_variance
 from slam.calibration.saved import agreement, agreement_in_words, joint_calibration
 from slam.errors import CalibrationError, ConfigurationError
@@ -30,7 +30,7 @@ TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
 
 def scaled(evidence, factor):
     """The evidence of a recording with `factor` times the information."""
-    return evidence._replace(whole=evidence.whole.scaled(factor))
+    return evidence._replace(plain=evidence.plain.scaled(factor), apart=evidence.apart.scaled(factor))
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +64,8 @@ def test_what_is_kept_corrects_from_the_first_frame_and_goes_on_being_learnt(fir
     field = first.model.field(first.model.far())[:, 2]
     variances = [np.einsum("ni,ij,nj->", field, p.covariance, field) for p in (second.kept().posterior, kept.posterior)]
     assert variances[0] < 0.8 * variances[1]  # of what two recordings say of the rig, and one
-    evidence, systematic = [first.evidence(), second.evidence()], first.config.systematic
-    both = joint_calibration(first.model, factory_prior(first.model), evidence, systematic).posterior
+    evidence = [first.evidence(), second.evidence()]
+    both = joint_calibration(first.model, factory_prior(first.model), evidence).posterior
     np.testing.assert_allclose(second.kept().posterior.mean, both.mean, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(second.kept().posterior.covariance, both.covariance, rtol=1e-6, atol=1e-15)
 
@@ -135,7 +135,7 @@ def test_bad_files_get_one_line(first, tmp_path, change, message):
 def joint(*drives):
     """The rig by several drives."""
     model = drives[0].model
-    return joint_calibration(model, factory_prior(model), [d.evidence() for d in drives], 0.05).posterior
+    return joint_calibration(model, factory_prior(model), [d.evidence() for d in drives]).posterior
 
 
 def test_one_recording_jointly_is_that_recording(first):
@@ -152,10 +152,10 @@ def test_recordings_together_are_surer_and_agree(first):
     pixels = np.concatenate([first.model.field(far)[:, 2], first.model.vertical(far)])
     joint_variance, *variances = (np.einsum("ni,ij,nj->", pixels, p.covariance, pixels) for p in (together, *alone))
     assert joint_variance < 0.7 * min(variances)  # of what pixels of far points are off by
-    found = agreement(first.model, [d.evidence() for d in drives], 0.05)
+    found = agreement(first.model, [d.evidence() for d in drives])
     assert agreement_in_words(found).startswith("The recordings agree") and found.shape == together.mean.shape
     assert np.nanmax(found) < 3
-    assert agreement(first.model, [first.evidence()], 0.05) is None
+    assert agreement(first.model, [first.evidence()]) is None
 
 
 def shown(model, depths, theta, fields, rng):
@@ -164,7 +164,8 @@ def shown(model, depths, theta, fields, rng):
     A = np.concatenate([model.field(points)[:, 2], model.vertical(points)]) / 0.05
     F = np.concatenate([residual_field(model, points)[:, 2], model.residual_vertical(points)]) / 0.05
     scales = -1e3 * np.abs(np.arange(len(RESIDUAL_SCALES)) - 6)  # that of the fields is known
-    return RecordingEvidence(Evidence(A.T @ A, A.T @ (A @ theta - F @ fields), A.T @ F), scales)
+    plain = Evidence(A.T @ A, A.T @ (A @ theta - F @ fields), A.T @ F)
+    return RigEvidence(plain, plain.with_error(systematic_variance(model, 0.01)), scales)
 
 
 def test_errors_that_no_parameter_holds_do_not_drive_recordings_apart():
@@ -182,7 +183,7 @@ def test_errors_that_no_parameter_holds_do_not_drive_recordings_apart():
     for _ in range(20):
         theta, fields = root @ rng.standard_normal(len(root)), -RESIDUAL_SCALES[6] * residual_fields(rng)
         recordings = [shown(model, depths, theta, fields, rng) for depths in ((0, 0.02), (0.05, 0.12))]
-        found = [joint_calibration(model, prior, some, 0.01).posterior for some in (recordings, *zip(recordings))]
+        found = [joint_calibration(model, prior, some).posterior for some in (recordings, *zip(recordings))]
         errors = [p.mean - theta for p in found]
         nees.append([e @ np.linalg.solve(p.covariance, e) / len(e) for e, p in zip(errors, found)])
         off.append([focal @ e for e in errors])
@@ -202,9 +203,9 @@ def test_a_calibration_passed_from_run_to_run_is_no_surer_than_all_recordings_to
     theta = np.linalg.cholesky(prior.covariances[-1]) @ rng.standard_normal(len(prior.mean))
     recordings, passed = [shown(model, (0, 0.05), theta, fields, rng) for _ in range(8)], None
     for recording in recordings:
-        kept = joint_calibration(model, prior, [recording], 0.01, passed and passed.evidence)
+        kept = joint_calibration(model, prior, [*([passed.evidence] if passed else []), recording])
         passed = SavedCalibration.from_json(json.loads(json.dumps(kept.to_json())))
-    together = joint_calibration(model, prior, recordings, 0.01).posterior
+    together = joint_calibration(model, prior, recordings).posterior
     np.testing.assert_allclose(passed.posterior.mean, together.mean, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(passed.posterior.covariance, together.covariance, rtol=1e-6, atol=1e-15)
 
@@ -218,7 +219,7 @@ def test_evidence_that_is_none_is_refused(first, evidence):
 
 def test_recordings_of_another_rig_do_not_agree(first):
     other = drive(TURNED + parameters(roll=3e-3), seed=2, frames=20)
-    found = agreement(first.model, [first.evidence(), other.evidence()], 0.05)
+    found = agreement(first.model, [first.evidence(), other.evidence()])
     assert agreement_in_words(found).startswith("The recordings do not agree in") and "roll" in agreement_in_words(
         found
     )
@@ -228,13 +229,13 @@ def test_recordings_of_another_rig_do_not_agree(first):
 def test_the_prior_that_recordings_share_is_no_agreement(first):
     """Two that say next to nothing are both near the calibration as delivered."""
     silent = [scaled(d.evidence(), 1e-9) for d in (first, drive(TURNED + parameters(roll=3e-3), seed=2, frames=20))]
-    found = agreement(first.model, silent, 0.05)
+    found = agreement(first.model, silent)
     assert np.isnan(found).all() and agreement_in_words(found).startswith("Nothing can be said")
-    half = agreement(first.model, [first.evidence(), silent[1]], 0.05)
+    half = agreement(first.model, [first.evidence(), silent[1]])
     assert np.isnan(half).all()
 
 
 def test_without_motion_there_is_nothing_to_join(first):
     assert drive(step=0.0, frames=3).evidence() is None
     with pytest.raises(CalibrationError, match="no recording"):
-        joint_calibration(first.model, factory_prior(first.model), [], 0.05)
+        joint_calibration(first.model, factory_prior(first.model), [])

@@ -45,7 +45,7 @@ def test_two_recordings_of_one_rig(made):
     assert all(abs(row["mean"] + 1e-3) < 3 * row["sigma"] for row in turn)
     assert any(abs(row["mean"]) > 1e-4 for row in turn)
     assert tree["agreement"].startswith("The recordings agree")
-    assert all(word in printed for word in ("apart", "roll", "no uncertainty"))
+    assert all(word in printed for word in ("apart", "roll", "no uncertainty", "added to measured pixels"))
     assert tree["judgement"] in " ".join(printed.split())
     assert tree["judgement"].startswith("By this the calibration is off by")
     model = RigModel(slam.open_sequence(WORLD).rig)
@@ -76,7 +76,8 @@ def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, a
     shift = np.array([float(name == "right_cx") for name in model.names]) / model.focal  # of all disparities by 1 px
     posterior = RigPosterior(off * shift, sigma**2 * np.outer(shift, shift))
     differing = None if apart is None else np.array([np.nan, apart])
-    words = _judged(model, posterior, 0.4, 100.0, differing)
+    words, worth = _judged(model, posterior, 0.4, 100.0, differing)
+    assert worth == (word in ("This is worth correcting", "This is bad"))  # only then it is said how to use it
     assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
 
 

@@ -73,6 +73,17 @@ def test_steps_at_the_begin_that_are_all_alike_are_no_truth():
     assert np.flatnonzero(doubtful(true, NOISE, first, first + 1)).tolist() == [*range(12)]  # single steps as well
 
 
+def test_a_path_that_was_interpolated_as_a_whole_is_no_truth():
+    """As the first frames of such a drive: nothing in them was measured, which would show what is even."""
+    steps = np.array([0, 0.004, 0.001, 0, 0, 1.0]) + 5e-6 * np.random.default_rng(0).normal(size=(11, 6))
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ exp(step))
+    true = Trajectory(0.1 * np.arange(12), np.array(poses))
+    assert interpolated(true, NOISE).all()
+    assert not interpolated(drive(12), NOISE).any()
+
+
 def test_truth_without_noise_is_exact():
     still = Trajectory(0.1 * np.arange(20), np.tile(np.eye(4), (20, 1, 1)))
     assert not doubtful(still, TruthNoise(), *stretches(20)).any()

@@ -49,6 +49,7 @@ STAMPS = {
     for text, value in {
         "None": None, "text": "1.0", "NaN": math.nan, "inf": math.inf, "-inf": -math.inf, "earlier": 0.0,
         "array": np.array([9.0]), "complex": 9j, "true": True, "decimal": Decimal(9), "huge": 10**400,
+        "nanoseconds": 17 * 10**17,
     }.items()
 }  # fmt: skip
 VALUES = {

@@ -68,6 +68,17 @@ def test_a_nees_of_which_most_stretches_had_no_covariance_is_no_figure():
     assert dict(rows([tree]))["errors over claimed σ (1 is right)"] == ["1"]
 
 
+def test_doubtful_truth_is_named_and_not_the_covariance():
+    """A run of frames whose truth was interpolated said "covariances are 12 times too small"."""
+    tree = summary(1.0)
+    tree["consistency"] |= {"doubtful truth over 10 m": 0.25}
+    assert verdict_of_run(tree).endswith(
+        "; not judged: 25 % of the stretches over 10 m, where the true path is doubtful"
+    )
+    tree["consistency"]["mean NEES"] = float("nan")
+    assert verdict_of_run(tree).startswith("covariances cannot be judged: the true path is doubtful")
+
+
 @pytest.mark.parametrize("nees", [None, float("nan")])
 def test_covariances_that_cannot_be_judged_say_so(nees):
     """A back end that claims the same covariance in every frame had no verdict, and no word why."""

@@ -120,7 +120,7 @@ def test_arrays_of_numpy_are_no_calibration(tmp_path: Path) -> None:
         slam.load_rig(tmp_path / "a.npz", size=SIZE)
 
 
-def test_a_rectified_pair_by_five_numbers_and_all_that_is_wrong_with_them(tmp_path: Path) -> None:
+def test_a_rectified_pair_by_five_numbers_and_what_is_wrong_with_them(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     file.write_text("fx: 500\nfy: 501\ncx: 31.5\ncy: 23.5\nbaseline: 120.0\n")
     rig = slam.load_rig(file, size=SIZE, unit="mm")
@@ -132,11 +132,39 @@ def test_a_rectified_pair_by_five_numbers_and_all_that_is_wrong_with_them(tmp_pa
     file.write_text("fx: 500\nfy: 500\ncx: 31\ncy: 23\nk1: -0.37\nk2: 0.2\nbaseline: 0.2\n")
     with pytest.raises(CalibrationError, match="names distortion, but only one camera"):
         slam.load_rig(file, size=SIZE)
-    file.write_text("fx: true\ncx: wide\ncy: .inf\nbaseline: -0.12\n")
-    with pytest.raises(CalibrationError) as error:
-        slam.load_rig(file, size=SIZE)
-    for part in ("fx is no number", "fy is missing", "cx is no number", "cy is not finite", "baseline is -0.12, which"):
-        assert part in str(error.value)
+    for text, words in (
+        ("fx: true\ncx: wide\n", r"fx is no number \(a rectified pair needs fx, fy, cx, cy in pixels and baseline\)"),
+        ("fx: 50\nfy: 50\ncx: .inf\n", "cx is not finite"),
+        ("fx: 50\nfy: 50\ncx: 1\ncy: 1\n", "baseline is missing"),
+        ("fx: 50\nfy: 50\ncx: 1\ncy: 1\nbaseline: -0.12\n", "fx, fy and baseline must be positive"),
+    ):
+        file.write_text(text)
+        with pytest.raises(CalibrationError, match=words):
+            slam.load_rig(file, size=SIZE)
+
+
+FLAT, M, EYE = {"fx": 50.0, "fy": 51.0, "cx": 31.5, "cy": 23.5}, K.tolist(), np.eye(3).tolist()
+SIDES = ("left", "right")
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {**{side: {"K": M} for side in SIDES}, "extrinsics": {"R": EYE, "T": [-0.2, 0, 0]}},
+        {"intrinsics": dict.fromkeys(SIDES, FLAT), "extrinsic": {"rotation": EYE, "translation": [-0.2, 0, 0]}},
+        {"KK_left": M, "kc_left": [0] * 5, "KK_right": M, "om": [0, 0, 0], "T": [-0.2, 0, 0]},
+        {"mtxL": M, "distL": [[0] * 5], "mtxR": M, "rot": EYE, "trans": [[-0.2], [0], [0]]},
+        {key: {**FLAT, "coeffs": [0] * 5, "model": "distortion.none"} for key in SIDES} | {"baseline": 0.2},
+        {"f": 50, "cu": 31.5, "cv": 23.5, "base": 0.2},
+        {"FX_px": 50, "FY_px": 51, "CX_px": 31.5, "CY_px": 23.5, "Baseline_m": 0.2},
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_the_same_rig_in_the_words_of_many_people(tmp_path: Path, entries: dict, encoding: str) -> None:
+    (tmp_path / "calibration.json").write_text(json.dumps(entries, indent=1), encoding=encoding)
+    rig = slam.load_rig(tmp_path, size=SIZE)
+    assert (rig.left.fu, rig.left.u0, rig.left.v0) == (50, 31.5, 23.5)
+    assert np.allclose(rig.b, [-0.2, 0, 0], atol=1e-9)
 
 
 CAMERA = """cam{}:
@@ -267,7 +295,6 @@ ZED = "".join(
     for name, f in (("HD", 600), ("VGA", 300))
 )
 ZED += "[STEREO]\nBaseline=120\nTY=0.1\nTZ=0.2\nRX_HD=0.01\nCV_HD=0.02\nRZ_HD=0.0\n"
-EYE = np.eye(3).tolist()
 OAK = json.dumps(
     {
         "cameraData": [
@@ -358,6 +385,9 @@ def test_what_is_recognised_but_cannot_be_read_is_named(tmp_path: Path) -> None:
         slam.load_rig(file)
     file.write_text('{"value0": {"intrinsics": [], "resolution": []}}')
     with pytest.raises(CalibrationError, match="looks like Basalt's"):
+        slam.load_rig(file, size=(64, 48))
+    file.write_text('{"CameraParameters1": {"IntrinsicMatrix": [[1]]}, "TranslationOfCamera2": [-120, 0, 0]}')
+    with pytest.raises(CalibrationError, match="looks like MATLAB's, which has matrices that are transposed"):
         slam.load_rig(file, size=(64, 48))
     for number, text in enumerate(("Image_Size: [64, 48]\nfoo_Bar: 1\n", "K1: [1]\n")):
         (tmp_path / f"{number}.yaml").write_text(text)

@@ -227,13 +227,3 @@ def test_ctrl_c_ends_a_run_from_a_stuck_camera_with_all_its_files(rig_here, scen
     assert (out / "trajectory_final.txt").read_text().count("\n") == summary["frames"]
     config = json.loads((out / "config.json").read_text())
     assert (config["source_format"], config["source"]) == (None, "camera:0?wait=0")
-
-
-@pytest.mark.slow
-def test_a_recording_runs_live_and_says_what_it_left_out(slam_command, tmp_path):
-    world = f"synthetic:desk?frames=12&width={WIDTH}&height={HEIGHT}"
-    done = slam_command("run", world, "--live", "--out", tmp_path / "out", "--no-picture", "--quiet")
-    assert done.returncode == 0, done.stderr
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["ended"] == "completed"
-    assert summary["frames"] + summary["live"]["frames dropped"] == 12

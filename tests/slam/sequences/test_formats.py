@@ -12,11 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import slam
 from slam.errors import CalibrationError, SequenceError
-from slam.evaluation.metrics import absolute_errors
-from slam.geometry.camera import PinholeCamera
-from slam.geometry.se3 import pose
 from slam.sequences import Sequence, formats, open_sequence
 from slam.sequences.kitti import imu_poses
+from tests import recordings
 from tests.recordings import projection_row, seeds
 
 PAIRS = [(i, i + 10) for i in range(6)]
@@ -59,6 +57,20 @@ def test_a_range_of_frames_is_read_without_decoding_the_others(kitti: Path, buil
     for start, stop in ((-1, 3), (6, None), (3, 3), (4, 2)):
         with pytest.raises(SequenceError, match=r"has frames 0:6|end is not after the start"):
             sequence.frames(start, stop)
+
+
+def test_single_frames_of_recordings_and_worlds(kitti: Path, build: SimpleNamespace) -> None:
+    for sequence in (open_sequence(kitti), slam.open_sequence("synthetic:desk?frames=4&width=64&height=48")):
+        (expected,) = sequence.frames(2, 3)
+        for frame in (sequence.frame(2), sequence[np.int64(2)]):
+            assert (frame.index, frame.stamp) == (2, expected.stamp)
+            assert np.array_equal(frame.left, expected.left) and np.array_equal(frame.right, expected.right)
+        for k in (-1, 6, 1.5):
+            with pytest.raises(SequenceError, match=f"there is no frame {k}; it has"):
+                sequence[k]
+    build.cut(kitti / "image_0" / "000001.png")
+    with pytest.raises(SequenceError, match="the left image of frame 1 cannot be read"):
+        open_sequence(kitti)[1]
 
 
 def test_names_of_folders(kitti: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,47 +128,24 @@ def test_own_images_in_euroc_s_tree(euroc: Path, build: SimpleNamespace) -> None
     assert sequence.rig.baseline == pytest.approx(0.2)
 
 
-SIZE, STEP, T0 = 256, 50_000_000, 1_520_530_308_199_447_626
-D = (0.0034823894, 0.0007150348, -0.0020532361, 0.0002029367)  # of a lens of TUM-VI's
-CAMERA = PinholeCamera(150.0, 150.0, 127.5, 127.5, SIZE, SIZE, "equidistant", D)
-T_CAM0_IMU = pose(Rotation.from_euler("xyz", [0.1, -0.2, 1.5]).as_matrix(), np.array([0.04, -0.02, 0.01]))
-
-
-def test_tum_vi_is_read_and_run(tmp_path: Path) -> None:
-    """Six frames of a world by equidistant cameras, in 16 bits, Kalibr's calibration in dso, truth in mocap0."""
-    folder, world = tmp_path / "dataset-room1_512_16", slam.open_sequence("synthetic:desk?frames=6")
-    v, u = np.mgrid[:SIZE, :SIZE]
-    xy = CAMERA.normalise(np.stack([u.ravel(), v.ravel()], axis=1).astype(float))
-    view = world.rig.left.project(np.concatenate([xy, np.ones((len(xy), 1))], axis=1))
-    view = np.nan_to_num(view, nan=-1.0).astype(np.float32).reshape(SIZE, SIZE, 2)
-    rows, names = [], [f"{T0 + k * STEP}.png" for k in range(6)]
-    chain = ""
-    for cam, shift in (("cam0", 0.0), ("cam1", -world.rig.baseline)):
-        T = T_CAM0_IMU.copy()
-        T[0, 3] += shift
-        chain += f"{cam}:\n  T_cam_imu:\n" + "".join(f"  - {row}\n" for row in T.tolist())
-        chain += f"  camera_model: pinhole\n  distortion_coeffs: {list(D)}\n  distortion_model: equidistant\n"
-        chain += f"  intrinsics: [150.0, 150.0, 127.5, 127.5]\n  resolution: [{SIZE}, {SIZE}]\n"
-        (folder / "mav0" / cam / "data").mkdir(parents=True)
-        (folder / "mav0" / cam / "data.csv").write_text("#t,name\n" + "".join(f"{n[:-4]},{n}\n" for n in names))
-    for frame, name, T in zip(world, names, world.ground_truth.poses @ T_CAM0_IMU):
-        for cam, image in (("cam0", frame.left), ("cam1", frame.right)):
-            seen = cv2.remap(image, view[..., 0], view[..., 1], cv2.INTER_LINEAR)
-            cv2.imwrite(str(folder / "mav0" / cam / "data" / name), 257 * seen.astype(np.uint16))
-        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-        rows.append(",".join(str(value) for value in (name[:-4], *T[:3, 3], w, x, y, z)))
-    for path, text in (("mav0/mocap0/data.csv", "\n".join(rows)), ("dso/camchain.yaml", chain)):
-        (folder / path).parent.mkdir()
-        (folder / path).write_text(text)
-    sequence = slam.open_sequence(folder)
-    assert (sequence.format, len(sequence), sequence.rig.left) == ("euroc", 6, CAMERA)
-    assert np.allclose(sequence.rig.b, [-0.12, 0, 0])
-    system = slam.StereoSlam(sequence.rig, backend="ekf", kind=sequence.kind)
-    results = [system.process(frame) for frame in sequence]
-    assert next(iter(sequence)).left.dtype == np.uint16
-    assert [result.status.value for result in results[1:]] == ["tracked"] * 5
-    errors = absolute_errors(system.trajectory(), sequence.ground_truth)
-    assert errors.rmse < 0.01  # 3 mm are measured, on a path of 9 cm
+def test_tum_vi_is_read(euroc: Path) -> None:
+    """Fisheye lenses, 16 bits, Kalibr's calibration in dso, the body's truth in mocap0."""
+    usual, T = open_sequence(euroc), np.linalg.inv(recordings.BODY_CAMERA)
+    D, chain = [0.0034823894, 0.0007150348, -0.0020532361, 0.0002029367], ""
+    for cam, shift in (("cam0", 0.0), ("cam1", -0.11)):
+        (euroc / "mav0" / cam / "sensor.yaml").unlink()
+        rows = "".join(f"  - {row}\n" for row in (T + shift * np.eye(4, k=3)).tolist())
+        chain += f"{cam}:\n  T_cam_imu:\n{rows}  camera_model: pinhole\n  distortion_coeffs: {D}\n"
+        chain += "  distortion_model: equidistant\n  intrinsics: [50, 50, 31, 23]\n  resolution: [64, 48]\n"
+    for path in euroc.glob("mav0/cam*/data/*.png"):
+        cv2.imwrite(str(path), 257 * cv2.imread(str(path), 0).astype(np.uint16))
+    (euroc / "mav0" / "state_groundtruth_estimate0").rename(euroc / "mav0" / "mocap0")
+    (euroc / "dso").mkdir()
+    (euroc / "dso" / "camchain.yaml").write_text(chain)
+    sequence = open_sequence(euroc)
+    assert (sequence.rig.left.model, sequence.rig.left.distortion) == ("equidistant", tuple(D))
+    assert np.allclose(sequence.rig.b, [-0.11, 0, 0]) and sequence[0].left.dtype == np.uint16
+    assert np.allclose(sequence.ground_truth.poses, usual.ground_truth.poses, atol=1e-6)
 
 
 # ------------------------------------------------------------------------------------------------ KITTI

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +16,7 @@ import pytest
 from slam.errors import SequenceError
 from slam.sequences import open_sequence
 from slam.sequences.images import MOST_PIXELS, decode_image, read_image
-from tests.fuzz.files import chunk, png
+from tests.fuzz.files import png
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
@@ -90,23 +89,6 @@ def test_a_huge_image_is_refused_by_its_header(tmp_path, size):
         read_image(tmp_path / "a.png")
 
 
-def test_an_image_of_another_size_is_not_decoded(tmp_path, monkeypatch):
-    (tmp_path / "a.png").write_bytes(png((8000, 8000), b""))
-    monkeypatch.setattr(PIL.ImageFile.ImageFile, "load", None)
-    with pytest.raises(SequenceError, match="8000x8000, not 64x48"):
-        read_image(tmp_path / "a.png", (64, 48))
-
-
-def test_a_damaged_image_prints_nothing(tmp_path, capfd):
-    whole = png((64, 48), zlib.compress(bytes(65 * 48)))
-    (tmp_path / "a.png").write_bytes(whole[:33] + chunk(b"iCCP", bytes(20)) + whole[33:])
-    assert read_image(tmp_path / "a.png").shape == (48, 64)
-    (tmp_path / "b.png").write_bytes(png((64, 48), b"no stream"))
-    with pytest.raises(SequenceError, match=r"b\.png"):
-        read_image(tmp_path / "b.png")
-    assert capfd.readouterr().err == ""
-
-
 @pytest.mark.parametrize(
     ("form", "channels"), [(".png", 1), (".png", 3), (".png", 4), (".tiff", 3), (".pgm", 1), (".ppm", 3)]
 )
@@ -124,18 +106,6 @@ def test_grey_values_are_as_stored_and_colours_become_grey():
     PIL.Image.fromarray(np.array([[70_000, -5, 100_000]], np.int32)).save(large, "TIFF")
     with pytest.raises(SequenceError, match="int32, not 8 or 16 bit"):
         decode_image(large.getvalue(), "x")
-
-
-def test_an_unreadable_left_image_costs_its_frame(kitti: Path, build: SimpleNamespace, caplog, capfd) -> None:
-    build.cut(kitti / "image_0" / "000002.png")
-    sequence = open_sequence(kitti)
-    with caplog.at_level(logging.WARNING, "slam.sequences"):
-        frames = list(sequence)
-    assert [f.index for f in frames] == [0, 1, 3, 4, 5] and frames[2].stamp == pytest.approx(0.3)
-    (record,) = caplog.records
-    assert record.name == "slam.sequences" and sequence.warnings == [record.getMessage()]
-    assert "frame 2 skipped: " in caplog.text and "000002.png: the image is cut off or damaged" in caplog.text
-    assert capfd.readouterr().err == ""  # neither OpenCV nor libpng says it again
 
 
 def test_damaged_vanished_and_other_images_cost_no_more_than_themselves(kitti: Path, build: SimpleNamespace) -> None:
