@@ -1,22 +1,17 @@
 """Way of one frame through the code: files entered, calls from one file to another, and Python calls in all.
 
-    python benchmarks/calls.py KITTI_FOLDER [--frame 20] [--backends ekf window]
-
 Calls inside the back end and the window solver are left out; the front end has done its work before.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from slam.sequences import Sequence, open_sequence
+from slam.sequences import Sequence
 from slam.system import StereoSlam
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -60,25 +55,3 @@ def ways_of(sequence: Sequence, backend: str, first: int, last: int) -> list[Way
         sys.setprofile(None)
         ways.append(way)
     return ways[first:]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder")
-    parser.add_argument("--frame", type=int, default=20)
-    parser.add_argument("--backends", nargs="+", default=["ekf", "smoother", "window"])
-    parser.add_argument("--files", action="store_true", help="list calls by file entered")
-    arguments = parser.parse_args()
-    for backend in arguments.backends:
-        (way,) = ways_of(open_sequence(arguments.folder), backend, arguments.frame, arguments.frame + 1)
-        files, across, calls = way.summary()
-        print(f"{backend}: {files} files, {across} calls between files, {calls} calls")
-        if arguments.files:
-            entered: Counter[str] = Counter()
-            for (_, called), n in way.calls.items():
-                entered[called.removeprefix(str(ROOT))] += n
-            print("\n".join(f"{n:6d} {name}" for name, n in entered.most_common(60)))
-
-
-if __name__ == "__main__":
-    main()

@@ -157,3 +157,11 @@ def write_storage(path: Path, entries: dict[str, np.ndarray | int]) -> None:
     for name, value in entries.items():
         storage.write(name, value)
     storage.release()
+
+
+def write_video(path: Path, images: list[np.ndarray], codec: str = "mp4v", rate: float = 30.0) -> None:
+    """A video in colour of grey images."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), rate, images[0].shape[::-1])
+    for pixels in images:
+        writer.write(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR))
+    writer.release()

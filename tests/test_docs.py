@@ -25,6 +25,7 @@ from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
 from slam.sequences.rigs import write_opencv
 from slam.settings import require_settable
+from tests.recordings import write_storage, write_video
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parent.parent
@@ -104,20 +105,12 @@ def test_a_bag_is_written_and_read_again(tmp_path, monkeypatch, raw, name):
 
 @pytest.mark.slow
 def test_the_webcam_in_15_lines_writes_a_path(tmp_path, monkeypatch, capsys):
-    import cv2
-
     text = (DOCS / "examples" / "webcam.py").read_text()
     assert len([line for line in text.splitlines() if line.strip()]) <= 15
     sequence = slam.open_sequence("synthetic:desk?frames=8&width=160&height=120")
     K, T = sequence.rig.left.K, sequence.rig.R @ sequence.rig.b
-    file = cv2.FileStorage(str(tmp_path / "calibration.yaml"), cv2.FILE_STORAGE_WRITE)
-    for name, value in {"K1": K, "K2": K, "R": np.eye(3), "T": T}.items():
-        file.write(name, value)
-    file.release()
-    video = cv2.VideoWriter(str(tmp_path / "both.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5.0, (320, 120))
-    for frame in sequence:
-        video.write(cv2.cvtColor(np.hstack([frame.left, frame.right]), cv2.COLOR_GRAY2BGR))
-    video.release()
+    write_storage(tmp_path / "calibration.yaml", {"K1": K, "K2": K, "R": np.eye(3), "T": T})
+    write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in sequence], "MJPG", 5.0)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["webcam.py", "both.avi?layout=sbs"])
     exec(compile(text, "webcam.py", "exec"), {})

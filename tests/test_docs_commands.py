@@ -16,6 +16,7 @@ import pytest
 import slam
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.export import write_euroc
+from tests.recordings import write_storage, write_video
 from tests.test_docs import DOCS, PAGES, ROOT, blocks, commands
 
 pytestmark = pytest.mark.slow
@@ -46,15 +47,16 @@ def reader(tmp_path_factory):
     for name, file, unit in (("recording", "calibration.yaml", 1), ("mine", "stereo.yml", 1000)):
         (root / name).mkdir()
         write_calibration(root / name / file, sequence.rig, unit)
-    write_side_by_side(sequence, root)
+    both = [np.hstack([frame.left, frame.right]) for frame in sequence]
+    write_images(root / "images", both)
+    for folder in (root, root / "images"):
+        write_calibration(folder / "calibration.yaml", sequence.rig, 1)
+    for name in ("walk", "both"):
+        write_video(root / f"{name}.mp4", both)
     for side in ("left", "right"):
         images = [getattr(frame, side) for frame in sequence]
-        (root / "recording" / side).mkdir()
-        video = cv2.VideoWriter(str(root / "mine" / f"{side[0]}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, (320, 240))
-        for k, image in enumerate(images):
-            cv2.imwrite(str(root / "recording" / side / f"{k:06}.png"), image)
-            video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-        video.release()
+        write_images(root / "recording" / side, images)
+        write_video(root / "mine" / f"{side[0]}.mp4", images)
     shutil.copy(DOCS / "examples" / "pose_fit.py", root)
     (root / "poses").mkdir()
     straight = np.tile(np.eye(4), (60, 1, 1))
@@ -63,30 +65,16 @@ def reader(tmp_path_factory):
     return root
 
 
-def write_side_by_side(sequence, root):
-    """A folder of images that hold both cameras' side by side, and two videos of them, with a calibration each."""
-    (root / "images").mkdir()
-    for folder in (root, root / "images"):
-        write_calibration(folder / "calibration.yaml", sequence.rig, 1)
-    both = [np.hstack([frame.left, frame.right]) for frame in sequence]
-    for k, image in enumerate(both):
-        cv2.imwrite(str(root / "images" / f"{k:06}.png"), image)
-    for name in ("walk", "both"):
-        video = cv2.VideoWriter(str(root / f"{name}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, both[0].shape[1::-1])
-        for image in both:
-            video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-        video.release()
+def write_images(folder, images):
+    folder.mkdir()
+    for k, image in enumerate(images):
+        cv2.imwrite(str(folder / f"{k:06}.png"), image)
 
 
 def write_calibration(path, rig, unit):
     """The rig in OpenCV's names, lengths in `unit` to the metre."""
-    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, camera in (("1", rig.left), ("2", rig.right)):
-        file.write(f"M{name}", camera.K)
-        file.write(f"D{name}", np.zeros(5))
-    file.write("R", rig.R)
-    file.write("T", unit * rig.R @ rig.b)
-    file.release()
+    lenses = {"D1": np.zeros(5), "D2": np.zeros(5)}
+    write_storage(path, {"M1": rig.left.K, "M2": rig.right.K, **lenses, "R": rig.R, "T": unit * rig.R @ rig.b})
 
 
 def shortened(words):
@@ -102,8 +90,6 @@ def shortened(words):
             if "frames=" not in word and "--frames" not in words:
                 word += f"{'&' if '?' in word else '?'}frames={FEW}"
         out.append(SHORTER.get(option) or word)
-    for option in [option for option, value in SHORTER.items() if value is None and option in out]:
-        del out[out.index(option) : out.index(option) + 2]
     added = {"demo": ["--frames", "10"], "compare": ["--workers", "1", "--trials", "1"], "view": ["--to", "shown.rrd"]}
     return out + (added.get(out[1], []) if out[0] == "slam" else [])
 

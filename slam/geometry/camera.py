@@ -161,7 +161,7 @@ class PinholeCamera:
             return _distort_equidistant(ab, np.asarray(self.distortion))
         from slam.geometry import kernels
 
-        return np.asarray(kernels.distort(np.ascontiguousarray(ab), self._coefficients, self._radius_limit, False)[0])
+        return np.asarray(kernels.distort(np.ascontiguousarray(ab), self._coefficients, self._radius_limit))
 
     @cached_property
     def _coefficients(self) -> Array:

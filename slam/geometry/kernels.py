@@ -47,20 +47,15 @@ def triangulate_rectified(camera, uv_left, uv_right):
 
 
 @kernel
-def distort(ab, coefficients, limit, jacobian):
-    """Distorted normalised coordinates (N, 2), and derivatives (N, 2, 2), or (0, 2, 2) if they are not asked for.
-
-    `limit` is the radius beyond which the polynomial folds rays back into the image: NaN there.
-    """
-    out, D, one = np.empty_like(ab), np.empty((len(ab) if jacobian else 0, 2, 2)), np.empty((2, 2))
+def distort(ab, coefficients, limit):
+    """Distorted normalised coordinates (N, 2); NaN beyond `limit`, where the polynomial folds rays back."""
+    out, D = np.empty_like(ab), np.empty((2, 2))
     for i in range(len(ab)):
         a, b = ab[i, 0], ab[i, 1]
         if np.sqrt(a * a + b * b) > limit:
             a = b = np.nan
-        out[i, 0], out[i, 1] = _distorted(coefficients, a, b, one)
-        if jacobian:
-            D[i, 0, 0], D[i, 0, 1], D[i, 1, 0], D[i, 1, 1] = one[0, 0], one[0, 1], one[1, 0], one[1, 1]
-    return out, D
+        out[i, 0], out[i, 1] = _distorted(coefficients, a, b, D)
+    return out
 
 
 @kernel

@@ -15,9 +15,10 @@ from unittest.mock import patch
 import numpy as np
 
 from slam.commands.cli import main
+from tests.fuzz.files import mutate
 from tests.fuzz.harness import LONGEST_LINE, Broken, Subject
 from tests.fuzz.hostile import NUMBERS, PATHS, choose
-from tests.fuzz.readers import mutate, some_format, write
+from tests.fuzz.readers import some_format, write
 from tests.fuzz.settings import TEXTS
 
 _RANGES = (

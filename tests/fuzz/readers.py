@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import os
-import struct
 import tempfile
-import zlib
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 import slam
 from slam.sequences.captures import quiet_libraries
 from tests import recordings
+from tests.fuzz.files import Files, mutate
 from tests.fuzz.harness import Broken, Subject
-from tests.fuzz.hostile import NUMBERS, PATHS, XML_BOMBS, YAML_BOMBS, broken_bytes, broken_text, choose
-
-Files = dict[str, bytes]
+from tests.fuzz.hostile import NUMBERS, PATHS, choose
 
 _OXTS = "49.0 8.4 112.8 0.02 0.01 -1.2 1 1 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 4 9 4 4 0\n"
-
-
-@cache
-def image(seed: int, ending: str = ".png") -> bytes:
-    """A small image file."""
-    return cv2.imencode(ending, recordings.picture(seed))[1].tobytes()
 
 
 def raw(folder: Path) -> Path:
@@ -46,10 +36,7 @@ def videos(folder: Path) -> Path:
     recordings.write_storage(folder / "calibration.xml", recordings.stereo_entries())
     for side in ("left", "right"):
         with quiet_libraries():  # ffmpeg asks only once how much it may say
-            writer = cv2.VideoWriter(str(folder / f"{side}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 20, (64, 48))
-        for k in range(4):
-            writer.write(np.random.default_rng(k).integers(0, 256, (48, 64, 3), dtype=np.uint8))
-        writer.release()
+            recordings.write_video(folder / f"{side}.avi", [recordings.picture(k) for k in range(4)], "MJPG", 20.0)
     return folder
 
 
@@ -123,82 +110,6 @@ def consume(path: str, frames: int = 100) -> None:
         rigid = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 0.1 and (np.linalg.det(R) > 0).all()
         if not (rigid and np.abs(truth.positions).max() < 1e9 and truth.poses[:, :3, 3].any()):
             raise Broken("ground truth that cannot be true is accepted")
-
-
-def mutate(rng: np.random.Generator, files: Files) -> None:
-    """Change one file."""
-    name = choose(rng, sorted(files))
-    kind = int(rng.integers(10))
-    if kind == 0:
-        del files[name]
-        if not files:
-            files["x"] = b""
-    elif kind == 1:
-        stem = choose(rng, (*NUMBERS, "0" * 200 + "7", "9999999999", "9" * 19, "x", "1e3", "١٢"))
-        old = Path(name)
-        files[f"{old.parent}/{stem[:200]}{old.suffix}".removeprefix("./")] = files.pop(name)
-    elif kind == 2 and name.endswith((".csv", ".txt")):
-        files[name] = hostile_truth(rng, files[name].decode("utf-8", "replace")).encode("utf-8", "replace")
-    elif name.endswith((".png", ".avi")):
-        files[name] = hostile_image(rng, files[name])
-    elif name.endswith((".yaml", ".xml", ".json")) and kind < 6:
-        bomb = choose(rng, (*YAML_BOMBS, *XML_BOMBS)).encode("utf-8", "replace")
-        files[name] = choose(rng, (bomb, files[name] + bomb))
-    else:
-        files[name] = broken_text(rng, files[name].decode("utf-8", "replace")).encode("utf-8", "replace")
-
-
-def hostile_truth(rng: np.random.Generator, text: str) -> str:
-    """A table whose numbers are all zero, all turned around, or all huge."""
-    kind = int(rng.integers(4))
-    rows = []
-    for line in text.splitlines():
-        separator = "," if "," in line else " "
-        words = line.split(separator)
-        keep = 1 if separator == "," else 0
-        numbers = words[keep:]
-        if kind == 0:
-            numbers = ["0"] * len(numbers)
-        elif kind == 1:
-            numbers = [f"-{w}" for w in numbers]
-        elif kind == 2:
-            numbers = [w.replace("1", "1e308") for w in numbers]
-        else:
-            numbers = numbers[::-1]
-        rows.append(separator.join([*words[:keep], *numbers]))
-    return "\n".join(rows) + "\n"
-
-
-def hostile_image(rng: np.random.Generator, data: bytes) -> bytes:
-    """An image with a false header, odd chunks, of another kind, or damaged."""
-    kind = int(rng.integers(6))
-    if kind == 0:
-        size = choose(rng, ((30_000, 30_000), (2**31 - 1, 1), (0, 0), (64, 60_000), (64, 48), (1, 1)))
-        return png(size, choose(rng, (b"", rng.bytes(50), zlib.compress(bytes(64 * 48)))), int(choose(rng, (8, 16, 3))))
-    if kind == 1:
-        extra = chunk(
-            choose(rng, (b"iCCP", b"gAMA", b"tEXt", b"zTXt", b"sRGB", b"PLTE", b"IDAT", b"tRNS")), rng.bytes(20)
-        )
-        return data[:33] + extra + data[33:]
-    if kind == 2:
-        ending = choose(rng, (".jpg", ".bmp", ".tiff", ".webp", ".pgm", ".jp2"))
-        return broken_bytes(rng, image(1, ending)) if rng.random() < 0.8 else image(1, ending)
-    if kind == 3:
-        return choose(
-            rng, (b"P5\n60000 60000\n255\n", b"P5 64 48 255\n", b"P2 64 48 65535\n1 2", b"BM" + rng.bytes(60))
-        )
-    return broken_bytes(rng, data)
-
-
-def png(size: tuple[int, int], pixels: bytes, depth: int = 8) -> bytes:
-    """A PNG with right checksums, whatever its header says."""
-    header = struct.pack(">IIBBBBB", *size, depth, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
-
-
-def chunk(kind: bytes, data: bytes) -> bytes:
-    """A chunk of a PNG."""
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 def special(rng: np.random.Generator, root: Path) -> None:

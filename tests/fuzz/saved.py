@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import struct
 import tempfile
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -27,11 +24,11 @@ from slam.run.recording import load_recording, record, save_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run_recording
 from slam.system import StereoSlam
+from tests.fuzz.files import changed
 from tests.fuzz.harness import Broken, Subject
-from tests.fuzz.hostile import VALUES, broken_bytes, broken_text, choose
+from tests.fuzz.hostile import choose
 from tests.fuzz.settings import scene
 
-_NUMBERS = (0, -1, 1, 2**31, 2**62, -(2**63), 1e308, -1e308, 1e-308, 1e30, 1e10, np.nan, np.inf, -np.inf, 0.5)
 _MAP = b"surf-stereo-slam map 6\n"
 
 
@@ -97,28 +94,15 @@ USES: dict[str, Callable[[Path, str], None]] = {
 }  # fmt: skip
 
 
-def changed(name: str, rng: np.random.Generator, folder: Path) -> None:
+def changed_file(name: str, rng: np.random.Generator, folder: Path) -> None:
     """Change a file, and use it where it is accepted."""
     files = {k: v for k, v in _files().items() if Path(k).match(name)}
     for key, data in files.items():
         (folder / key).parent.mkdir(exist_ok=True)
         (folder / key).write_bytes(data)
     key = choose(rng, sorted(files))
-    (folder / key).write_bytes(_changed(rng, key, files[key]))
+    (folder / key).write_bytes(changed(rng, key, files[key]))
     USES[name](folder / key, choose(rng, ("ekf", "smoother")))
-
-
-def _changed(rng: np.random.Generator, name: str, data: bytes) -> bytes:
-    """Bytes, words, members or leaves of a file replaced."""
-    if rng.random() < 0.15:
-        return broken_bytes(rng, data)
-    if name.endswith((".map", ".npz")):
-        archive = data.split(b"\n", 2)[2] if name.endswith(".map") else data
-        return _pack(rng, _mutated(rng, _unpack(archive)))
-    text = data.decode(errors="replace")
-    if name.endswith(".json") and rng.random() < 0.7:
-        text = json.dumps(_hostile_tree(rng, json.loads(text)))
-    return (broken_text(rng, text) if rng.random() < 0.5 else text).encode(errors="replace")
 
 
 def large_map(rng: np.random.Generator, folder: Path) -> None:
@@ -136,102 +120,11 @@ def large_map(rng: np.random.Generator, folder: Path) -> None:
     _go_on(prior_map=known)
 
 
-def _unpack(data: bytes) -> dict[str, bytes]:
-    with zipfile.ZipFile(io.BytesIO(data)) as file:
-        return {name: file.read(name) for name in file.namelist()}
-
-
-def _mutated(rng: np.random.Generator, members: dict[str, bytes]) -> dict[str, bytes]:
-    """A member missing, damaged, with a false header, or with hostile values."""
-    name = choose(rng, sorted(members))
-    kind = int(rng.integers(6))
-    if kind == 0:
-        del members[name]
-        members.setdefault("x.npy", b"")
-    elif kind == 1:
-        members[name] = broken_bytes(rng, members[name])
-    elif kind == 2:
-        members[name] = hostile_header(rng)
-    elif name.endswith(".npy"):
-        out = io.BytesIO()
-        array = _hostile_array(rng, np.load(io.BytesIO(members[name])))
-        np.lib.format.write_array(out, array, allow_pickle=False)
-        members[name] = out.getvalue()
-    else:
-        members[name] = json.dumps(_hostile_tree(rng, json.loads(members[name]))).encode()
-    return members
-
-
-def _hostile_array(rng: np.random.Generator, array: np.ndarray) -> np.ndarray:
-    """An array with hostile numbers, of another type or shape; texts of JSON with hostile leaves."""
-    kind = int(rng.integers(6))
-    if array.dtype.kind == "U":
-        text = str(array)
-        if text.startswith("{"):
-            return np.array(json.dumps(_hostile_tree(rng, json.loads(text))))
-        return np.array(choose(rng, ("", "x", "a\nb", "y" * 100_000, 1.5, 10**10, None, "[" * 5000))).astype("U")
-    if kind == 0:
-        return array[..., None] if rng.random() < 0.5 else array.ravel()
-    if kind == 1:
-        return array.astype(choose(rng, (np.float64, np.int64, np.float32, np.uint8, ">f8", np.complex64, "U5", "?")))
-    if kind == 2:
-        return np.array(choose(rng, (1.5, 2, -1, "1", True)))
-    if kind == 3:
-        return array[: int(rng.integers(len(array) + 1))] if array.ndim else array
-    out, value = np.array(array), choose(rng, _NUMBERS)
-    if out.size:
-        rows = rng.random(out.shape) < choose(rng, (0.01, 0.5, 1.0))
-        rows.flat[int(rng.integers(out.size))] = True
-        if out.dtype.kind in "iu":
-            limits = np.iinfo(out.dtype)
-            value = int(min(max(value, limits.min), limits.max)) if np.isfinite(value) else 0
-        with np.errstate(all="ignore"):
-            out[rows] = value
-    return out
-
-
-def _hostile_tree(rng: np.random.Generator, tree: Any) -> Any:
-    """A tree of JSON with one leaf or branch replaced."""
-    node, parent, key = tree, None, None
-    while isinstance(node, (dict, list)) and len(node) and (parent is None or rng.random() < 0.8):
-        parent = node
-        key = choose(rng, list(node)) if isinstance(node, dict) else int(rng.integers(len(node)))
-        node = node[key]
-    value = choose(rng, [v for v in VALUES if not isinstance(v, (bytes, complex))])
-    if parent is None:
-        return value
-    parent[key] = value
-    return tree
-
-
-def hostile_header(rng: np.random.Generator) -> bytes:
-    """An array whose header says what is not so."""
-    shape = choose(rng, ("(10**12,)", "(1000000000000,)", "(-1,)", "()", "(2,3)", "(" * 3000, "(1,)" * 100, "None"))
-    descr = choose(rng, ("'<f8'", "'|O'", "'<U1000000000'", "[('a', '<f8')]", "'<i8'", "'x'", "None", "'|S0'", "'<U0'"))
-    header = f"{{'descr': {descr}, 'fortran_order': {choose(rng, ('False', 'True', '3'))}, 'shape': {shape}, }}"
-    text = header.encode() + b" " * 10 + b"\n"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", min(len(text), 65_535)) + text + bytes(int(rng.integers(100)))
-
-
-def _pack(rng: np.random.Generator, members: dict[str, bytes]) -> bytes:
-    """An archive: packed as usual, oddly packed, marked as encrypted, or one that unpacks to gigabytes."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", choose(rng, (0, 0, 0, 0, 8, 8, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2))) as file:
-        for name, data in members.items():
-            file.writestr(name, data)
-        if rng.random() < 0.02:
-            file.writestr("bomb.npy", bytes(300_000_000), zipfile.ZIP_DEFLATED)
-    data = out.getvalue()
-    if rng.random() < 0.1:
-        data = data.replace(b"PK\x01\x02\x14\x03\x14\x00\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01\x00")  # encrypted
-    return data
-
-
 SUBJECTS = (
-    Subject("maps", partial(changed, "a.map"), quiet=False, short=40),
-    Subject("recordings", partial(changed, "a.npz"), quiet=False, short=40),
-    Subject("databases", partial(changed, "objects.npz"), quiet=False, short=20),
-    Subject("kept calibrations", partial(changed, "rig.json"), quiet=False, short=30),
-    Subject("run folders", partial(changed, "run/*"), quiet=False, short=40),
+    Subject("maps", partial(changed_file, "a.map"), quiet=False, short=40),
+    Subject("recordings", partial(changed_file, "a.npz"), quiet=False, short=40),
+    Subject("databases", partial(changed_file, "objects.npz"), quiet=False, short=20),
+    Subject("kept calibrations", partial(changed_file, "rig.json"), quiet=False, short=30),
+    Subject("run folders", partial(changed_file, "run/*"), quiet=False, short=40),
     Subject("extreme maps", large_map, quiet=False, short=12),
 )

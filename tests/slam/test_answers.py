@@ -1,4 +1,4 @@
-"""Nonsense from a back end or a front end of elsewhere ends a step with one line that names the method."""
+"""Parts of elsewhere that raise or answer nonsense end a step with one line: the frame, the part and the method."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
 from slam.config import SystemConfig
 from slam.data import Patches, StereoFrame
-from slam.errors import MeasurementError, SlamError
+from slam.errors import ConfigurationError, MeasurementError, PartError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
+from slam.third_party import named_failures
 from tests.frontends.scenes import stereo_pair
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
@@ -106,3 +107,50 @@ def test_a_front_end_whose_features_are_no_features_ends_in_one_line():
 
     with pytest.raises(MeasurementError, match="uv_right must be an array of 2 dimensions"):
         StereoSlam(RIG, Flat(RIG, features=50)).process(StereoFrame(0, 0.0, LEFT, RIGHT))
+
+
+class Failing(EkfBackend):
+    def __init__(self, method: str, error: BaseException) -> None:
+        super().__init__(RIG, models=EstimatorModels())
+        self.error = error
+        setattr(self, method, self.fails)
+
+    def fails(self, *_: object, **__: object) -> None:
+        raise self.error
+
+
+class Blind(SurfFrontend):
+    def extract(self, frame):
+        raise StopIteration
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("no way"), SystemExit(3), StopIteration()])
+@pytest.mark.parametrize("method", ["predict", "estimate"])
+def test_a_failing_back_end_is_named_and_the_cause_is_kept(method, error):
+    system = StereoSlam(RIG, "surf", Failing(method, error))
+    with pytest.raises(PartError, match=rf"^frame 0: Failing.fails failed: {type(error).__name__}") as raised:
+        system.process(LEFT, RIGHT, 0.0)
+    assert raised.value.__cause__ is error
+
+
+def test_a_front_end_that_stops_does_not_end_the_frames():
+    system = StereoSlam(RIG, Blind(RIG), "ekf")
+    frames = [StereoFrame(0, 0.0, LEFT, RIGHT)]
+    for overlap in (True, False):
+        with pytest.raises(PartError, match=r"^frame 0: Blind.extract failed: StopIteration"):
+            list(system.run(frames, overlap))
+
+
+def test_exceptions_of_our_own_parts_and_interrupts_go_on():
+    for error in (ValueError("a defect"), np.linalg.LinAlgError("singular")):
+        with pytest.raises(type(error)), named_failures("frame 0", EkfBackend(RIG, models=EstimatorModels())):
+            raise error
+    with pytest.raises(KeyboardInterrupt), named_failures("frame 0", Failing("predict", ValueError())):
+        raise KeyboardInterrupt
+
+
+def test_what_is_no_part_is_refused():
+    with pytest.raises(ConfigurationError, match="back end int is none: it lacks predict"):
+        StereoSlam(RIG, None, 3)
+    with pytest.raises(ConfigurationError, match="rig must be a StereoRig, got NoneType"):
+        StereoSlam(None)

@@ -16,7 +16,7 @@ import pytest
 from slam.errors import SequenceError
 from slam.sequences import open_sequence
 from slam.sequences.images import MOST_PIXELS, decode_image, read_image
-from tests.fuzz.readers import png
+from tests.fuzz.files import png
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
