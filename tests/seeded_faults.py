@@ -100,7 +100,7 @@ FAULTS = (
         "tests/slam/window tests/backends/test_window.py",
     ),
     Fault(
-        "a pose relative to the reference changes the wrong way", "slam/window/kernels.py",
+        "a pose relative to the reference changes the wrong way", "slam/window/terms.py",
         "A[at + i, j] = (1.0 if i == j else 0.0) if p == 0 else -Ad[i, j]",
         "A[at + i, j] = (1.0 if i == j else 0.0) if p == 0 else Ad[i, j]",
         "tests/slam/window tests/backends/test_window.py",
