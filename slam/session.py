@@ -70,7 +70,7 @@ class Session:
         atlas = Atlas.of_earlier_run(prior_map.keyframes, prior_map.keyframe_poses, prior_map.loops)
         dimensions, mapped = prior_map.dimensions if len(prior_map) else None, len(prior_map) > 0
         tracks = Tracks.empty(prior_map.descriptors.shape[1]).with_landmarks(prior_map.rows)
-        return State(first, tracks, atlas, dimensions=dimensions, mapped=mapped, prior_map=prior_map)
+        return State(first, tracks, atlas, dimensions=dimensions, ever_mapped=mapped, prior_map=prior_map)
 
     def found_in_prior_map(self, state: State, features: StereoFeatures) -> State | None:
         """The state with a back end at the pose at which the camera is found in the prior map; None if it is not.

@@ -252,10 +252,10 @@ class StereoSlam:
             step = t.update(state, step)
             if isinstance(step, Elsewhere):  # the place is unknown: a new map begins, see `slam.session`
                 return step
-        with stage("estimate"):  # the pose; the calibration learns from it
+        with stage("estimate"):  # the pose; the calibration learns from the one on which the matches agree
             step = t.estimate(state, step)
-        with stage("objects"):  # still, moving or undecided; moving bodies (paper B, 3): `slam.bodies.detector`
-            step = t.sort(state, step)
+        with stage("objects"):  # which features may move or do; moving bodies (paper B, 3): `slam.bodies.detector`
+            step = t.classify(state, step)
         with stage("manage"):  # count, erase and add landmarks (paper A, IV): `slam.tracks.mapper`
             step = t.manage(state, step)
         with stage("atlas"):  # the frame may become a keyframe, a loop corrects the path: `slam.atlas`
@@ -292,7 +292,7 @@ class StereoSlam:
             step = session.with_takeover(self._state, state, step)
         step = replace(step, repeated=repeated)
         common = tracker.rig_error.common(state.backend, as_reported=True)
-        result = frame_result(step, atlas, state.mapped, revision, self._stages.milliseconds, common)
+        result = frame_result(step, atlas, state.ever_mapped, revision, self._stages.milliseconds, common)
         self._state, self._stages = state.after(step, atlas, checksum), Stages()
         return out(result)
 

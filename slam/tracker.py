@@ -1,7 +1,8 @@
 """The parts of a system and the stages of a step, each a function of the frame in work; `slam.system` orders them.
 
-`State` is all that a step starts from and leaves behind. A step builds a new one beside it, which takes its place at
-the end, so that a step has happened or has not.
+`State` is what a step starts from and leaves behind. A step builds a new one beside it, which takes its place at the
+end. What lies outside of it, the back end's map, the detector's bodies and the columns of tracks that are followed, is
+undone or forgotten by `Tracker.roll_back` after a step that an exception ended.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class State:
     tracking: TrackingState = field(default_factory=TrackingState)  # how localization has gone
     standing: Standing = field(default_factory=Standing)  # whether the camera stands
     dimensions: int | None = None  # length of the descriptors; None before the first feature
-    mapped: bool = False  # whether there ever was a landmark
+    ever_mapped: bool = False  # whether there ever was a landmark
     measured_at: float = -np.inf  # time of the last frame whose pose was measured, or in which a new map began [s]
     checksum: tuple[int, int] | None = None  # of the images; None without images, or of images that show nothing
     # in which the camera has not been found yet; None without one, or once it is found
@@ -72,11 +73,11 @@ class State:
 
     def after(self, step: Step, atlas: Atlas, checksum: tuple[int, int] | None) -> State:
         """The state after one more frame."""
-        located = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
+        located = not step.tracking.unmeasured or not self.ever_mapped or self.begins_at(step.index)
         return replace(
             self, tracks=step.tracks, atlas=atlas, index=step.index, tracking=step.tracking,
             standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
-            checksum=checksum, mapped=self.mapped or len(step.added) > 0,
+            checksum=checksum, ever_mapped=self.ever_mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
             measured_at=step.features.stamp if located else self.measured_at,
         )  # fmt: skip
@@ -188,7 +189,7 @@ class Tracker:
         step = Step(index, aligned, replace(corrected, images=None), prediction, tracks, matches, standing, tracking)
         suspects = self._suspects(step)
         matches = matches.select(~isin(matches.ids, suspects))
-        tracks.find(tracks.rows(matches.ids), matches.rows)
+        tracks.set_features(tracks.rows(matches.ids), matches.rows)
         return replace(step, matches=matches, suspects=suspects)
 
     def _suspects(self, step: Step) -> IdArray:
@@ -223,7 +224,7 @@ class Tracker:
         estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
         return replace(step, estimate=estimate)
 
-    def sort(self, state: State, step: Step) -> Step:
+    def classify(self, state: State, step: Step) -> Step:
         """Which features move, and the moving bodies."""
         features, standing = step.features, step.standing
         labels, objects = self.objects.step(state.backend, step.tracks, features, step.estimate, standing.witnesses)
@@ -315,7 +316,7 @@ def _status(step: Step, mapped_before: bool) -> tuple[FrameStatus, str]:
     """How a frame ended, and why where it was not tracked."""
     if step.report.status is UpdateStatus.FAILED:
         return FrameStatus.FAILED, step.report.reason
-    if not step.tracking.unmatched:
+    if not step.tracking.unmeasured:
         return FrameStatus.TRACKED, ""
     if not mapped_before:
         return (FrameStatus.STARTED, "") if len(step.added) else (FrameStatus.PREDICTED, "nothing to see yet")

@@ -69,7 +69,7 @@ class LoopCloser:
     def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> Atlas:
         """The atlas after a frame; `path` returns the path in odom so far."""
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
-        wanted = begins or (not step.tracking.unmatched and self._is_keyframe(atlas, step))
+        wanted = begins or (not step.tracking.unmeasured and self._is_keyframe(atlas, step))
         if not (self._enabled and wanted):
             return atlas
         landmark_of = step.matches.landmark_of(len(step.features))

@@ -91,7 +91,7 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> N
     deviation = np.sqrt(np.maximum(S[m, 2, 2], s.sigma**2))  # rounding may leave a covariance that is not definite
     allowance = _RIGHT_SIGMAS * deviation + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth
     good = ~(np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance)  # NaN compares false
-    tracks.find(rows[m[good]], row[good])
+    tracks.set_features(rows[m[good]], row[good])
     taken[row[good]] = True
 
 
@@ -110,7 +110,7 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     allowed = away < c.max_speed * frame.dt + unknown
     looks, features = (tracks.look[left], tracks.laplacian[left]), frame.features.select(free)
     found = features_of_tracks.match_everywhere(*looks, features, c.wide_d_match, c.wide_ratio, allowed)
-    tracks.find(left[found.tracks], free[found.features])
+    tracks.set_features(left[found.tracks], free[found.features])
 
 
 def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) -> BodyBelief | None:

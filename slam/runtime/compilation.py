@@ -266,8 +266,8 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Enter a stage; its time is taken where no exception ends it."""
+        """Enter a stage; where no exception ends it, its time adds to that of the same stage before."""
         self.begun = True
         start = working_time()
         yield
-        self.milliseconds[name] = 1e3 * (working_time() - start)
+        self.milliseconds[name] = self.milliseconds.get(name, 0.0) + 1e3 * (working_time() - start)

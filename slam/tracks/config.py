@@ -124,8 +124,8 @@ class MapConfig:
         descriptor_update: weight of the newest descriptor in a landmark's descriptor; 1 keeps the last, 0 the first.
         lost_after: the camera is lost after this many frames without a match, if the predicted pixels are less certain
             than `AssociationConfig.tight_window`.
-        restart_after: after this many unmatched frames with enough features to be localised in a known place, a new map
-            begins at the predicted pose; again after as many more.
+        restart_after: after this many frames without a measured pose, with enough features to be localised in a known
+            place, a new map begins at the predicted pose; again after as many more.
         max_landmarks: largest size of the map; beyond it, the landmarks measured longest ago are erased.
         monocular: features without a stereo match become landmarks too, once two views give a depth (paper B, 2.2):
             in every frame, never, or, for null (in Python None), in frames in which no feature has one.

@@ -125,7 +125,7 @@ class Search:
         is asked for a pose, which is treated likewise, but is accepted at once if the prediction allows it and enough
         landmarks match around it.
         """
-        models, stamp, doubtful = self.localizer.models, self.features.stamp, tracking.unmatched > 0
+        models, stamp, doubtful = self.localizer.models, self.features.stamp, tracking.unmeasured > 0
         matches, farthest = self.match(doubtful), self.config.lost_jump if doubtful else self.config.max_jump
         T = matches.T_world_left
         if T is None:

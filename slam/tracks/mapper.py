@@ -144,7 +144,7 @@ class Mapper:
         m, tracks, rows, matches = self.config, step.tracks, step.tracks.mapped, step.matches
         matches = matches.select(isin(matches.ids, step.report.used))
         expected = rows[:0]
-        if not step.tracking.unmatched:
+        if not step.tracking.unmeasured:
             size = (self.rig.left.width, self.rig.left.height)
             shown = expected_landmarks(view, step.features, size, m.view_margin, m.occlusion_radius)
             shown &= self._localizer.similar_view(view.T_world_left, tracks.seen_from[rows], view.positions)

@@ -60,7 +60,7 @@ NO_POSE = PoseHypotheses()
 class TrackingState:
     """How localization has gone recently."""
 
-    unmatched: int = 0  # frames since the pose was last measured
+    unmeasured: int = 0  # frames since the pose was last measured
     unknown: int = 0  # how many of these had enough features to be localised in a mapped place
     # the pose has not been measured for so long, and the prediction is so uncertain, that it is not known
     lost: bool = False
@@ -82,9 +82,9 @@ class TrackingState:
         """
         if measured:
             return TrackingState(doubted=self.doubted, believed=self.believed, stood=stands, hidden_at=self.hidden_at)
-        unmatched, enough = self.unmatched + 1, stereo_features >= ENOUGH_FEATURES
-        lost = self.lost or (uncertain and unmatched >= lost_after)
-        return replace(self, unmatched=unmatched, unknown=self.unknown + enough, lost=lost, showed_enough=enough)
+        unmeasured, enough = self.unmeasured + 1, stereo_features >= ENOUGH_FEATURES
+        lost = self.lost or (uncertain and unmeasured >= lost_after)
+        return replace(self, unmeasured=unmeasured, unknown=self.unknown + enough, lost=lost, showed_enough=enough)
 
     def believing(self, T_world_left: Array, stamp: float, hidden_at: Array | None = None) -> TrackingState:
         """A copy in which a pose (4, 4) at a time [s] is believed, and none is doubted."""
@@ -106,7 +106,7 @@ class TrackingState:
 
     def may_add(self, restart_after: int) -> bool:
         """Whether new landmarks may join the map: not while the pose is unknown, unless the place is not in the map."""
-        return not self.unmatched or self.in_unknown_place(restart_after)
+        return not self.unmeasured or self.in_unknown_place(restart_after)
 
 
 @dataclass(frozen=True, eq=False)

@@ -177,7 +177,8 @@ class Tracks(LandmarkTable):
     def begun(self, new: int, window: int) -> Tracks:
         """A copy for another frame: in it there is room for so many `new` rows, and nothing is found yet.
 
-        What is followed is shared with the copy, unless it has windows of another number of frames.
+        The landmarks' columns are copied; what is followed is shared with the copy, unless it has windows of another
+        number of frames. After a step that fails, `Tracker.roll_back` therefore forgets what was followed.
         """
         tracks = self
         if self.dof.shape[1] != window:
@@ -230,7 +231,7 @@ class Tracks(LandmarkTable):
         """Number of measurements of tracks in the window (M,)."""
         return np.asarray(np.count_nonzero(self.dof[rows], axis=1))
 
-    def find(self, rows: IndexArray, features: IndexArray) -> None:
+    def set_features(self, rows: IndexArray, features: IndexArray) -> None:
         """Rows (K,) are found as these features, in place; of rows alike to the bit, the first has the feature."""
         features, first = np.unique(features, return_index=True)
         self.row[rows[first]] = features

@@ -19,7 +19,7 @@ def features(count: int) -> StereoFeatures:
 def followed(count: int) -> Tracks:
     """A table in which the first rows are found as one feature each, and followed."""
     tracks, rows = Tracks.empty(8, 4, rows=count + 2), np.arange(count)
-    tracks.find(rows, rows)
+    tracks.set_features(rows, rows)
     tracks.begin(rows, 100 + rows, features(count), np.zeros((count, 3)))
     return tracks
 
