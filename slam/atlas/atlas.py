@@ -231,7 +231,7 @@ class Atlas:
         poses, count, m = self.poses.copy(), len(self), len(rig.root)
         if path is not None:
             poses[self.prior_count :] = path.poses[np.searchsorted(path.stamps, self.stamps[self.prior_count :])]
-        none = np.zeros((6, m))  # of keyframes of a prior map that was made without common errors
+        none = np.zeros((6, m))  # of keyframes of a map that was made without the rig's uncertainty
         shares = np.array([k.jacobian if k.jacobian.shape[1] == m else none for k in self.keyframes])
         steps = np.array([k.step_covariance for k in self.keyframes])
         common = (shares.reshape(6 * count, m) @ rig.root).reshape(count, 6, rig.root.shape[1])

@@ -41,7 +41,8 @@ def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Traject
             the path between is then as much too small as the two disagree.
     """
     given, common = atlas, None if atlas.solved is None else atlas.solved.belief(rig)[0]
-    limit = _AMONG_LOOPS if atlas.loops else _FROM_PATH
+    between = any(x.first < loop.second and x.second > loop.first for x in atlas.loops)
+    limit = _AMONG_LOOPS if between else _FROM_PATH
 
     def without_it(atlas: Atlas) -> tuple[Chain, PoseGraph, float]:
         """The path, the pose graph without the loop, and the loop's distance from it."""
@@ -62,8 +63,10 @@ def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Traject
             chain, graph, _ = without_it(atlas)
         elif atlas.loops and not is_informative(graph, loop):
             return atlas.with_inactive_loop(loop)
+        # one that was the first may be farther off the path than those that came after it
+        limits = np.where(graph.disagreement() > _AMONG_LOOPS, _FROM_PATH, _AMONG_LOOPS)
         graph = graph.with_loop(loop)
-        if (graph.disagreement() > _AMONG_LOOPS).any():
+        if (graph.disagreement() > [*limits, limit]).any():
             return _refused(replace(atlas, pending=None), chain, loop, rig)
         return atlas.with_loop(loop).solved_by(graph, rig)
     except np.linalg.LinAlgError:
@@ -135,7 +138,7 @@ def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array) -> l
         while joined:
             whole = PoseGraph.solved(chain, [*members, *joined], start, also)
             off = whole.disagreement()
-            if (off <= _AMONG_LOOPS).all():
+            if off[0] <= _FROM_PATH and (off[1:] <= _AMONG_LOOPS).all():
                 members, graph = [*members, *joined], whole
                 break
             del joined[int(np.argmax(off[len(members) :]))]

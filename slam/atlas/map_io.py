@@ -33,7 +33,7 @@ from slam.tracks.table import LandmarkTable
 from slam.version import __version__
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 6  # fixed: of the file format
+_VERSION = 7  # fixed: of the file format
 _TEXTS = ("frontend", "world_frame", "written_by")  # of the header
 _DATE = (1980, 1, 1, 0, 0, 0)  # fixed: NumPy's for all members, so that the same map gives the same bytes
 

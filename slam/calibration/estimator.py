@@ -104,13 +104,14 @@ class SelfCalibration:
         Errors beyond 5 standard deviations of what is allowed to a calibration are none of it: the true ones are larger
         still, as the prior holds them back.
         """
-        error = float(self._focal @ self._own.mean)
+        error = float(self._focal @ (self._own.mean - self._prior.mean))
         allowed = np.sqrt(self._focal @ (self._prior.covariances[-1] + self.posterior.covariance) @ self._focal)
-        if abs(error - self._focal @ self._prior.mean) <= 5 * allowed:
+        if abs(error) <= 5 * allowed:
             return ""
         return (
-            f"the images fit a focal length at least {abs(100 * error):.0f} % {'shorter' if error > 0 else 'longer'} "
-            "than the calibration's: is the calibration of this camera, and for images of this size?"
+            f"the images fit a focal length at least {abs(100 * error):.1f} % {'shorter' if error > 0 else 'longer'} "
+            f"than the {'' if self._kept is None else 'kept '}calibration's: is it of this camera, and for images of "
+            "this size?"
         )
 
     def apply(self, least: float = 0.0) -> Revision | None:

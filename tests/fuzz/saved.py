@@ -29,7 +29,7 @@ from tests.fuzz.harness import Broken, Subject
 from tests.fuzz.hostile import choose
 from tests.fuzz.settings import scene
 
-_MAP = b"surf-stereo-slam map 6\n"
+_MAP = b"surf-stereo-slam map 7\n"
 
 
 @lru_cache(maxsize=1)

@@ -75,7 +75,7 @@ def test_any_altered_byte_is_found():
 
 
 def signed(body: bytes) -> bytes:
-    return b"surf-stereo-slam map 6\n" + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+    return b"surf-stereo-slam map 7\n" + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
 
 
 def with_member(name: str, content: bytes | None) -> bytes:
@@ -146,9 +146,9 @@ def test_other_files_and_versions_are_refused(tmp_path):
     (tmp_path / "text").write_text("hello")
     with pytest.raises(SlamError, match="not a saved map"):
         load_map(tmp_path / "text")
-    for version in (b"2", b"5"):
-        data = encode(some_map()).replace(b"map 6\n", b"map " + version + b"\n", 1)
-        with pytest.raises(SlamError, match=f"version '{version.decode()}'.*version 6"):
+    for version in (b"2", b"6"):
+        data = encode(some_map()).replace(b"map 7\n", b"map " + version + b"\n", 1)
+        with pytest.raises(SlamError, match=f"version '{version.decode()}'.*version 7"):
             decode(data, "a.map")
     with pytest.raises(SlamError, match="cannot be written"):
         save_map(tmp_path / "no" / "folder.map", some_map())

@@ -109,7 +109,7 @@ def test_a_common_error_of_the_focal_lengths_is_found_in_a_turn(theta):
 def test_a_focal_length_of_another_camera_is_doubted(share, word):
     camera = CAR.left
     rig = type(CAR).rectified_pair(share * camera.fu, camera.u0, camera.v0, CAR.baseline, CAR.width, CAR.height)
-    assert f"% {word} than the calibration's: is the calibration of this camera" in quarter_turn(None, rig).doubt
+    assert f"% {word} than the calibration's: is it of this camera" in quarter_turn(None, rig).doubt
 
 
 def test_on_a_straight_road_a_common_error_of_the_focal_lengths_stays_unknown():
