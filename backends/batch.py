@@ -144,16 +144,7 @@ class BatchBackend:
 
 
 class _BatchSolution:
-    """A solved problem.
-
-    Attributes:
-        state: what it is the solution for.
-        values: all variables.
-        poses: of the last frames (F, 4, 4), from where the problem begins: the first, or a restart of the smoother.
-        newest: variable of the newest frame.
-        landmarks: serial numbers of the landmarks that are variables.
-        once: how those that are none, but were measured, move with their pose (4, 4), by serial number.
-    """
+    """A solved problem."""
 
     def __init__(self, smoother: SmootherBackend) -> None:
         s, make = smoother.state, smoother.factor_maker
@@ -235,13 +226,7 @@ def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[i
 
 
 def _motions(keys: list[int], dt: Array, make: FactorMaker) -> Iterator[gtsam.NonlinearFactor]:
-    """What ties successive poses: their velocities differ by white noise; the first one has its own prior.
-
-    Args:
-        keys: variables of the poses (N,).
-        dt: times between them (N − 1,) [s].
-        make: makes the factors.
-    """
+    """What ties poses `dt` (N − 1,) [s] apart: velocities differ by white noise; the first one has its own prior."""
     for i, interval in enumerate(dt.tolist()):
         before = float(dt[i - 1]) if i else None
         first = is_first(before, interval)

@@ -99,19 +99,8 @@ class Elsewhere:
 class Tracker:
     """The parts of a system, and the stages of a step.
 
-    Args:
-        rig: the rectified pair.
-        config: settings for it.
-        calibration: of the rig's error.
-        backend: the first one.
-        restarts: whether another one of its kind can take over.
-        objects: detects what moves.
-        frontend: made the features; those of landmarks are aligned with earlier images if it can do that.
-
-    Attributes:
-        rig_error: what the calibration's error adds to the estimate.
-        localizer: finds landmarks; mapper: adds and erases them; loop_closer: finds places.
-        advanced: stamp to which a back end was last advanced [s]; an interrupted step counts.
+    With `restarts` another back end of its kind can take over. The front end made the features; those of landmarks are
+    aligned with earlier images if it can do that.
     """
 
     def __init__(

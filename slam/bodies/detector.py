@@ -58,12 +58,8 @@ class ObjectDetector:
     ) -> IdArray:
         """Ids of landmarks that may have begun to move in this frame or the last ones: see `suspects`.
 
-        Args:
-            tracks: the table of tracks, as the last frame left it.
-            features: of the frame, before the back end's update.
-            at: rows in the table of the landmarks found in it (K,).
-            rows: of their features (K,).
-            T_world_left: the camera's pose (4, 4), as far as it is known.
+        The table is as the last frame left it; `at` are rows in it of the landmarks found in this frame (K,), and
+        `rows` those of their features (K,). The pose (4, 4) is that before the back end's update.
         """
         return np.zeros(0, np.int64)
 
@@ -71,24 +67,15 @@ class ObjectDetector:
         """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
 
     def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
-        """Take note that the rig's correction changes before the next frame.
-
-        Args:
-            tracks: the table of tracks.
-            correct: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
-        """
+        """Take note that `correct` takes rectified rows (uL, vL, uR) (N, 3) [px] of before to what they are now."""
 
     def step(
         self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, still: IndexArray
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Say which features move, before any of them becomes a landmark, and report the bodies.
 
-        Args:
-            backend: gives the camera's last poses with their joint covariance.
-            tracks: the table of tracks; landmarks that were found have their feature already. Changed in place.
-            features: of the frame.
-            estimate: the camera's pose after the update.
-            still: rows of features that stay at their pixels while the camera stands.
+        The table changes in place; landmarks that were found have their feature already. `estimate` is that after the
+        update, `still` are rows of features that stay at their pixels while the camera stands.
         """
         none = np.zeros(0, np.intp)
         return MotionLabels(none, none, np.zeros(0, np.int64)), ()

@@ -72,9 +72,7 @@ class RemainingRigError:
     def revise(self, backend: Backend, restarted: bool) -> Revision | None:
         """Correct a back end's earlier measurements, if it can revise them; returns the change, or None.
 
-        Args:
-            backend: the present one.
-            restarted: part of the path is an earlier back end's and cannot be revised.
+        Where the back end has `restarted`, part of the path is an earlier one's and cannot be revised.
         """
         applied = self._calibration.applied
         if not isinstance(backend, RevisingBackend) or applied is self._measured_with:
@@ -108,12 +106,9 @@ class RemainingRigError:
         ``J₁ S c``, ``J₂ S c``, …, with the same c of unit variance, where S is of the last frame.
 
         Where a whole path is revised, the newest pose stays and all before it move. Poses as reported keep in this way
-        what the earlier correction did to them: as if the world had turned under the path.
-
-        Args:
-            backend: the present one.
-            as_reported: for poses as reported in each frame, with the correction of that time; else for the present
-                path, in which a back end may have revised earlier poses.
+        what the earlier correction did to them: as if the world had turned under the path. `as_reported` asks for poses
+        as reported in each frame, with the correction of that time; else for the present path, in which a back end may
+        have revised earlier poses.
         """
         if not (self._calibration.config.enabled and isinstance(backend, ConsideringBackend)):
             return CommonError()

@@ -36,18 +36,8 @@ _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 
 class SelfCalibration:
     """Estimates the rig's error: its posterior, and the views that wait for a second one.
 
-    Args:
-        rig: the cameras.
-        config: settings.
-        kept: calibration from earlier recordings of this rig; None without one.
-
-    Raises:
-        CalibrationError: `kept` is of another rig.
-        ConfigurationError: there is one, but self-calibration is switched off.
-
-    Attributes:
-        pairs: number of pairs of views in the posterior.
-        unsolved: number of pairs for which no motion was found.
+    `kept` is a calibration from earlier recordings; raises CalibrationError where it is of another rig, and
+    ConfigurationError where self-calibration is switched off.
     """
 
     def __init__(self, rig: StereoRig, config: SelfCalibrationConfig, kept: SavedCalibration | None = None) -> None:

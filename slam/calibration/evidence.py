@@ -103,10 +103,7 @@ class Accumulator:
     the common solution would scatter with covariances equal to their information; the information is divided by the
     factor by which they scatter more (a block version of the sandwich covariance). When there are too many blocks,
     neighbours are merged, so that the blocks, and with them the time over which correlations count, grow with the run.
-
-    Args:
-        inflation: initial factor on variances, until the scatter has been measured.
-        length: initial number of likelihoods in a block.
+    Until the scatter has been measured, that factor is `inflation`; a block has `length` likelihoods at first.
     """
 
     def __init__(self, inflation: float, length: int) -> None:
@@ -166,11 +163,9 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
     """Likelihood of the parameters by one frame's vertical disparities, which an ideal rectified pair does not have.
 
     `points` ``(x, y, d)`` (N, 3) [px] of the matches and `vertical`, right row less left row (N,) [px], are as
-    measured; outliers are identified at `parameters` (n,).
-
-    Returns:
-        The evidence of the parameters (n), and of them followed by the right camera's residual fields of y (n + k). The
-        left camera's fields have the same effect with opposite sign.
+    measured; outliers are identified at `parameters` (n,). Returns the evidence of the parameters (n), and of them
+    followed by the right camera's residual fields of y (n + k): the left camera's have the same effect with opposite
+    sign.
     """
     A, fields = model.field(points)[:, 3], model.residual_field(points)[:, 3]
     squared = np.square(vertical + A @ parameters)

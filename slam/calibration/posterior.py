@@ -150,12 +150,8 @@ def solve(prior: Prior, evidence: Evidence, known: Evidence | None = None) -> Ri
     """Posterior, averaged over the unknown scales of the calibration's errors.
 
     The scales are weighted by their marginal likelihood, so that a calibration without evidence against it is left
-    unchanged instead of following the noise.
-
-    Args:
-        prior: of the parameters.
-        evidence: of the data, from which the prior's scales follow.
-        known: evidence of which the parameters' posterior is computed; None if it is `evidence`.
+    unchanged instead of following the noise. They follow from `evidence`; the posterior is of `known`, where that is
+    another.
     """
     e, information = evidence.e - evidence.S @ prior.mean, prior.information + evidence.S
     fits = np.linalg.solve(information, np.broadcast_to(e[:, None], (len(information), len(e), 1)))[..., 0] @ e

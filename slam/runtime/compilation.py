@@ -253,12 +253,7 @@ event.register("numba:compile", _Notice())
 
 
 class Stages:
-    """Stages of one step, entered one after the other.
-
-    Attributes:
-        begun: whether one has been entered.
-        milliseconds: wall time of each stage that was completed [ms], without that in which kernels were compiled.
-    """
+    """Stages of one step, entered one after the other; their wall times [ms], without that in which kernels compile."""
 
     def __init__(self) -> None:
         self.begun = False

@@ -28,11 +28,7 @@ from slam.window.consensus import CLEAR_MAJORITY, PoseConsensus, find_consensus
 class Localizer:
     """How landmarks are searched for in frames, and when the pose that they give is credible.
 
-    Args:
-        rig: the cameras.
-        config: settings.
-        models: noise of uL, vL, uR [px], and how fast a camera may move.
-        lost_after: frames without a measured pose after which a camera with an uncertain prediction is lost.
+    After `lost_after` frames without a measured pose a camera with an uncertain prediction is lost.
     """
 
     def __init__(self, rig: StereoRig, config: AssociationConfig, models: EstimatorModels, lost_after: int = 5) -> None:

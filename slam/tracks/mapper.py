@@ -59,14 +59,7 @@ class MapView:
 class Mapper:
     """Keeps the map of a system; within a step, nothing else adds landmarks to a back end or removes them.
 
-    Args:
-        rig: the cameras.
-        config: settings.
-        localizer: says which landmarks are seen from a similar viewpoint as before.
-        backend: the first one; it must have `place` if `config.monocular` is true.
-
-    Raises:
-        ConfigurationError: the back end cannot place landmarks.
+    Raises ConfigurationError where `config.monocular` is true and the first back end has no `place`.
     """
 
     def __init__(self, rig: StereoRig, config: MapConfig, localizer: Localizer, backend: Backend) -> None:

@@ -42,20 +42,11 @@ def find_consensus(
 ) -> PoseConsensus:
     """The pose with which most matches agree (RANSAC on minimal sets of three, then least squares on all that agree).
 
-    The guess is tried first, refined on what agrees with it, then on what disagrees with it least, and is enough where
-    a clear majority agrees. Other hypotheses are poses from the left pixels of three matches (P3P).
-
-    Args:
-        rig: the rectified pair.
-        points: landmark positions (M, 3) in world coordinates [m].
-        measured: (M, 3) = (uL, vL, uR), uR NaN for monocular rows.
-        guess: expected pose T_world_left (4, 4).
-        threshold: largest reprojection error of an inlier, on each of uL, vL, uR [px].
-        hypotheses: how many minimal sets are tried.
-        seed: of the random choice.
-
-    Raises:
-        CalibrationError: the rig is not rectified.
+    The guess of T_world_left (4, 4) is tried first, refined on what agrees with it, then on what disagrees with it
+    least, and is enough where a clear majority agrees. The other `hypotheses` are poses from the left pixels of three
+    matches (P3P). Landmarks are at `points` (M, 3) in the world [m], `measured` (M, 3) = (uL, vL, uR) [px], uR NaN for
+    monocular rows; an inlier is off by `threshold` at most in each. Raises CalibrationError where the rig is not
+    rectified.
     """
     matches = _Matches.of(rig, points, measured, threshold)
     clear = CLEAR_MAJORITY * len(points)
@@ -73,14 +64,9 @@ def find_consensus(
 
 
 def landmarks_pose(measure: RectifiedMeasurement, points: Array, z: Array, T: Array, seed: int) -> Array | None:
-    """The pose (4, 4) on which most landmarks agree; None if fewer than five agree.
+    """The pose (4, 4) on which most landmarks (M, 3) in the world [m] agree, by T; None if fewer than five agree.
 
-    Args:
-        measure: projection, pixel noise and gate.
-        points: the landmarks (M, 3) in the world [m].
-        z: measurements (M, 3), see `RectifiedStereo.measure`.
-        T: guess of the pose T_world_left (4, 4).
-        seed: of the random choice.
+    Measurements z (M, 3) are those of `RectifiedStereo.measure`.
     """
     sigma, probability = measure.models.pixel_sigma, measure.models.gate_probability
     threshold = sigma * float(np.sqrt(_AS_NEW * chi_square_limit(3, probability)))

@@ -16,13 +16,10 @@ INFLATION = (3.0, 10.0)  #: factors on the process noise's standard deviation tr
 
 
 def share_by_chance(rejected: Array, limit: float) -> float:
-    """The share of wrong observations that pass a gate by chance.
+    """The share of wrong observations that pass a gate of `limit` by chance.
 
-    The rejected observations show how widely wrong ones scatter about their predictions.
-
-    Args:
-        rejected: squared Mahalanobis distances (R,) of the rejected observations, χ² with three degrees of freedom.
-        limit: the gate.
+    The rejected observations show how widely wrong ones scatter about their predictions: `rejected` (R,) has their
+    squared Mahalanobis distances, χ² with three degrees of freedom.
     """
     median = chi_square_limit(3, 0.5)
     spread = float(np.median(rejected)) / median  # in units of the innovation covariances
@@ -30,13 +27,10 @@ def share_by_chance(rejected: Array, limit: float) -> float:
 
 
 def squared_distances(residuals: Array, covariances: Array) -> Array:
-    """Squared Mahalanobis distances ``νᵀ S⁻¹ ν`` (M,).
+    """Squared Mahalanobis distances ``νᵀ S⁻¹ ν`` (M,) of residuals ν (M, 3) = (uL, vL, uR) [px].
 
-    Args:
-        residuals: ν (M, 3) = (uL, vL, uR) [px]; where uR is NaN the left pixel alone is tested.
-        covariances: S (M, 3, 3) [px²], lower triangles; the last row of a missing uR does not count.
-
-    A row that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
+    Where uR is NaN the left pixel alone is tested. Of the covariances S (M, 3, 3) [px²] lower triangles count. A row
+    that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
     """
     from slam.geometry import kernels
 
@@ -45,11 +39,7 @@ def squared_distances(residuals: Array, covariances: Array) -> Array:
 
 
 def whiteners(covariances: Array) -> Array:
-    """``W = L⁻¹`` (M, 3, 3) with ``S = L Lᵀ``, so that ``W ν`` has covariance I where ν has S (M, 3, 3).
-
-    Raises:
-        numpy.linalg.LinAlgError: a covariance is not positive definite.
-    """
+    """``W = L⁻¹`` (M, 3, 3) with ``S = L Lᵀ`` (M, 3, 3): W ν has covariance I; LinAlgError if S is not definite."""
     from slam.geometry import kernels
 
     W = np.asarray(kernels.whiteners(np.ascontiguousarray(covariances)))
