@@ -20,14 +20,13 @@ from slam.bodies.bodies import (
 )
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.estimator import FRAMES, BodyEstimator
-from slam.bodies.finder import parting
+from slam.bodies.finder import Scene, displacements, parting
 from slam.bodies.fits import fit_positions, fit_velocities, make_room, record, revise_tracks
 from slam.bodies.following import follow, located, observed
 from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
 from slam.bodies.membership import merge
 from slam.bodies.proof import PROOF, Way, by_left_image, with_frame
 from slam.bodies.regions import Region, follow_regions
-from slam.bodies.scene import Scene, displacements
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
 from slam.geometry.rig import StereoRig

@@ -1,7 +1,7 @@
 """Regions that may be a moving body: neighbouring tracks with agreeing velocities, followed over time.
 
 A body that shows few tracks at a time, and each for a few frames only (a cyclist, a distant car), never has as many
-long tracks as `slam.bodies.scene` needs. Here the region is followed instead of its tracks: tracks come and go, the
+long tracks as `slam.bodies.finder` needs. Here the region is followed instead of its tracks: tracks come and go, the
 region's place and velocity stay in a Kalman filter with constant velocity. A region that is followed over more than its
 own size, supported all the way by tracks that move as it does, and contradicted by few inside it, cannot be still:
 where velocities are wrong (false matches, depth noise) the region walks away from the tracks that made it.
