@@ -7,17 +7,20 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.evidence import Accumulator, Evidence, RigEvidence, row_evidence
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
     FOCALS,
+    Accumulator,
+    Evidence,
+    RigEvidence,
     RigPosterior,
     along,
     factory_prior,
     prior_information,
     residual_likelihoods,
     resumed_prior,
+    row_evidence,
     solve,
     systematic_variance,
 )

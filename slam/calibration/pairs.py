@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
+from slam.calibration.posterior import Evidence
 from slam.chi_square import chi_square_limit
 from slam.data import StereoFeatures
 from slam.geometry.arrays import median
