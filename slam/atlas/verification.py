@@ -10,8 +10,7 @@ from slam.atlas.config import AtlasConfig
 from slam.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.data import StereoFeatures
 from slam.geometry.kernels import residuals
-from slam.geometry.pnp import measurement_rows
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable

@@ -32,8 +32,7 @@ from slam.bodies.belief import (
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, Observations, RecentPoses
 from slam.geometry.arrays import isin
-from slam.geometry.pnp import MINIMAL_POINTS
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations

@@ -41,7 +41,7 @@ from slam.bodies.track_kernels import displaced, fit_fixed_points, inverses
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
-from slam.geometry.pnp import measurement_rows
+from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 

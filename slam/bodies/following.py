@@ -17,7 +17,7 @@ from slam.bodies.track_kernels import inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
-from slam.geometry.pnp import measurement_rows
+from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks

@@ -17,7 +17,7 @@ from slam.bodies.fits import AGREES, EXPLAINED, MOVES, ConstantVelocity, constan
 from slam.bodies.frame import Frame
 from slam.data import BoolArray, IndexArray
 from slam.geometry.kernels import squared_distances
-from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.metrics import PathErrors, error_sizes
-from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log
 from slam.object_data import MovingObject
 

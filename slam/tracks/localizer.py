@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
-from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig

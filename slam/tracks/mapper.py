@@ -16,8 +16,7 @@ from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array, isin
-from slam.geometry.pnp import MINIMAL_POINTS
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse, transform
 from slam.interfaces import Backend, MapBackend
 from slam.third_party import checked

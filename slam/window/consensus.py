@@ -11,10 +11,10 @@ import numpy as np
 
 from slam.chi_square import chi_square_limit
 from slam.geometry import kernels
-from slam.geometry.arrays import BoolArray, median
-from slam.geometry.pnp import MINIMAL_POINTS, poses_of_three
-from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
+from slam.geometry.arrays import BoolArray, IndexArray, median
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig
+from slam.geometry.se3 import Array, inverse
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.problem import Rows, Window
 from slam.window.solver import STEPS, solve
@@ -150,7 +150,7 @@ class _Matches:
         while tried < hypotheses:
             count = min(_BATCH, hypotheses - tried)
             triples = among[rng.random((count, len(among))).argsort(axis=1)[:, :MINIMAL_POINTS]]
-            poses = poses_of_three(rig, self.points, measured, triples)
+            poses = _poses_of_three(rig.left, self.points, measured, triples)
             tried += count
             if not len(poses):
                 continue
@@ -160,3 +160,19 @@ class _Matches:
             if (1 - (most / len(self.points)) ** MINIMAL_POINTS) ** tried < 0.01:
                 break
         return best
+
+
+def _poses_of_three(camera: PinholeCamera, points: Array, measured: Array, triples: IndexArray) -> Array:
+    """Poses T_world_left (H, 4, 4) from left pixels of triples (K, 3) of points (M, 3) [m]: up to four each (P3P)."""
+    import cv2
+
+    bearings = camera.normalise(measured[:, :2])
+    poses = []
+    for three in triples:
+        _, turns, shifts = cv2.solveP3P(points[three], bearings[three], np.eye(3), None, cv2.SOLVEPNP_P3P)
+        for turn, shift in zip(turns, shifts):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+            poses.append(inverse(T))
+    found = np.array(poses).reshape(-1, 4, 4)
+    return found[np.isfinite(found).all(axis=(1, 2))]

@@ -17,7 +17,7 @@ from scipy.special import bdtrc, comb
 
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
-from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log
 from slam.window import pose_only
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
