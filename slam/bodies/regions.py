@@ -108,8 +108,11 @@ def _moving_tracks(frame: Frame, tracks: Tracks) -> _Moving:
     return _Moving(rows[k], m, radius[k], spread, moves)
 
 
-def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> list[Region]:
-    """Regions in this frame, the longest known first, and new ones of the tracks that move and support none."""
+def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple[list[Region], list[Region]]:
+    """Regions in this frame, the longest known first, then those of tracks that move and support none.
+
+    As those that go on, and those that have moved for certain.
+    """
     t = _moving_tracks(frame, tracks)
     free, followed = t.moves.copy(), []
     for region in sorted(regions, key=lambda r: -r.frames):
@@ -120,7 +123,9 @@ def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> list[
         r = _supported(r, t, mine)
         if r.unseen <= frame.setup.config.patience:
             followed.append(r)
-    return followed + _new_regions(t, np.flatnonzero(free))
+    followed += _new_regions(t, np.flatnonzero(free))
+    moved = [r.has_moved(frame) for r in followed]
+    return [r for r, far in zip(followed, moved) if not far], [r for r, far in zip(followed, moved) if far]
 
 
 def _supported(r: Region, t: _Moving, mine: BoolArray) -> Region:
