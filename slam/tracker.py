@@ -151,7 +151,7 @@ class Tracker:
             tracks = Tracks.empty(features.descriptors.shape[1])
         tracks = tracks.begun(len(features), self.objects.window)
         landmarks, backend = tracks.landmarks(), state.backend
-        positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks))
+        positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks.ids))
 
         def elsewhere() -> Array | None:
             nonlocal place

@@ -53,6 +53,10 @@ _UPPER_QUARTILE = chi_square_limit(3, 0.75)  # of χ²(3)
 _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
 _HALVES = 0.5 * np.array(list(product((0, 1), repeat=3)))  # of a width, by which windows of a size are apart
 _CELLS = 2**12  # numerics: more than there are windows along an axis
+_ROUNDS = 3  # of leaving out what rather stands still, and fitting again
+_AROUND = 0.5  # of a group's extent in view, how far beyond it landmarks of unknown motion are taken for a part of it
+_LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
+_RIDGE = 1e-6  # numerics: share of the trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +203,6 @@ def tail(alone: Array) -> float:
     return max(1.0, float(np.quantile(alone, 0.75)) / _UPPER_QUARTILE) if len(alone) else 1.0
 
 
-_ROUNDS = 3  # of leaving out what rather stands still, and fitting again
-_AROUND = 0.5  # of a group's extent in view, how far beyond it landmarks of unknown motion are taken for a part of it
-_LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
-_RIDGE = 1e-6  # numerics: share of the trace
-
-
 def find_groups(
     frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]
 ) -> tuple[Scene, IndexArray, list[tuple[int | None, IndexArray]]]:
@@ -232,7 +230,7 @@ def find_groups(
     tracks.doubtful[suspects] = True
     fit_velocities(tracks, np.flatnonzero(tracks.doubtful), frame.times, c.max_speed)
     of_parts = among(len(tracks), np.concatenate([np.zeros(0, np.intp), *(members for _, members in parts)]))
-    alike = of_parts | among(len(tracks), np.concatenate([np.zeros(0, np.intp), *moving]))
+    alike = of_parts | among(len(of_parts), np.concatenate([np.zeros(0, np.intp), *moving]))
     tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
     alone = [(None, members) for members in groups if 2 * of_parts[members].sum() <= len(members)]
     return scene, suspects, [*parts, *alone]

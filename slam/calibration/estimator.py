@@ -47,6 +47,13 @@ from slam.tracks.follow import Matches
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
 
+#: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
+_SIGNIFICANT = 0.5
+
+#: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
+#: tenths of a percent. It scales the whole world, so images never show it.
+BASELINE = 0.002
+
 
 class SelfCalibration:
     """Estimates the rig's error: its posterior, and the views that wait for a second one.
@@ -279,14 +286,6 @@ class SelfCalibration:
 def _mean_variance(changes: Array, covariance: Array) -> float:
     """Mean variance of changes (N, n) by the parameters, with their covariance (n, n)."""
     return float((changes @ covariance * changes).sum(axis=1).mean())
-
-
-#: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
-_SIGNIFICANT = 0.5
-
-#: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
-#: tenths of a percent. It scales the whole world, so images never show it.
-BASELINE = 0.002
 
 
 class RemainingRigError:

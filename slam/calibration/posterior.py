@@ -25,6 +25,39 @@ RESIDUAL_SCALES = np.geomspace(0.05, 5.0, 10)
 _MEDIAN = chi_square_limit(1, 0.5)  # derived: of χ² with one degree of freedom
 _PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts for
 
+#: Standard deviations of the corrections, dimensionless [rad, focal lengths, 1]. A chess board fixes combinations of
+#: parameters far better than each one: a shift of the principal point looks like a turn of the camera, and moves the
+#: centre of the distortion, which is a tangential one. Repeated calibrations therefore scatter by about a hundredth of
+#: the focal length in the principal point, by as much times the angle in the turn that makes up for it, by as much
+#: times k1 (0.3 to 0.4 for wide lenses) in the tangential terms; by some thousandths in focal length and aspect; and by
+#: a hundredth in k1 and k2, whose errors nearly cancel where the board was held, and do not outside.
+SIGMAS = {
+    "cx": 0.014, "cy": 0.014, "f": 0.003, "aspect": 0.0015, "k1": 0.01, "k2": 0.01, "p1": 0.005, "p2": 0.005,
+    "pitch": 0.014, "yaw": 0.02, "roll": 0.004, "down": 0.007, "forward": 0.02,
+}  # fmt: skip
+
+#: Errors that a chess board does bound: the mean over the image of the disparity of far points, and of the vertical
+#: disparity [focal lengths].
+MEAN_DISPARITY = 7e-4
+MEAN_VERTICAL = 1.4e-3  # the same of the vertical disparity [focal lengths]
+
+#: Offset of all disparities [focal lengths]: even after the best calibration, shocks and warming turn the cameras by
+#: less than a milliradian.
+OFFSET = 7e-4
+
+#: Root mean square over the image of the errors of far points' disparities and rows [focal lengths]: about a pixel at a
+#: focal length of 700 px, as reprojection errors would show larger ones. Such fields are smooth, so they have some ten
+#: independent values.
+FIELD = 1.4e-3
+
+#: Error of the focal length common to both cameras, as the board's distance or curvature may compensate it [share].
+FOCAL = 0.005
+
+#: The parameters that such an error changes.
+FOCALS = "left_f", "right_f"
+
+_OFFSETS = (0.03, 0.3, 1.0)  # scales of an offset of the disparity alone, equally probable a priori
+
 
 class Evidence(NamedTuple):
     """A Gaussian likelihood in information form: ``log p = eᵀ θ - θᵀ S θ / 2``."""
@@ -183,40 +216,6 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
     weighted, n = both * weights, A.shape[1]
     S, e = weighted.T @ both, -(weighted.T @ vertical)
     return Evidence(S[:n, :n], e[:n], weighted[:, :n].T @ fields), Evidence(S, e, np.zeros((len(e), 0)))
-
-
-#: Standard deviations of the corrections, dimensionless [rad, focal lengths, 1]. A chess board fixes combinations of
-#: parameters far better than each one: a shift of the principal point looks like a turn of the camera, and moves the
-#: centre of the distortion, which is a tangential one. Repeated calibrations therefore scatter by about a hundredth of
-#: the focal length in the principal point, by as much times the angle in the turn that makes up for it, by as much
-#: times k1 (0.3 to 0.4 for wide lenses) in the tangential terms; by some thousandths in focal length and aspect; and by
-#: a hundredth in k1 and k2, whose errors nearly cancel where the board was held, and do not outside.
-SIGMAS = {
-    "cx": 0.014, "cy": 0.014, "f": 0.003, "aspect": 0.0015, "k1": 0.01, "k2": 0.01, "p1": 0.005, "p2": 0.005,
-    "pitch": 0.014, "yaw": 0.02, "roll": 0.004, "down": 0.007, "forward": 0.02,
-}  # fmt: skip
-
-#: Errors that a chess board does bound: the mean over the image of the disparity of far points, and of the vertical
-#: disparity [focal lengths].
-MEAN_DISPARITY = 7e-4
-MEAN_VERTICAL = 1.4e-3  # the same of the vertical disparity [focal lengths]
-
-#: Offset of all disparities [focal lengths]: even after the best calibration, shocks and warming turn the cameras by
-#: less than a milliradian.
-OFFSET = 7e-4
-
-#: Root mean square over the image of the errors of far points' disparities and rows [focal lengths]: about a pixel at a
-#: focal length of 700 px, as reprojection errors would show larger ones. Such fields are smooth, so they have some ten
-#: independent values.
-FIELD = 1.4e-3
-
-#: Error of the focal length common to both cameras, as the board's distance or curvature may compensate it [share].
-FOCAL = 0.005
-
-#: The parameters that such an error changes.
-FOCALS = "left_f", "right_f"
-
-_OFFSETS = (0.03, 0.3, 1.0)  # scales of an offset of the disparity alone, equally probable a priori
 
 
 @dataclass(frozen=True, eq=False)

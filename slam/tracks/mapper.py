@@ -289,7 +289,7 @@ def undetected_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArr
     unconfirmed = (landmarks.seen < config.confirmed) & (landmarks.unseen > config.erase_missed)
     unconfirmed &= landmarks.last_seen >= 0  # a loaded map's landmarks stay until this run has seen them
     unseen = landmarks.last_seen.max(initial=0) - landmarks.last_seen
-    forgotten = unseen > config.forget_after if config.forget_after else np.zeros(len(landmarks), bool)
+    forgotten = unseen > config.forget_after if config.forget_after else np.zeros_like(lost)
     return np.asarray(lost | rare | unconfirmed | forgotten)
 
 
@@ -299,7 +299,7 @@ def redundant_landmarks(landmarks: LandmarkTable, positions: Array, config: MapC
     Landmarks that have just gone out of view are compared with each other and with all others out of view. Those of a
     loaded map that this run has not seen yet count among the others only.
     """
-    out = np.zeros(len(landmarks), bool)
+    out = np.zeros(len(landmarks.ids), bool)
     gone = np.flatnonzero((landmarks.unseen > config.erase_missed) & np.isfinite(landmarks.seen_from[:, 0]))
     just = gone[(landmarks.unseen[gone] <= 2 * config.erase_missed) & (landmarks.last_seen[gone] >= 0)]
     if not len(just) or not config.spacing:
@@ -321,8 +321,8 @@ def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
     First those that were measured in a single frame, then the others by their last measurement, oldest first; those
     measured in the newest frame last.
     """
-    out = np.zeros(len(landmarks), bool)
-    surplus = len(landmarks) - config.max_landmarks
+    out = np.zeros(len(landmarks.ids), bool)
+    surplus = len(out) - config.max_landmarks
     if surplus > 0:
         now = landmarks.last_seen == landmarks.last_seen.max()
         order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
@@ -337,7 +337,7 @@ def features_of_landmarks(
 
     Positions are the same if they are within `same_distance`, or differ in depth by no more than stereo's uncertainty.
     """
-    out = np.zeros(len(features), bool)
+    out = np.zeros(len(view.points), bool)
     feature, rows = _near_landmarks(features.uv_left, view)
     offset = view.points[feature] - view.local[rows]
     along = np.abs(offset[:, 2]) < SIGMAS * view.depth_sigma[feature]
@@ -349,7 +349,7 @@ def features_of_landmarks(
 
 def doubled_landmarks(view: MapView, landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
     """Which landmarks in view (N,) duplicate another one that was seen more often, or as often and is older."""
-    out = np.zeros(len(landmarks), bool)
+    out = np.zeros_like(view.in_image)
     shown = np.flatnonzero(view.in_image)
     row, rival = _near_landmarks(view.uv_left[shown], view)
     row = shown[row]
