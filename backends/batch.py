@@ -148,7 +148,7 @@ class _BatchSolution:
 
     def __init__(self, smoother: SmootherBackend) -> None:
         s, make = smoother.state, smoother.factor_maker
-        self.state = s
+        self.state = s  # what it is the solution for
         numbers = range(s.begun, s.number + 1)
         stamps, hangs = smoother.path.frames(s.begun)
         before = smoother.path.trajectory(s).poses[-len(stamps) :]
@@ -165,7 +165,7 @@ class _BatchSolution:
             problem.factors.add(factor)
         places = _places(s, make.stereo, numbers)
         known = {serial for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
-        self.landmarks = known.union(places)
+        self.landmarks = known.union(places)  # serial numbers of those that are variables
         for serial in sorted(self.landmarks):
             if serial in known:
                 tracks.add_known(problem, s, serial)
@@ -178,7 +178,7 @@ class _BatchSolution:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
         self._factors, self.newest = problem.factors, keys[-1]
         self.values = minimised(problem, _ITERATIONS)
-        self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])
+        self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])  # (F, 4, 4) from its beginning on
         self.once = self._moved(numbers)
 
     def _moved(self, numbers: range) -> dict[int, Array]:

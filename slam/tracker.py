@@ -113,7 +113,8 @@ class Tracker:
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self.mapper = Mapper(rig, c.map, self.localizer, backend)
         self.loop_closer = LoopCloser(rig, c.atlas.enabled, c.association, c.models, c.map.max_depth_error)
-        self.advanced, self._restarts = -np.inf, restarts
+        self._restarts = restarts
+        self.advanced = -np.inf  # stamp to which a back end was last advanced [s]; an interrupted step counts
         aligns = c.association.align and isinstance(frontend, AligningFrontend)
         self._aligning: AligningFrontend | None = frontend if aligns else None  # type: ignore[assignment]
 

@@ -50,7 +50,7 @@ class Graph:
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
-        self.rebuilds = 0
+        self.rebuilds = 0  # how often it was built anew after a failure
         self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
         self._make, self._lag = make, lag
         self.restart()

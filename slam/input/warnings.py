@@ -47,8 +47,8 @@ class InputWarnings:
     """
 
     def __init__(self, rig: StereoRig, models: EstimatorModels, rows: float) -> None:
-        self.lines: list[str] = []
-        self.repeated = ""
+        self.lines: list[str] = []  # the warnings so far
+        self.repeated = ""  # the warning of repeated images
         self._rig, self._rows = rig, rows
         self._farthest = farthest_apart(rig, models)
         self._stamps: list[float] = []

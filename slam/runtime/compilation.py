@@ -256,7 +256,7 @@ class Stages:
     """Stages of one step, entered one after the other; their wall times [ms], without that in which kernels compile."""
 
     def __init__(self) -> None:
-        self.begun = False
+        self.begun = False  # whether one has been entered
         self.milliseconds: dict[str, float] = {}
 
     @contextmanager
