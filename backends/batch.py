@@ -144,20 +144,11 @@ class BatchBackend:
 
 
 class _BatchSolution:
-    """A solved problem.
-
-    Attributes:
-        state: what it is the solution for.
-        values: all variables.
-        poses: of the last frames (F, 4, 4), from where the problem begins: the first, or a restart of the smoother.
-        newest: variable of the newest frame.
-        landmarks: serial numbers of the landmarks that are variables.
-        once: how those that are none, but were measured, move with their pose (4, 4), by serial number.
-    """
+    """A solved problem."""
 
     def __init__(self, smoother: SmootherBackend) -> None:
         s, make = smoother.state, smoother.factor_maker
-        self.state = s
+        self.state = s  # what it is the solution for
         numbers = range(s.begun, s.number + 1)
         stamps, hangs = smoother.path.frames(s.begun)
         before = smoother.path.trajectory(s).poses[-len(stamps) :]
@@ -174,7 +165,7 @@ class _BatchSolution:
             problem.factors.add(factor)
         places = _places(s, make.stereo, numbers)
         known = {serial for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
-        self.landmarks = known.union(places)
+        self.landmarks = known.union(places)  # serial numbers of those that are variables
         for serial in sorted(self.landmarks):
             if serial in known:
                 tracks.add_known(problem, s, serial)
@@ -187,7 +178,7 @@ class _BatchSolution:
                     problem.factors.add(make.explicit(make.point(z), number, serial))
         self._factors, self.newest = problem.factors, keys[-1]
         self.values = minimised(problem, _ITERATIONS)
-        self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])
+        self.poses = np.array([self.values.atPose3(key).matrix() for key in keys])  # (F, 4, 4) from its beginning on
         self.once = self._moved(numbers)
 
     def _moved(self, numbers: range) -> dict[int, Array]:
@@ -235,13 +226,7 @@ def _places(s: SmootherState, stereo: RectifiedStereo, numbers: range) -> dict[i
 
 
 def _motions(keys: list[int], dt: Array, make: FactorMaker) -> Iterator[gtsam.NonlinearFactor]:
-    """What ties successive poses: their velocities differ by white noise; the first one has its own prior.
-
-    Args:
-        keys: variables of the poses (N,).
-        dt: times between them (N − 1,) [s].
-        make: makes the factors.
-    """
+    """What ties poses `dt` (N − 1,) [s] apart: velocities differ by white noise; the first one has its own prior."""
     for i, interval in enumerate(dt.tolist()):
         before = float(dt[i - 1]) if i else None
         first = is_first(before, interval)

@@ -56,9 +56,9 @@ def exact_rig() -> AbstractContextManager[object]:
     """The rig's uncertainty is added to nothing."""
     stack = ExitStack()
     for name, put in (
-        ("slam.calibration.consider.RemainingRigError.follow", lambda *_, **__: None),
-        ("slam.calibration.consider.RemainingRigError.added_to", lambda _, __, estimate: estimate),
-        ("slam.calibration.consider.RemainingRigError.common", lambda *_, **__: CommonError()),
+        ("slam.calibration.estimator.RemainingRigError.follow", lambda *_, **__: None),
+        ("slam.calibration.estimator.RemainingRigError.added_to", lambda _, __, estimate: estimate),
+        ("slam.calibration.estimator.RemainingRigError.common", lambda *_, **__: CommonError()),
     ):
         stack.enter_context(mock.patch(name, put))
     return stack

@@ -37,10 +37,7 @@ def require_positive(config: object, ranges: Ranges | None = None, owner: str = 
     """Check the types of a configuration dataclass, and that its numbers are positive and in their ranges.
 
     `ranges` has least and largest values by field, both allowed; default: `LEAST` to `MOST`, counts to a million.
-    `owner` says whose settings they are.
-
-    Raises:
-        ConfigurationError: a value is of the wrong type or out of its range.
+    `owner` says whose settings they are. Raises ConfigurationError.
     """
     mark, hints = f"{owner}: " if owner else "", _hints(type(config))  # type: ignore[arg-type]
     for f in fields(config):  # type: ignore[arg-type]
@@ -131,8 +128,7 @@ def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
 def from_options(kind: type[_C], owner: str, options: Mapping[str, Any]) -> _C:
     """A configuration, of the dataclass `kind`, from keyword options of a front end or back end, its `owner`.
 
-    Raises:
-        ConfigurationError: an option is unknown (the message lists the known ones) or out of its range.
+    Raises ConfigurationError where an option is unknown (the message lists the known ones) or out of its range.
     """
     known = [f.name for f in fields(kind)]  # type: ignore[arg-type]
     for key in options:

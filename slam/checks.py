@@ -76,9 +76,8 @@ def require_recent(owner: str, n: int) -> int:
 def require_known(backend: str, ids: IdArray, positions: Array, covariances: Array) -> None:
     """Check landmarks (N) at positions (N, 3) [m] with covariances (N, 3, 3) [m²], as given to a back end of this name.
 
-    Raises:
-        MeasurementError: shapes differ, an id occurs twice, a position is not finite or absurdly far, or a covariance
-            is not symmetric and positive definite.
+    Raises MeasurementError where shapes differ, an id occurs twice, a position is not finite or absurdly far, or a
+    covariance is not symmetric and positive definite.
     """
     n = len(ids)
     if positions.shape != (n, 3) or covariances.shape != (n, 3, 3):
@@ -112,10 +111,8 @@ def known_landmarks(
 ) -> tuple[IdArray, Array, Array]:
     """Copies of landmarks (N,) handed to `slam.interfaces.MapBackend`, checked; they may not be in the table yet.
 
-    Where they are seen, their positions (N, 3) are in the camera's coordinates, in front of it.
-
-    Raises:
-        MeasurementError: as `require_known` and `require_in_front`; or one is in the table already.
+    Where they are seen, their positions (N, 3) are in the camera's coordinates, in front of it. Raises
+    MeasurementError.
     """
     require_known(backend, ids, positions, covariances)
     if seen:

@@ -60,11 +60,7 @@ def note_input(path: str | Path) -> None:
 
 
 def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError) -> bytes:
-    """The content of a regular file of at most `limit` bytes.
-
-    Raises:
-        SlamError: of type `error`, where the file is missing, not a regular file, unreadable or too large.
-    """
+    """The content of a regular file; raises `error` where it is missing, unreadable or larger than `limit`."""
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except OSError as fault:
@@ -107,9 +103,8 @@ def read_object(path: str | Path) -> dict[str, Any]:
 def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict[str, bytes]:
     """The members of a zip archive by name; `source` is its name, for messages.
 
-    Raises:
-        SlamError: of type `error`, if it is damaged, encrypted, compressed in an unusual way, or would unpack to far
-            more than its own size.
+    Raises `error` where it is damaged, encrypted, compressed in an unusual way, or would unpack to far more than its
+    size.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
@@ -188,8 +183,7 @@ def require_utf8(path: Path, error: type[SlamError] = SlamError) -> None:
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write an image as PNG, whatever the file is called; a link that is there is replaced, not followed.
 
-    Raises:
-        OSError: it cannot be written; no part of it is left.
+    Raises OSError where it cannot be written; no part of it is left.
     """
     import cv2
 
@@ -240,8 +234,7 @@ def _require_target(path: Path, error: type[SlamError]) -> None:
 def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator[BinaryIO]:
     """A file to write to, which replaces the old one only when it is complete and on the disk.
 
-    Raises:
-        SlamError: of type `error`, if it cannot be written; nothing is left of it then.
+    Raises `error` where it cannot be written; nothing is left of it then.
     """
     place, temporary = Path(path), None
     try:
@@ -274,14 +267,9 @@ def write_text(path: str | Path, text: str) -> None:
 class RowFile:
     """A text file that grows by whole rows: rows that cannot be written completely are removed again.
 
-    Rows are handed to the operating system before `write` returns, so that a kill loses none. What a link points to is
-    left alone.
-
-    Args:
-        path: of the file; an old one is removed.
-
-    Raises:
-        OSError: it cannot be opened, or what is there is not a regular file.
+    Rows are handed to the operating system before `write` returns, so that a kill loses none. An old file is removed,
+    what a link points to is left alone. Raises OSError where it cannot be opened, or what is there is not a regular
+    file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -312,12 +300,9 @@ class RowFile:
 
 
 def lock_folder(folder: Path) -> int | None:
-    """Keep other runs out of a folder until the returned descriptor is closed, or the process ends.
+    """Keep other runs out of a folder until the returned descriptor is closed, or the process ends; else SlamError.
 
     The folder itself is locked, so that no lock file is left behind. Returns None if the system has no such locks.
-
-    Raises:
-        SlamError: another run has locked it.
     """
     try:
         import fcntl

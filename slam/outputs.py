@@ -54,16 +54,10 @@ class Output:
 
 
 def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), overwrite: bool | None = False) -> None:
-    """Raise where an output could not be written, or would replace what is there.
+    """Raise SlamError where an output could not be written, or would replace what is there.
 
-    Args:
-        outputs: all outputs of a command.
-        inputs: files that it reads, and folders whose files it reads.
-        overwrite: whether files that are there may be replaced, if they are no inputs; None where the command has no
-            such option.
-
-    Raises:
-        SlamError: one line says which output, and why.
+    `inputs` are files that the command reads, and folders whose files it reads: these are never replaced, others if
+    `overwrite` is true, which is None for a command without such an option.
     """
     for output in outputs:
         if "\0" in str(output.path):

@@ -42,12 +42,7 @@ NOT_FOUND = "the camera has not been found in the map yet"
 
 
 class Session:
-    """Replaces a tracker's back end between frames.
-
-    Args:
-        tracker: with the parts of the system.
-        backend: name of the back ends; None if the first one was given as an object, so that no other can be made.
-    """
+    """Replaces a tracker's back end between frames, by one named `backend`; by none where that is None."""
 
     def __init__(self, tracker: Tracker, backend: str | None) -> None:
         self._tracker, self._config, self._backend = tracker, tracker.config, backend
@@ -55,9 +50,8 @@ class Session:
     def begin(self, first: Backend, prior_map: SavedMap | None) -> State:
         """The state before the first frame.
 
-        Raises:
-            ConfigurationError: there is a prior map, but the back end was not given by name, or cannot start in one.
-            SlamError: the map is empty, or too large for the back end.
+        Raises ConfigurationError where there is a prior map, but the back end was not given by name or cannot start in
+        one, and SlamError where the map is empty, or too large for the back end.
         """
         self._tracker.rig_error.follow(first)
         if prior_map is None:
@@ -75,8 +69,7 @@ class Session:
     def found_in_prior_map(self, state: State, features: StereoFeatures) -> State | None:
         """The state with a back end at the pose at which the camera is found in the prior map; None if it is not.
 
-        Raises:
-            SlamError: the descriptors have another length than the map's.
+        Raises SlamError where the descriptors have another length than the map's.
         """
         saved = state.prior_map
         assert saved is not None

@@ -31,12 +31,8 @@ _BRACKETS = 100  # in its value
 def apply_settings(tree: dict[str, Any], settings: Sequence[str] | Mapping[str, Any]) -> None:
     """Change leaves of a configuration's tree in place; types and ranges are checked when it is read back.
 
-    Args:
-        tree: as `slam.config.SystemConfig.to_json` writes it.
-        settings: texts such as ``"map.max_landmarks=300"``, whose values are JSON or plain words; or values by key.
-
-    Raises:
-        ConfigurationError: a text is not of that form, or its section or key is unknown.
+    Settings are texts such as ``"map.max_landmarks=300"``, whose values are JSON or plain words; or values by key.
+    Raises ConfigurationError where a text is not of that form, or its section or key is unknown.
     """
     if isinstance(settings, Mapping):
         for key, value in settings.items():
@@ -63,10 +59,7 @@ def can_be_set(key: str, owner: str = "") -> bool:
 def require_settable(settings: Iterable[str], tree: Mapping[str, Any], frontend: str) -> None:
     """Refuse texts ``section.key=value`` of settings that are the program's own; other faults `apply_settings` finds.
 
-    `tree` is the configuration that they are for, `frontend` the name of the front end.
-
-    Raises:
-        ConfigurationError: one is no setting for users.
+    `tree` is the configuration that they are for, `frontend` the name of the front end. Raises ConfigurationError.
     """
     known = set(leaves(dict(tree)))
     for key in (text.partition("=")[0].strip() for text in settings):

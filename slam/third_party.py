@@ -34,10 +34,8 @@ _IDS, _FINITE = ("ids", "used", "rejected"), ("T_world_left", "covariance", "pos
 def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     """What a method of a back end or front end answered, checked; a step does that with every answer, so it is cheap.
 
-    `sizes` of the arrays, by the letters of `_ANSWERS`, are those that are known.
-
-    Raises:
-        SlamError: it is of another type than documented, an array of another shape, or a pose or position not finite.
+    `sizes` of the arrays, by the letters of `_ANSWERS`, are those that are known. Raises SlamError where it is of
+    another type than documented, an array of another shape, or a pose or position not finite.
     """
     what, (kind, attributes) = f"{type(owner).__name__}.{method}", _ANSWERS[method]
     if not isinstance(answer, kind):
@@ -70,9 +68,6 @@ def named_failures(place: str, *parts: object) -> Iterator[None]:
     """Turn exceptions that a third-party part raised, or that its return values may have caused, into `PartError`.
 
     If all parts are our own, exceptions pass unchanged. `place` is the present operation, for the message.
-
-    Raises:
-        PartError: chained from the exception.
     """
     try:
         yield

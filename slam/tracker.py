@@ -100,19 +100,8 @@ class Elsewhere:
 class Tracker:
     """The parts of a system, and the stages of a step.
 
-    Args:
-        rig: the rectified pair.
-        config: settings for it.
-        calibration: of the rig's error.
-        backend: the first one.
-        restarts: whether another one of its kind can take over.
-        objects: detects what moves.
-        frontend: made the features; those of landmarks are aligned with earlier images if it can do that.
-
-    Attributes:
-        rig_error: what the calibration's error adds to the estimate.
-        localizer: finds landmarks; mapper: adds and erases them; loop_closer: finds places.
-        advanced: stamp to which a back end was last advanced [s]; an interrupted step counts.
+    With `restarts` another back end of its kind can take over. The front end made the features; those of landmarks are
+    aligned with earlier images if it can do that.
     """
 
     def __init__(
@@ -125,7 +114,8 @@ class Tracker:
         self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self.mapper = Mapper(rig, c.map, self.localizer, backend)
         self.loop_closer = LoopCloser(rig, c.atlas.enabled, c.association, c.models, c.map.max_depth_error)
-        self.advanced, self._restarts = -np.inf, restarts
+        self._restarts = restarts
+        self.advanced = -np.inf  # stamp to which a back end was last advanced [s]; an interrupted step counts
         aligns = c.association.align and isinstance(frontend, AligningFrontend)
         self._aligning: AligningFrontend | None = frontend if aligns else None  # type: ignore[assignment]
 
@@ -163,7 +153,7 @@ class Tracker:
             tracks = Tracks.empty(features.descriptors.shape[1])
         tracks = tracks.begun(len(features), self.objects.window)
         landmarks, backend = tracks.landmarks(), state.backend
-        positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks))
+        positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks.ids))
 
         def elsewhere() -> Array | None:
             nonlocal place

@@ -106,8 +106,9 @@ FAULTS = (
         "tests/slam/window tests/backends/test_window.py",
     ),
     Fault(
-        "the gate of a left pixel alone has three degrees of freedom", "slam/window/gating.py",
-        "dof = np.where(np.isnan(residuals[:, 2]), 2, 3)", "dof = np.where(np.isnan(residuals[:, 2]), 3, 3)",
+        "the gate of a left pixel alone has three degrees of freedom", "slam/window/pose_only.py",
+        "limits = chi_square_limits(2 + np.isfinite(problem.z[:, 2]), problem.probability)",
+        "limits = chi_square_limits(np.full(len(problem.z), 3), problem.probability)",
         "tests/slam/window tests/backends/test_window.py",
     ),
     Fault(

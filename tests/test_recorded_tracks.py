@@ -12,8 +12,7 @@ import pytest
 import backends
 from slam.config import SystemConfig
 from slam.data import Observations
-from slam.geometry.pnp import measurement_rows
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse
 from slam.interfaces import Backend
 from slam.window.consensus import find_consensus

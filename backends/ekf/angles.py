@@ -60,14 +60,9 @@ def body_rate_derivative(phi: Array, omega: Array) -> Array:
 
 
 def reanchor(R_world_angles: Array, camera: Array) -> tuple[Array, Array, Array]:
-    """Choose a new angles' world for the attitude of a camera state.
+    """A new angles' world for the attitude of a camera state [r, φ, v, ω] (12,), at present ``R_world_angles`` (3, 3).
 
-    Args:
-        R_world_angles: the present one (3, 3).
-        camera: the camera's state [r, φ, v, ω] (12,).
-
-    Returns:
-        the same state in it, the new ``R_world_angles``, and the Jacobian (12, 12) of the new state by the old.
+    Returns the same state in it, the new ``R_world_angles``, and the Jacobian (12, 12) of the new state by the old.
     """
     phi, omega = camera[3:6], camera[9:12]
     R_new, phi_new = anchor(attitude(R_world_angles, phi))

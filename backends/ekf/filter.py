@@ -206,10 +206,9 @@ class EkfBackend:
         return Trajectory(np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4))
 
     def recent(self, n: int) -> RecentPoses:
-        """The camera's last n poses, at most five, as they were believed in their time; see `slam.data.RecentPoses`.
+        """The last n poses, at most five, as believed in their time; see `slam.data.RecentPoses`.
 
-        Raises:
-            MeasurementError: before the first `predict`, or n is less than one.
+        Raises MeasurementError before the first `predict`, or where n is less than one.
         """
         return self._started("recent").recent_poses(require_recent(self._form.name, n))
 

@@ -33,16 +33,9 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     """Solve with the prior that most observations agree with; None where there is none.
 
     Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
-    ignored: it could move the pose anywhere.
-
-    Args:
-        update: the update.
-        noises: motion noises (12, 12) that may have been there in addition, smallest first.
-        search: finds the pose on which the landmarks agree; only called where nothing else helps.
-        models: how fast a camera may be that restarts.
-
-    Raises:
-        UnsolvableError: there is none, and the reason is numerical.
+    ignored: it could move the pose anywhere. `noises` are motion noises (12, 12) that may have been there in addition,
+    smallest first; `search` is only called where nothing else helps. Raises UnsolvableError where the reason is
+    numerical.
     """
     found, error, most = None, None, (len(update.z) + 1) // 2
     try:

@@ -164,11 +164,7 @@ class Innovation:
         return np.concatenate([y @ self.by_pose, (y.reshape(-1, 1, 3) @ self.own).reshape(-1)])
 
     def whitened(self, used: BoolArray) -> Whitened:
-        """That of some landmarks (mask (M,)), whitened.
-
-        Raises:
-            UnsolvableError: S is not positive definite.
-        """
+        """That of some landmarks (mask (M,)), whitened; UnsolvableError where S is not positive definite."""
         nu, S, out = self.nu, self.S, np.flatnonzero(np.repeat(~used, 3))
         if len(out):
             nu, S = nu.copy(), S.copy()
@@ -270,8 +266,7 @@ class Gated:
 def gate(update: Update, at_guess: bool = False) -> Gated:
     """Test each landmark by itself, with its innovation linearised at the prior or at the guess.
 
-    Raises:
-        UnsolvableError: the prior is not finite, or S is not positive definite.
+    Raises UnsolvableError where the prior is not finite, or S is not positive definite.
     """
     start = update.at(update.camera.at(update.guess)) if at_guess else update.at()
     P, measured = update.covariance, np.isfinite(update.z)
@@ -292,10 +287,8 @@ def solve(gated: Gated) -> Posterior | None:
     """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
-    the worst one, until all that is left agrees; None where nothing is left.
-
-    Raises:
-        UnsolvableError: S is not positive definite, the new state not finite, or the pose's covariance not positive.
+    the worst one, until all that is left agrees; None where nothing is left. Raises UnsolvableError where S or the
+    pose's covariance is not positive definite, or the new state not finite.
     """
     used = gated.used
     while used.any():

@@ -145,10 +145,8 @@ class FilterState:
         Mourikis and Roumeliotis, 2010). If the camera transports its error, the covariance is therefore transported to
         the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
         old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
-        and Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none.
-
-        Raises:
-            UnsolvableError: the new state is not finite.
+        and Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none. Raises
+        UnsolvableError where the new state is not finite.
         """
         update, before, P = found.update, self.landmarks, self.covariance
         camera, state = found.camera, slice(P.left, P.correlated)

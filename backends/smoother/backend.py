@@ -206,11 +206,7 @@ class SmootherBackend:
     # --- copies ---
 
     def __reduce_ex__(self, protocol: object) -> str:
-        """Refuse to be copied: copying gtsam's objects would abort the process.
-
-        Raises:
-            CopyError: always.
-        """
+        """Raises CopyError: copying gtsam's objects would abort the process."""
         raise CopyError(
             f"{type(self).__name__} can be neither copied nor pickled, as gtsam's solver cannot: save the map "
             "(slam.save_map) and start in it, or record the run (--record) and replay it"

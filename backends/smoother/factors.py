@@ -42,12 +42,7 @@ def _parameters(mode: gtsam.LinearizationMode) -> gtsam.SmartProjectionParams:
 
 
 class FactorMaker:
-    """Makes factors for one rig and one set of models.
-
-    Args:
-        stereo: the rectified rig's projection.
-        models: noise and priors.
-    """
+    """Makes factors for one rig and one set of models."""
 
     def __init__(self, stereo: RectifiedStereo, models: EstimatorModels) -> None:
         self.sigma = models.pixel_sigma
@@ -75,11 +70,8 @@ class FactorMaker:
         """The velocity between the last two poses is that before but for noise.
 
         gtsam linearises it where it linearises the rest: at other poses it would pull at the path as a whole, which
-        nothing else holds.
-
-        Args:
-            keys: variables of three successive poses, or of two of which the first velocity is unknown.
-            dt: times between the last three (2,) [s]; the first does not count where there are two.
+        nothing else holds. `keys` are three successive poses with the times `dt` (2,) [s] between them; or two of which
+        the first velocity is unknown, and then the first time does not count.
         """
         n, before, last = len(keys), float(dt[0]), float(dt[1])
 

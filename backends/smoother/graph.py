@@ -46,18 +46,11 @@ class Graph:
 
     Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
     world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
-    known in the world the first pose has its own covariance instead.
-
-    Args:
-        make: makes the factors.
-        lag: number of poses that are smoothed; None for all.
-
-    Attributes:
-        rebuilds: how often it was built anew after a failure.
+    known in the world the first pose has its own covariance instead. With a `lag` of None all poses are smoothed.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
-        self.rebuilds = 0
+        self.rebuilds = 0  # how often it was built anew after a failure
         self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
         self._make, self._lag = make, lag
         self.restart()
@@ -81,10 +74,8 @@ class Graph:
     def followed(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with more poses than the last one; and why the graph was built anew, if it was.
 
-        After a failure there are no landmarks among its variables.
-
-        Raises:
-            SolverError: gtsam fails with the new graph as well.
+        After a failure there are no landmarks among its variables. Raises SolverError where gtsam fails with the new
+        graph as well.
         """
         why = ""
         if self._number < s.number and self._is_of(s):
@@ -99,11 +90,7 @@ class Graph:
         return self.rebuilt(s), why
 
     def rebuilt(self, s: SmootherState, again: int = 0) -> Solved:
-        """The solution with all anew, from what the state keeps; `again` so many times linearised again.
-
-        Raises:
-            SolverError: gtsam fails.
-        """
+        """The solution with all anew, linearised `again` so many times more; SolverError where gtsam fails."""
         self.restart()
         oldest, self._careful = self.oldest(s), max(self._careful, s.number + 1)
         try:
@@ -220,11 +207,7 @@ def held(s: SmootherState, number: int) -> tuple[Array, Array]:
 
 
 def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
-    """The values that fit all factors best, by Levenberg-Marquardt.
-
-    Raises:
-        SolverError: gtsam failed, or found nothing better.
-    """
+    """The values that fit all factors best, by Levenberg-Marquardt; SolverError if gtsam finds nothing better."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(1e-9)

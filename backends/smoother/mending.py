@@ -21,11 +21,7 @@ _ITERATIONS = 20  # numerics: of Levenberg-Marquardt at most
 
 
 def corrected(s: SmootherState, correct: Callable[[Array], Array]) -> SmootherState:
-    """With corrected measurements.
-
-    Raises:
-        MeasurementError: a corrected measurement is not finite.
-    """
+    """With corrected measurements; MeasurementError if one is not finite."""
     marks, shape = s.landmarks, s.landmarks.z.shape
     counts = np.cumsum([0, *map(len, s.sights)])
     rows = np.concatenate([*(sight.z for sight in s.sights), marks.z.reshape(-1, 3)[marks.pose.ravel() >= 0]])
@@ -80,10 +76,9 @@ def path_solved(s: SmootherState, make: FactorMaker, before: Array) -> Array:
 
 
 def optimised(s: SmootherState, make: FactorMaker, first: int) -> Array:
-    """Poses from number `first` on that fit their measurements best; the first has a prior.
+    """Poses from number `first` on that fit their measurements best, the first with a prior.
 
-    Raises:
-        SolverError: gtsam failed, or found nothing better.
+    Raises SolverError as `minimised`.
     """
     problem, tracks = GraphProblem(), Tracks(make, None)
     problem.factors.add(make.prior(first, s.poses[s.of(first)], held(s, first)[0]))

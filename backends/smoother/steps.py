@@ -177,8 +177,7 @@ class Steps(RectifiedMeasurement):
     def added(self, s: SmootherState, ids: IdArray, z: Array) -> SmootherState:
         """With new landmarks at their first sight z (M, 3) in the newest pose (paper A, Eqs. 8 and 10).
 
-        Raises:
-            MeasurementError: one is in the map already, or has no right pixel or no positive depth.
+        Raises MeasurementError where one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
         s = s if s.inside else _entered(s)
@@ -207,8 +206,7 @@ class Steps(RectifiedMeasurement):
     def removed(self, s: SmootherState, ids: IdArray) -> SmootherState:
         """Without landmarks; what their measurements say of the poses stays.
 
-        Raises:
-            MeasurementError: one is not in the map.
+        Raises MeasurementError where one is not in the map.
         """
         keep = np.ones(len(s.landmarks), bool)
         keep[s.landmarks.rows_of(ids)] = False

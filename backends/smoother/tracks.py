@@ -48,10 +48,7 @@ class Tracks:
     A landmark is a smart factor that grows until the landmark goes on in a new one (`SmootherLandmarks.measured`):
     factors end before their first pose leaves the lag. A landmark of which more is known than what was measured is a
     variable of its own, and so are some that were measured for longer: those take over what is in their smart factor.
-
-    Args:
-        make: makes the factors.
-        lag: number of poses that are smoothed; None for all.
+    With a `lag` of None all poses are smoothed.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:

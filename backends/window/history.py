@@ -46,8 +46,7 @@ class History:
     def corrected(self, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> History:
         """With corrected measurements; landmarks of the state before them move to where they are seen at from now on.
 
-        Raises:
-            MeasurementError: a corrected measurement is not finite.
+        Raises MeasurementError if a corrected measurement is not finite.
         """
         measured = [call[1][1] for _, calls in self.parts for call in calls if call[0] in ("updated", "added")]
         z = stereo.corrected("window", np.concatenate([np.zeros((0, 3)), *measured]), correct)

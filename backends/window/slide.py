@@ -29,10 +29,8 @@ def slid(s: WindowState, stereo: RectifiedStereo, config: WindowConfig, field: F
     The oldest pose is the one that the prior is relative to, and stays for some frames; the next ones leave. Landmarks
     that they have measured join the prior, if they are still measured: they keep their covariance with all the others.
     Those that nothing will measure again leave with all their measurements, and so do landmarks beyond the prior's
-    limit, which are then estimated afresh.
-
-    Raises:
-        numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
+    limit, which are then estimated afresh. Raises LinAlgError where the information of what leaves is not positive
+    definite.
     """
     K, oldest = len(s.frames), 0 if s.frames[-1] - s.frames[0] > config.reference else 1
     # landmarks are known relative to the pose that was solved for; the last two poses say how the camera moves

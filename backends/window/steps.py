@@ -96,8 +96,7 @@ class Steps(RectifiedMeasurement):
     def added(self, s: WindowState, ids: IdArray, z: Array) -> WindowState:
         """With new landmarks at their first sight z (M, 3) in the newest pose (paper A, Eqs. 8 and 10).
 
-        Raises:
-            MeasurementError: one is in the map already, or has no right pixel or no positive depth.
+        Raises MeasurementError where one is in the map already, or has no right pixel or no positive depth.
         """
         s.landmarks.require_new(ids)
         s = _with_new(s, ids, *self.first_sight(ids, z))
@@ -107,8 +106,7 @@ class Steps(RectifiedMeasurement):
     def removed(self, s: WindowState, ids: IdArray) -> WindowState:
         """Without landmarks; what their measurements say of the poses stays.
 
-        Raises:
-            MeasurementError: one is not in the map.
+        Raises MeasurementError where one is not in the map.
         """
         left = s.landmarks.ids.copy()
         left[s.landmarks.rows_of(ids)] = -1

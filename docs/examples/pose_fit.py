@@ -4,7 +4,7 @@ import numpy as np
 
 from slam.data import Estimate, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
-from slam.geometry.pnp import measurement_rows
+from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels

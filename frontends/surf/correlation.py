@@ -206,10 +206,9 @@ def align(source, at, warps, image, size, start, min_correlation, reaches, windo
 
 
 def cut_patches(image: NDArray[np.float32], uv: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """The image (H, W) around pixels (N, 2).
+    """The image (H, W) around pixels (N, 2), as patches (N, S, S), and the pixels in them (N, 2).
 
-    Returns:
-        patches (N, S, S), NaN beyond the image and where a pixel is not finite, and the pixels in them (N, 2).
+    Patches are NaN beyond the image and where a pixel is not finite.
     """
     whole = np.floor(np.where(np.isfinite(uv), uv, -2.0 * _MARGIN)).astype(np.intp)
     offsets = np.arange(-_MARGIN, _MARGIN + 1)

@@ -97,15 +97,10 @@ def _sum_areas(space, weights, descriptors, row):
 
 @kernel
 def describe(integral, uv, size, angle, box, weights):
-    """Descriptors (N, 16 or 64) float32 of features.
+    """Descriptors (N, 16 or 64) float32 of features with pixels (N, 2), sizes (N,) [px], angles (N,) [rad], y down.
 
-    Args:
-        integral: see `integral_image`.
-        uv: pixels of the features (N, 2).
-        size: their sizes (N,) [px].
-        angle: their orientations (N,) [rad], y down.
-        box: side of the boxes that are averaged, in cells: `TURNED_BOX` or `UPRIGHT_BOX`.
-        weights: see `gaussian_weights`.
+    `integral` is of `integral_image`, `box` the side of the boxes that are averaged, in cells (`TURNED_BOX` or
+    `UPRIGHT_BOX`), `weights` are `gaussian_weights`.
     """
     rows, lanes = weights.shape
     out = np.zeros((len(uv), 4 * (rows // _SUB) ** 2), np.float32)

@@ -31,13 +31,9 @@ class Filters(NamedTuple):
 
 @lru_cache(maxsize=64)
 def make_filters(octave: int, layers: int, scale: float, stride: int) -> Filters:
-    """Filters of one octave.
+    """Filters of the `layers` of an octave (0-based) that are searched for maxima.
 
-    Args:
-        octave: 0-based.
-        layers: number of layers searched for maxima.
-        scale: factor that brings pixel values to 0..255.
-        stride: width of the integral image.
+    `scale` brings pixel values to 0..255; places are those in an integral image of width `stride`.
     """
     sizes = layer_sizes(octave, layers)
     corners = np.rint(sizes[:, None] * np.arange(10) / 9.0).astype(np.int64)

@@ -259,18 +259,10 @@ def _search(image, shape, band, y, first, last, own, limits, space):
 def search_rows(left, right, uv, low, high, band, min_correlation, uniqueness):
     """Right positions (N, 2) of left features to a pixel or two, by correlation along rows; NaN where there is none.
 
-    A place counts where it correlates with at least `min_correlation`, clearly better than any rival, and where
-    the search back from it, in the left image, does so too and ends within a pixel of where it began.
-
-    Args:
-        left: the rectified left image at half resolution.
-        right: the right one.
-        uv: left pixels (N, 2) at full resolution.
-        low: least disparity [px, full resolution].
-        high: largest disparity.
-        band: rows searched above and below the feature's own [half-resolution px].
-        min_correlation: least correlation.
-        uniqueness: largest ratio ``(1 - best) / (1 - rival)``.
+    A place counts where it correlates with at least `min_correlation`, clearly better than any rival (ratio ``(1 -
+    best) / (1 - rival)`` up to `uniqueness`), and where the search back from it, in the left image, does so too and
+    ends within a pixel of where it began. The rectified images have half resolution, with `band` rows searched above
+    and below the feature's own; pixels `uv` (N, 2) and disparities from `low` to `high` are those of full resolution.
     """
     out = np.full((len(uv), 2), np.nan)
     low, high = 0.5 * low, 0.5 * high

@@ -41,8 +41,7 @@ class Picture:
 def grey(image: NDArray, what: str = "image") -> NDArray:
     """A grey image (H, W), C-contiguous and writeable, from one in grey, BGR or BGRA of any layout.
 
-    Raises:
-        SequenceError: not an array (H, W), (H, W, 3|4), uint8 or uint16; the line begins with `what`.
+    Raises SequenceError, a line that begins with `what`, where it is no array (H, W), (H, W, 3|4) of uint8 or uint16.
     """
     image = np.asarray(image)
     if image.dtype.newbyteorder("=") not in _FULL_SCALE:

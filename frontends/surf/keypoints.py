@@ -67,8 +67,7 @@ class Keypoints(Table):
     def from_cv2(cls, keypoints: Iterable[cv2.KeyPoint]) -> Keypoints:
         """Of OpenCV's key points, of any detector, in their order.
 
-        Raises:
-            SequenceError: something else is among them, or a place or size is impossible.
+        Raises SequenceError where something else is among them, or a place or size is impossible.
         """
         if isinstance(keypoints, Keypoints):
             return keypoints
@@ -104,17 +103,10 @@ def adapted_threshold(threshold: float, count: int, target: int, least: float, m
 
 
 def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], size: tuple[int, int]) -> NDArray[np.intp]:
-    """Rows of at most `limit` features, spread over the image.
+    """Rows (K,), ascending, of at most `limit` features, spread over the image.
 
-    Args:
-        uv: pixels (N, 2), strongest first.
-        limit: number to keep.
-        grid: columns and rows of cells; each has an equal share of `limit`. What some cells leave over goes to the
-            strongest of the others.
-        size: width and height of the image [px].
-
-    Returns:
-        Indices (K,), ascending, so still strongest first.
+    `uv` are pixels (N, 2), strongest first; `grid` has columns and rows of cells in an image of width and height `size`
+    [px]. Each cell has an equal share of `limit`; what some leave over goes to the strongest of the others.
     """
     if len(uv) <= limit:
         return np.arange(len(uv))

@@ -123,17 +123,10 @@ def newton_step(c, curvature, step):
 
 @kernel
 def localise(integral, uv, size, reach):
-    """Maximum of the response next to each feature, in continuous position and size.
+    """Maximum of the response next to each feature with pixel (N, 2) and size (N,) [px], continuous in both.
 
-    Args:
-        integral: see `float_integral_image`.
-        uv: pixels of the features (N, 2).
-        size: their sizes (N,) [px].
-        reach: furthest that a feature may move, in units of its size.
-
-    Returns:
-        (N, 4): x, y, size [px] and the response (for the image's own pixel values) of each; NaN where there is no
-        maximum in reach, or where the filter would leave the image.
+    Returns (N, 4): x, y, size [px] and the response, for the image's own pixel values; NaN where there is no maximum in
+    `reach` of the feature, in units of its size, or where the filter would leave the image of the float `integral`.
     """
     out, largest = np.full((len(uv), 4), np.nan), 0.0
     for i in range(len(size)):

@@ -115,13 +115,9 @@ def _strongest_window(space, n, bins):
 
 @kernel
 def orientations(integral, uv, size, disc):
-    """Angles (N,) [rad], y down, in 0..2π, of features; NaN where no wavelet fits into the image.
+    """Angles (N,) [rad], y down, in 0..2π, of features with pixels (N, 2) and sizes (N,) [px]; `disc` is `DISC`.
 
-    Args:
-        integral: see `integral_image`.
-        uv: pixels of the features (N, 2).
-        size: their sizes (N,) [px].
-        disc: `DISC`.
+    They are NaN where no wavelet fits into the image; `integral` is of `integral_image`.
     """
     out, n = np.full(len(uv), np.nan), len(disc.weights)
     space = (  # columns and rows of the samples, gradients, their angles, and sums

@@ -15,11 +15,7 @@ _SMALLEST_SHARE = 32  # cost: items that are worth a task
 
 
 class Workers:
-    """A few threads for kernels that let go of Python's global lock.
-
-    Args:
-        threads: number of threads, the caller's own included; with 1 everything runs in the caller.
-    """
+    """A few threads, the caller's own included, for kernels that let go of Python's global lock."""
 
     def __init__(self, threads: int) -> None:
         self._threads = threads

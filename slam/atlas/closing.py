@@ -28,17 +28,11 @@ _AMONG_LOOPS = chi_square_limit(_DIMENSIONS, 1 - 1 / 3000)
 
 
 def close(atlas: Atlas, loop: Loop, rig: CommonError, path: Callable[[], Trajectory], same_view: bool) -> Atlas:
-    """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop; else refuse it.
+    """Close a loop that the last keyframe sees, if it agrees with the path and a keyframe shortly before saw the same.
 
-    One that cannot be judged is refused.
-
-    Args:
-        atlas: whose last keyframe sees the loop.
-        loop: to be closed.
-        rig: what the common errors stand for.
-        path: returns the path in odom so far.
-        same_view: the camera sees the same from the same place, which is believed against the path: the covariance of
-            the path between is then as much too small as the two disagree.
+    Else it is refused; one that cannot be judged, too. `path` returns the path in odom so far. With `same_view` the
+    camera sees the same from the same place, which is believed against the path: the covariance of the path between is
+    then as much too small as the two disagree.
     """
     given, common = atlas, None if atlas.solved is None else atlas.solved.belief(rig)[0]
     between = any(x.first < loop.second and x.second > loop.first for x in atlas.loops)

@@ -45,14 +45,9 @@ class Found:
 
 
 class LoopCloser:
-    """Adds keyframes to an atlas and closes loops.
+    """Adds keyframes to an atlas and closes loops, if `enabled`.
 
-    Args:
-        rig: the rectified pair.
-        enabled: whether there are keyframes and loops.
-        association: settings of the search by descriptor.
-        models: with the noise of uL, vL, uR [px].
-        max_depth_error: largest relative standard deviation of a kept feature's depth, the same as a new landmark's.
+    Features whose depth has a relative standard deviation above `max_depth_error` are not kept, as no landmark begins.
     """
 
     def __init__(

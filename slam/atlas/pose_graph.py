@@ -281,8 +281,7 @@ class _Normal:
     def of(cls, count: int, a: NDArray[np.intp], b: NDArray[np.intp], A: Array, B: Array, C: Array) -> _Normal:
         """Of `count` poses, from derivatives (E, 6, 6) of residuals by poses a and b, and (E, 6, m) by common errors.
 
-        Raises:
-            LinAlgError: they are singular, or not finite.
+        Raises LinAlgError where they are singular, or not finite.
         """
         from scipy.sparse import csr_array
         from scipy.sparse.linalg import splu

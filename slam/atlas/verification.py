@@ -10,8 +10,7 @@ from slam.atlas.config import AtlasConfig
 from slam.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.data import StereoFeatures
 from slam.geometry.kernels import residuals
-from slam.geometry.pnp import measurement_rows
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
@@ -52,20 +51,12 @@ def refined_pose(
 ) -> tuple[Array, Array]:
     """Least-squares pose (4, 4) and its covariance (6, 6) from points triangulated in one earlier stereo frame.
 
-    Both frames have noise: a window of two poses, the earlier one fixed. From another viewpoint a feature is found at
-    another point of the surface, and some matches are wrong, so errors may be many times as large. The residuals tell:
-    the covariance has what the jackknife finds beyond that by pixel noise, how far the pose moves when one match is
-    left out (Efron and Stein, Annals of Statistics 9(3), 1981).
-
-    Args:
-        rig: the cameras, rectified.
-        points: in the earlier camera's coordinates (M, 3) [m].
-        measured: (uL, vL, uR) (M, 3) [px] in the present frame; uR NaN where there is no right pixel.
-        T_world_left: initial guess of the present camera's pose in the earlier one's coordinates (4, 4).
-        pixel_sigma: noise of uL, vL, uR [px].
-
-    Raises:
-        LinAlgError: these points do not determine the pose.
+    The points (M, 3) [m] and the guess of the pose (4, 4) are in the earlier camera's coordinates; `measured` (M, 3)
+    [px] is (uL, vL, uR) in the present frame, uR NaN where there is no right pixel. Both frames have noise: a window of
+    two poses, the earlier one fixed. From another viewpoint a feature is found at another point of the surface, and
+    some matches are wrong, so errors may be many times as large. The residuals tell: the covariance has what the
+    jackknife finds beyond that by pixel noise, how far the pose moves when one match is left out (Efron and Stein,
+    Annals of Statistics 9(3), 1981). Raises LinAlgError where these points do not determine the pose.
     """
     stereo, n = RectifiedStereo.of(rig), len(points)
     z = np.concatenate([stereo.project(points)[0], measured - [0.0, 0.0, stereo.doffs]])

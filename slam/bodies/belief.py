@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, RecentPoses
-from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, transform
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate

@@ -20,14 +20,13 @@ from slam.bodies.bodies import (
 )
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.estimator import FRAMES, BodyEstimator
-from slam.bodies.finder import parting
+from slam.bodies.finder import Scene, displacements, parting
 from slam.bodies.fits import fit_positions, fit_velocities, make_room, record, revise_tracks
 from slam.bodies.following import follow, located, observed
 from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
 from slam.bodies.membership import merge
 from slam.bodies.proof import PROOF, Way, by_left_image, with_frame
 from slam.bodies.regions import Region, follow_regions
-from slam.bodies.scene import Scene, displacements
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
 from slam.geometry.rig import StereoRig
@@ -58,12 +57,8 @@ class ObjectDetector:
     ) -> IdArray:
         """Ids of landmarks that may have begun to move in this frame or the last ones: see `suspects`.
 
-        Args:
-            tracks: the table of tracks, as the last frame left it.
-            features: of the frame, before the back end's update.
-            at: rows in the table of the landmarks found in it (K,).
-            rows: of their features (K,).
-            T_world_left: the camera's pose (4, 4), as far as it is known.
+        The table is as the last frame left it; `at` are rows in it of the landmarks found in this frame (K,), and
+        `rows` those of their features (K,). The pose (4, 4) is that before the back end's update.
         """
         return np.zeros(0, np.int64)
 
@@ -71,24 +66,15 @@ class ObjectDetector:
         """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
 
     def revise(self, tracks: Tracks, correct: Callable[[Array], Array]) -> None:
-        """Take note that the rig's correction changes before the next frame.
-
-        Args:
-            tracks: the table of tracks.
-            correct: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
-        """
+        """Take note that `correct` takes rectified rows (uL, vL, uR) (N, 3) [px] of before to what they are now."""
 
     def step(
         self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate, still: IndexArray
     ) -> tuple[MotionLabels, tuple[MovingObject, ...]]:  # fmt: skip
         """Say which features move, before any of them becomes a landmark, and report the bodies.
 
-        Args:
-            backend: gives the camera's last poses with their joint covariance.
-            tracks: the table of tracks; landmarks that were found have their feature already. Changed in place.
-            features: of the frame.
-            estimate: the camera's pose after the update.
-            still: rows of features that stay at their pixels while the camera stands.
+        The table changes in place; landmarks that were found have their feature already. `estimate` is that after the
+        update, `still` are rows of features that stay at their pixels while the camera stands.
         """
         none = np.zeros(0, np.intp)
         return MotionLabels(none, none, np.zeros(0, np.int64)), ()
@@ -145,7 +131,7 @@ class MovingObjectDetector(ObjectDetector):
         follow(tracks, self.bodies, frame)
         self._measure(tracks, frame)
         np.maximum(tracks.parted - 1, 0, out=tracks.parted)
-        tracks.still[:] = tracks.found & among(max(len(features), 1), still)[tracks.row]
+        tracks.still[:] = tracks.found & among(max(len(frame.local), 1), still)[tracks.row]
         self._fit(tracks, frame)
         self._change_members(tracks, frame)
         scene, suspects, groups = finder.find_groups(frame, tracks, self.bodies)
@@ -155,7 +141,9 @@ class MovingObjectDetector(ObjectDetector):
             if new is not None:
                 self._found(new, tracks, frame, group[0])
         if self.setup.config.size > 0:  # nothing gains by it where bodies are resolved, see `slam.bodies.regions`
-            self._follow_regions(tracks, frame)
+            self._regions, moved = follow_regions(self._regions, frame, tracks)
+            for region in moved:
+                self._found(finder.region_group(frame, tracks, region), tracks, frame, far=True)
         self._prove(tracks, frame, scene)
         unproven = (tracks.body >= 0) & ~self._of_proven(tracks)
         c, expelled = self.setup.config, np.flatnonzero(tracks.expelled & tracks.found)
@@ -171,12 +159,12 @@ class MovingObjectDetector(ObjectDetector):
         """Move on by a frame; nothing is followed into the first one."""
         s = self.setup
         self._number += 1
-        measured = among(len(features), tracks.row[tracks.row >= 0])
         if self._number == 0:
             tracks.number[:], tracks.body[:], tracks.dof[:] = -1, -1, 0
         slot = self._number % s.config.window
         self._stamps[slot], self._poses[slot] = features.stamp, estimate.T_world_left
         local = s.rig.triangulate(features.uv_left, features.uv_right)
+        measured = among(len(local), tracks.row[tracks.row >= 0])
         measuring = local[measured & np.isfinite(local[:, 0])]
         self._path = with_estimate(self._path, estimate, s.rig, s.sigma, measuring, FRAMES + 1)
         cameras = recent_poses(backend, FRAMES + 1, self._path, estimate.covariance)
@@ -238,13 +226,6 @@ class MovingObjectDetector(ObjectDetector):
                 self.bodies[id] = with_extent(body, tracks.local[mine])
         merge(self.bodies, tracks)
 
-    def _follow_regions(self, tracks: Tracks, frame: Frame) -> None:
-        """Follow the regions that may move; one that has moved for certain becomes a body."""
-        self._regions = follow_regions(self._regions, frame, tracks)
-        for region in [r for r in self._regions if r.has_moved(frame)]:
-            self._regions.remove(region)
-            self._found(finder.region_group(frame, tracks, region), tracks, frame, far=True)
-
     def _found(
         self, group: finder.MovingGroup, tracks: Tracks, frame: Frame, whole: int | None = None, far: bool = False
     ) -> None:
@@ -305,7 +286,7 @@ class MovingObjectDetector(ObjectDetector):
         tracks.give_up(np.flatnonzero(lost))
         found = np.flatnonzero(tracks.row >= 0)
         anew = found[(tracks.number[found] < 0) & deep[tracks.row[found]]]
-        rows = np.flatnonzero(~among(len(f), tracks.row[found]) & deep)
+        rows = np.flatnonzero(~among(len(deep), tracks.row[found]) & deep)
         unused = np.flatnonzero(~tracks.used)[: len(rows)]
         tracks.row[unused] = rows
         new = np.concatenate([anew, unused])
@@ -320,9 +301,9 @@ class MovingObjectDetector(ObjectDetector):
         return np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
 
     def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
-        n = len(frame.features)
+        n = len(frame.local)
         on, near = membership.tracks_on_bodies(self.bodies, tracks, self.setup.config.margin)
         moving = among(n, tracks.row[on])
-        undecided = among(n, tracks.row[near]) | among(n, tracks.row[tracks.found & tracks.doubtful])
+        undecided = among(n, np.append(tracks.row[near], tracks.row[tracks.found & tracks.doubtful]))
         landmarks = np.sort(tracks.ids[self._of_proven(tracks) & (tracks.ids >= 0)])
         return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks)

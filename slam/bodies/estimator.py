@@ -32,8 +32,7 @@ from slam.bodies.belief import (
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, Observations, RecentPoses
 from slam.geometry.arrays import isin
-from slam.geometry.pnp import MINIMAL_POINTS
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian, so3_log, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
@@ -119,11 +118,7 @@ class BodyEstimator:
         return self._reported(b, id, cameras, True, seen.given.points[joined], none)
 
     def _followed(self, b: BodyBelief, id: int, seen: _Seen | None, cameras: RecentPoses) -> BodyBelief:
-        """The belief with a further frame.
-
-        Raises:
-            numpy.linalg.LinAlgError: it cannot be solved.
-        """
+        """The belief with a further frame; LinAlgError where it cannot be solved."""
         cameras = _of(cameras, np.append(b.stamps, cameras.stamps[-1]))
         earlier = _of(cameras, b.stamps)
         if len(b) >= FRAMES:
@@ -316,11 +311,7 @@ def _has_moved(b: BodyBelief) -> bool:
 
 
 def _of(cameras: RecentPoses, stamps: Array) -> RecentPoses:
-    """The camera's poses at some of their stamps (K,), ascending.
-
-    Raises:
-        numpy.linalg.LinAlgError: one of them is not there.
-    """
+    """The camera's poses at some of their stamps (K,), ascending; LinAlgError where one of them is not there."""
     at = np.searchsorted(cameras.stamps, stamps).clip(0, len(cameras) - 1)
     if len(cameras) < len(stamps) or (cameras.stamps[at] != stamps).any():
         raise np.linalg.LinAlgError("the camera's poses in a body's frames are not known")

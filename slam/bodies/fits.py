@@ -10,8 +10,7 @@ import numpy as np
 from slam.bodies.bodies import Body
 from slam.bodies.track_kernels import constant_velocities, fit_fixed_points, leave_window, points_on_rays
 from slam.data import IndexArray, StereoFeatures
-from slam.geometry.pnp import measurement_rows
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import Array
 from slam.tracks.table import Tracks
 

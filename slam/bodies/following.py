@@ -17,7 +17,7 @@ from slam.bodies.track_kernels import inverses
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
-from slam.geometry.pnp import measurement_rows
+from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.object_data import ObjectObservations
 from slam.tracks import follow as features_of_tracks
@@ -44,7 +44,7 @@ def follow(tracks: Tracks, bodies: Mapping[int, Body], frame: Frame) -> None:
     alive = np.flatnonzero(tracks.number >= 0)
     _advance(tracks, bodies, alive, frame.dt)
     lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
-    taken = among(len(frame.features), tracks.row[tracks.row >= 0])
+    taken = among(len(frame.local), tracks.row[tracks.row >= 0])
     _look(tracks, frame, alive[~lost & (tracks.row[alive] < 0)], taken)
     of_lost = alive[lost]
     of_others = np.setdiff1d(np.flatnonzero(tracks.found & (tracks.body >= 0)), of_lost)

@@ -24,9 +24,9 @@ from scipy.special import chdtrc, fdtrc
 
 from slam.bodies.belief import MIN_POINTS
 from slam.bodies.bodies import Body
+from slam.bodies.finder import Displacements, Scene
 from slam.bodies.fits import EXPLAINED, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.scene import Displacements, Scene
 from slam.chi_square import chi_square_limit
 from slam.data import IndexArray
 from slam.geometry.arrays import median

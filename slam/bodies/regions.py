@@ -1,7 +1,7 @@
 """Regions that may be a moving body: neighbouring tracks with agreeing velocities, followed over time.
 
 A body that shows few tracks at a time, and each for a few frames only (a cyclist, a distant car), never has as many
-long tracks as `slam.bodies.scene` needs. Here the region is followed instead of its tracks: tracks come and go, the
+long tracks as `slam.bodies.finder` needs. Here the region is followed instead of its tracks: tracks come and go, the
 region's place and velocity stay in a Kalman filter with constant velocity. A region that is followed over more than its
 own size, supported all the way by tracks that move as it does, and contradicted by few inside it, cannot be still:
 where velocities are wrong (false matches, depth noise) the region walks away from the tracks that made it.
@@ -17,7 +17,7 @@ from slam.bodies.fits import AGREES, EXPLAINED, MOVES, ConstantVelocity, constan
 from slam.bodies.frame import Frame
 from slam.data import BoolArray, IndexArray
 from slam.geometry.kernels import squared_distances
-from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
@@ -108,8 +108,11 @@ def _moving_tracks(frame: Frame, tracks: Tracks) -> _Moving:
     return _Moving(rows[k], m, radius[k], spread, moves)
 
 
-def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> list[Region]:
-    """Regions in this frame, the longest known first, and new ones of the tracks that move and support none."""
+def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple[list[Region], list[Region]]:
+    """Regions in this frame, the longest known first, then those of tracks that move and support none.
+
+    As those that go on, and those that have moved for certain.
+    """
     t = _moving_tracks(frame, tracks)
     free, followed = t.moves.copy(), []
     for region in sorted(regions, key=lambda r: -r.frames):
@@ -120,7 +123,9 @@ def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> list[
         r = _supported(r, t, mine)
         if r.unseen <= frame.setup.config.patience:
             followed.append(r)
-    return followed + _new_regions(t, np.flatnonzero(free))
+    followed += _new_regions(t, np.flatnonzero(free))
+    moved = [r.has_moved(frame) for r in followed]
+    return [r for r, far in zip(followed, moved) if not far], [r for r, far in zip(followed, moved) if far]
 
 
 def _supported(r: Region, t: _Moving, mine: BoolArray) -> Region:

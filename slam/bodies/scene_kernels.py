@@ -1,6 +1,6 @@
 """Compiled loops of the test of the scene: sums of normal equations over many sets of tracks, and what they say.
 
-Symmetric 6x6 matrices of tracks are kept as their lower triangles (21,), row by row: see `slam.bodies.scene` for the
+Symmetric 6x6 matrices of tracks are kept as their lower triangles (21,), row by row: see `slam.bodies.finder` for the
 meaning of Λ, η and ξ.
 """
 

@@ -116,7 +116,7 @@ def constant_velocities(A, p, rows, times, prior):
 
 @kernel
 def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, rays, centres, slide):
-    """How far tracks went from the older to the recent frames of their windows: see `slam.bodies.scene`.
+    """How far tracks went from the older to the recent frames of their windows: see `slam.bodies.finder`.
 
     Slots have `ages` (W,) in frames, of which `most_recent` are recent at most; `rays` (M, 3) point from the camera,
     which was at `centres` (W, 3), to the tracks. `slide` is the variance of a feature's direction with each angle by

@@ -4,8 +4,7 @@ docs/selfcalibration.md derives the estimator. May import `slam.geometry` and th
 """
 
 from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.consider import RemainingRigError
-from slam.calibration.estimator import SelfCalibration
+from slam.calibration.estimator import RemainingRigError, SelfCalibration
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.posterior import RigPosterior
 from slam.calibration.saved import SavedCalibration, load_calibration, save_calibration

@@ -39,9 +39,6 @@ class RigModel:
 
     The order is: left camera (`LENS`), right camera (the same), `POSE`. In addition, there are residual fields, of
     which only the size is known: they are not corrected, but make the parameters less certain.
-
-    Args:
-        rig: the cameras as calibrated.
     """
 
     names = (*(f"{side}_{name}" for side in ("left", "right") for name in LENS), *POSE)

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
+from slam.calibration.posterior import Evidence
 from slam.chi_square import chi_square_limit
 from slam.data import StereoFeatures
 from slam.geometry.arrays import median
@@ -189,11 +189,9 @@ def parallax(model: RigModel, pair: Pair) -> float:
 def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array, Array]:
     """Transform points ``(x, y, D)`` (N, 3) of one view to another by ``R, t`` [baselines].
 
-    In these coordinates a rigid motion is a homography: ``(x, y, f)ᵀ ← R (x, y, f)ᵀ + D t`` up to the scale that
-    ``D`` shares, with D the true disparity. It has no singularity at infinity, where D = 0.
-
-    Returns:
-        Moved points (N, 3), Jacobians by the points (N, 3, 3), and by ``[rotation (left), t]`` (N, 3, 6).
+    In these coordinates a rigid motion is a homography: ``(x, y, f)ᵀ ← R (x, y, f)ᵀ + D t`` up to the scale that ``D``
+    shares, with D the true disparity. It has no singularity at infinity, where D = 0. Returns moved points (N, 3),
+    Jacobians by the points (N, 3, 3), and by ``[rotation (left), t]`` (N, 3, 6).
     """
     return linearised(points, points, points, R, t, focal, np.eye(3))[:3]
 

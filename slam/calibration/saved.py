@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from slam.calibration.evidence import RigEvidence
 from slam.calibration.model import RigModel
-from slam.calibration.posterior import Prior, RigPosterior, factory_prior, solve
+from slam.calibration.posterior import Prior, RigEvidence, RigPosterior, factory_prior, solve
 from slam.errors import CalibrationError
 from slam.files import expanded, read_text, write_text
 from slam.geometry.rig import StereoRig

@@ -39,11 +39,7 @@ def calibrate(
     opencv: Path | None,
     overwrite: bool,
 ) -> None:
-    """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`.
-
-    Raises:
-        SlamError: bad input; one line says what and where.
-    """
+    """Run recordings of one rig; write and print what they say of it, see `slam.run.calibrating`."""
 
     def show(sequence: StereoSequence, count: int) -> AbstractContextManager[Callable[[FrameResult], None]]:
         return progress(count, f"…{sequence.name[-14:]}", quiet)

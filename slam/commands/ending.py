@@ -74,10 +74,8 @@ def whole_frames(
 ) -> Iterator[Callable[[FrameResult], None]]:
     """A callback for the end of every frame, at which a signal that came meanwhile takes effect.
 
-    Args:
-        after_frame: is called, too.
-        folder: of the run, named in what a signal leaves.
-        until: set by a signal; its run then has no more frames, and Ctrl-C has no further effect.
+    It calls `after_frame`, too. A signal's message names the run's `folder`. Where there is `until`, a signal sets it:
+    its run then has no more frames, and Ctrl-C has no further effect.
     """
     global _in_frames, _until
     done = 0

@@ -96,10 +96,7 @@ class Difference:
 def difference(metric: Metric, reference: Array, other: Array) -> Difference:
     """The paired difference of two back ends in one figure, as the only test; see `adjusted` for several.
 
-    Args:
-        metric: the figure.
-        reference: values (N,) by trial, NaN where a run failed.
-        other: the other's.
+    The values (N,) are by trial, NaN where a run failed.
     """
     both = np.isfinite(reference) & np.isfinite(other)
     values = [reference[both], other[both]]

@@ -47,12 +47,8 @@ _SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
 def run_trial(trial: Trial, folder: Path, recording: Path | None = None) -> None:
     """Run a trial; its files are left in `folder`, `RESULT` last: what is there then is whole.
 
-    Bad input, failures of the estimator and defects of a program are an outcome, kept with the frames done so far.
-
-    Args:
-        trial: what to run.
-        folder: for its files; made where it is missing.
-        recording: for a replay, the measurements of the run that is replayed; a closed loop leaves them as `RECORDING`.
+    Bad input, failures of the estimator and defects of a program are an outcome, kept with the frames done so far. A
+    replay takes the measurements of `recording`; a closed loop leaves its own as `RECORDING`.
     """
     remove_file(folder / RESULT)
     try:

@@ -104,13 +104,9 @@ def _is_trifle(d: Difference) -> bool:
 
 
 def caution(trials: int, tests: int) -> str:
-    """What so many trials can show at best; empty where nothing is tested, or one of so many tests can be certain.
+    """What so many trials of a sequence can show at best; empty where nothing is tested, or one test can be certain.
 
-    Said before the trials are run, and with the same numbers after them.
-
-    Args:
-        trials: of the sequence that has most.
-        tests: that the plan can come to, see `slam.compare.tables.most_tests`.
+    Said before the trials are run, and with the same numbers after them; `tests` is `slam.compare.tables.most_tests`.
     """
     enough = fewest(tests)
     if not tests or trials >= enough:

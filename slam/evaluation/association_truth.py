@@ -12,11 +12,7 @@ from slam.geometry.se3 import Array, inverse, transform
 
 
 class SurfacePoints:
-    """Which point of the still world each landmark is: the one that its feature showed at first sight.
-
-    Args:
-        world: the sequence with its truth, as `slam.worlds.WorldSequence` has it.
-    """
+    """Which point of the still world each landmark is: the one that its feature showed at first sight."""
 
     def __init__(self, world: Any) -> None:
         self._world = world

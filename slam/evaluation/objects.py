@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.metrics import PathErrors, error_sizes
-from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log
 from slam.object_data import MovingObject
 
@@ -88,12 +88,8 @@ class _Life:
 class ObjectScore:
     """Gathers a run's results frame by frame and sums them up.
 
-    Args:
-        bodies: true poses ``T_world_object`` of every body (B, N, 4, 4) by frame, in the truth's world; ids from 1.
-        stamps: of the frames (N,) [s].
-        pixel: how far a body's image moves before it can be said to move [px].
-        focal: focal length [px].
-        cameras: true poses of the left camera (N, 4, 4).
+    `bodies` are true poses ``T_world_object`` (B, N, 4, 4) by frame, in the truth's world, ids from 1; `cameras` those
+    of the left camera (N, 4, 4). A body's image moves by `pixel` [px] before it can be said to move.
     """
 
     def __init__(self, bodies: Array, stamps: Array, cameras: Array, focal: float, pixel: float = 1.0) -> None:

@@ -38,17 +38,11 @@ _MEDIAN = 0.6745  # derived: median of the absolute value of a Gaussian number o
 
 
 def truth_covariances(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray, A: Array) -> Array:
-    """Covariances (M, 6, 6) of the truth's errors in relative poses, ``e_j − A e_i``.
+    """Covariances (M, 6, 6) of the truth's errors in relative poses, ``e_j − A e_i``, of the true path (N), z forward.
 
     Attitude and position have errors of their own, constant in the world but for their change over time. The error of a
-    stamp is one along the motion, independent in each pose.
-
-    Args:
-        true: true poses of the left camera (N), x to the right and z forward.
-        noise: of the truth.
-        first: rows i at which stretches begin (M,).
-        last: rows j at which they end (M,).
-        A: adjoints (M, 6, 6) of the inverse relative poses.
+    stamp is one along the motion, independent in each pose. Stretches begin at the rows `first` (M,) and end at `last`;
+    `A` (M, 6, 6) are adjoints of the inverse relative poses.
     """
     rotated = np.zeros_like(A)
     rotated[:, :3, :3], rotated[:, 3:, 3:] = A[:, :3, :3], A[:, 3:, 3:]

@@ -93,11 +93,7 @@ class LandmarkRows(Table):
         return np.asarray(rows[np.searchsorted(self.ids[rows], 0) :])
 
     def rows_of(self, ids: IdArray | Sequence[int]) -> IndexArray:
-        """Rows (M,) of landmarks.
-
-        Raises:
-            MeasurementError: one is not in the map.
-        """
+        """Rows (M,) of landmarks; MeasurementError where one is not in the map."""
         ids, present = np.asarray(ids, np.int64), self.ids[self.order]
         at = np.searchsorted(present, ids).clip(0, max(len(present) - 1, 0))
         bad = present[at] != ids if len(present) else np.ones(len(ids), bool)

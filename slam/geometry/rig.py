@@ -13,6 +13,12 @@ from slam.geometry.camera import PinholeCamera, floats, size_doubt
 from slam.geometry.se3 import Array, nearest_rotation
 
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
+MINIMAL_POINTS = 3  #: fixed: points that fix a pose
+
+
+def measurement_rows(uv_left: Array, uv_right: Array) -> Array:
+    """Stereo measurements (M, 3) = (uL, vL, uR) of pixels (M, 2); uR is NaN where there is no right pixel."""
+    return np.concatenate([uv_left, uv_right[:, :1]], axis=1)
 
 
 def quarter_turn(turns: int) -> Array:

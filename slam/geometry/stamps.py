@@ -73,11 +73,7 @@ def require_frame(name: str, k: int, length: int) -> int:
 
 
 def frame_range(start: int, stop: int | None, length: int) -> tuple[int, int]:
-    """A checked range of frames: `stop` None or beyond the end means the end.
-
-    Raises:
-        SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
-    """
+    """A checked range of frames: `stop` None or beyond the end means the end; SequenceError where it holds none."""
     if not all(isinstance(number, Integral) for number in (start, length if stop is None else stop)):
         raise SequenceError(f"frames are asked for by whole numbers, not {start!r} to {stop!r}")
     end = length if stop is None else min(stop, length)

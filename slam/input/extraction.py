@@ -25,8 +25,7 @@ _ROWS = 1.5
 def as_frame(left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: float | None, index: int) -> StereoFrame:
     """A frame, or two images (H, W) or (H, W, 3|4) with their time [s], as a frame of this index.
 
-    Raises:
-        MeasurementError: images without a stamp, or a frame with one.
+    Raises MeasurementError for images without a stamp, or a frame with one.
     """
     if isinstance(left, StereoFrame):
         if right is not None or stamp is not None:
@@ -61,13 +60,7 @@ def checksum_of(frame: StereoFrame) -> tuple[int, int] | None:
 class Extractor:
     """Extracts features of frames, in one thread at a time, which may differ from the system's.
 
-    Args:
-        frontend: to use; its settings give the largest row difference of left and right features.
-        rig: the cameras.
-        models: noise of the features.
-
-    Attributes:
-        input_warnings: about the images so far.
+    The front end's settings give the largest row difference of left and right features.
     """
 
     def __init__(self, frontend: Frontend | None, rig: StereoRig, models: EstimatorModels) -> None:
@@ -79,11 +72,9 @@ class Extractor:
     def extract(self, frontend: Frontend | None, frame: StereoFrame) -> Extracted:
         """A frame with its features; where it raises, what is known of the frames before is unchanged.
 
-        Raises:
-            ConfigurationError: there is no front end.
-            MeasurementError: this is no frame, or the features are not as documented.
-            SequenceError: left and right are one image, or exchanged, see `InputWarnings`.
-            SlamError: another thread is extracting; or the front end failed (`PartError`).
+        Raises ConfigurationError without a front end, MeasurementError where this is no frame or the features are not
+        as documented, SequenceError as `InputWarnings`, SlamError where another thread is extracting or the front end
+        failed.
         """
         if frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")

@@ -25,12 +25,10 @@ _COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
 
 
 def documented(features: Any, rig: StereoRig) -> StereoFeatures:
-    """The features with the documented dtypes.
+    """The features with the documented dtypes; MeasurementError where they are not as `StereoFeatures` says.
 
-    Raises:
-        MeasurementError: they are not as `StereoFeatures` says: a wrong type, shape or number of dimensions, a value
-            that is not finite (except NaN in `uv_right`), a pixel farther outside the image than its width or height,
-            a stamp that is no number, or images of another type or size.
+    That is a wrong type, shape or number of dimensions, a value that is not finite (except NaN in `uv_right`), a pixel
+    farther outside the image than its width or height, a stamp that is no number, or images of another type or size.
     """
     if not isinstance(features, StereoFeatures):
         raise MeasurementError(f"features must be StereoFeatures, got {type(features).__name__}")
@@ -72,8 +70,7 @@ def _at(mask: BoolArray, uv: Array) -> BoolArray:
 def following(features: StereoFeatures, dimensions: int | None, after: float) -> StereoFeatures:
     """The features of a frame after the stamp [s] of the last one; without any, descriptors are (0, `dimensions`).
 
-    Raises:
-        MeasurementError: the stamp is not later, or the descriptors are of another length.
+    Raises MeasurementError where the stamp is not later, or the descriptors are of another length.
     """
     if features.stamp <= after:
         raise MeasurementError(
@@ -132,14 +129,7 @@ def _require_images(images: Any, rig: StereoRig) -> None:
 
 
 class Rectification:
-    """The ways between a rig and its rectified pair. Where the rig is rectified, everything passes unchanged.
-
-    Args:
-        rig: the cameras.
-
-    Attributes:
-        rig: the rectified pair.
-    """
+    """The ways between a rig and its rectified pair `rig`. Where it is rectified, everything passes unchanged."""
 
     def __init__(self, rig: StereoRig) -> None:
         self._ways, self._none = rig.rectified, rig.is_rectified

@@ -43,19 +43,12 @@ _UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 class InputWarnings:
     """Checks the front end's input, and warns once of each thing that looks wrong.
 
-    Args:
-        rig: the cameras.
-        models: the motion that is expected.
-        rows: largest row difference at which the front end matches left and right features [px].
-
-    Attributes:
-        lines: the warnings so far.
-        repeated: the warning of repeated images; empty without one.
+    The front end matches features whose rows differ by `rows` [px] at most.
     """
 
     def __init__(self, rig: StereoRig, models: EstimatorModels, rows: float) -> None:
-        self.lines: list[str] = []
-        self.repeated = ""
+        self.lines: list[str] = []  # the warnings so far
+        self.repeated = ""  # the warning of repeated images
         self._rig, self._rows = rig, rows
         self._farthest = farthest_apart(rig, models)
         self._stamps: list[float] = []
@@ -74,9 +67,8 @@ class InputWarnings:
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
         """Check a frame and the features found in it, which are as documented.
 
-        Raises:
-            SequenceError: left and right are exchanged, for certain: no pair before was right, features fit the rig
-                the other way round, and hardly any has a right match as it is. Nothing is changed then.
+        Raises SequenceError, with nothing changed, where left and right are exchanged for certain: no pair before was
+        right, features fit the rig the other way round, and hardly any has a right match as it is.
         """
         own, images = None, _Images(frame, self._rig)
         if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK and not self._pair_warned:  # 0, 1, 2, 4 …
@@ -202,12 +194,10 @@ class InputWarnings:
     def copied(self, frame: StereoFrame, checksum: Checksum | None) -> tuple[Checksum | None, str]:
         """Why the right image is a copy, which measures nothing (empty if it is none), and the frame's checksum.
 
-        A copy is equal, byte for byte, to the left image, or to the right one of the frame before. A left image that
-        is that of the frame before makes the frame a repeated one, whatever the right one is: its checksum is that of
-        the frame before. Nothing is changed until `used`.
-
-        Raises:
-            SequenceError: left and right are equal, and there was no pair of two images before: it is one camera twice.
+        A copy is equal, byte for byte, to the left image, or to the right one of the frame before. A left image that is
+        that of the frame before makes the frame a repeated one, whatever the right one is: its checksum is that of the
+        frame before. Nothing is changed until `used`. Raises SequenceError where left and right are equal, and there
+        was no pair before: it is one camera twice.
         """
         last = self._last
         if checksum is None or not shows_something(frame.right):

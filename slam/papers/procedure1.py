@@ -71,11 +71,7 @@ class ObjectDatabase:
 
     @classmethod
     def load(cls, path: Path) -> ObjectDatabase:
-        """Read what `save` wrote.
-
-        Raises:
-            ConfigurationError: there is no such file, or it is none of a database.
-        """
+        """Read what `save` wrote; ConfigurationError where there is no such file, or it is none of a database."""
         source = f"object database {path}"
         members = unpack(read_bytes(path, _LARGEST, ConfigurationError), source, ConfigurationError)
         names = ("points", "descriptors", "laplacian", "origin")

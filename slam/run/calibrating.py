@@ -12,8 +12,7 @@ import numpy as np
 
 from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
-from slam.calibration.evidence import RigEvidence
-from slam.calibration.posterior import factory_prior
+from slam.calibration.posterior import RigEvidence, factory_prior
 from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult

@@ -142,10 +142,8 @@ def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
 class GrowingMap:
     """Draws the map from above, frame by frame: old landmarks, those in the map, the path, and moving bodies.
 
-    The camera's first direction is upwards.
-
-    Args:
-        metres: that are shown; None for as many as suit the distance of the first landmarks.
+    The camera's first direction is upwards. So many `metres` are shown; None for as many as suit the distance of the
+    first landmarks.
     """
 
     def __init__(self, metres: float | None = None) -> None:
@@ -205,14 +203,8 @@ def output(path: Path) -> Output:
 class FramePictures(ExitStack):
     """Writes pictures of frames to a folder of PNG files, or to a video where the path ends in ``.mp4``.
 
-    The video's rate is that of the first two frames; a single picture is shown for a second.
-
-    Args:
-        path: folder or video.
-        with_map: beside each frame the map that grows, as wide as the frame is high.
-
-    Raises:
-        SlamError: the video cannot be written.
+    The video's rate is that of the first two frames; a single picture is shown for a second. With a map, that grows
+    beside each frame, as wide as the frame is high. Raises SlamError where a video cannot be written.
     """
 
     def __init__(self, path: Path, with_map: bool = False) -> None:

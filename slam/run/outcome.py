@@ -42,15 +42,9 @@ def outcome(
 ) -> str:
     """What to say of a run in which many frames were not tracked, with the likely cause; empty for others.
 
-    Args:
-        record: of the run. Its first frame is not counted: there is no map yet.
-        rig: the cameras.
-        warnings: what looked wrong with the images and their times; the first is taken for a cause.
-            Repeated images are counted instead.
-        in_map: the run began in the map of an earlier one.
-        dropped: frames of a live run that came too late.
-        doubt: of the motion, see `motion_doubt`; a cause where nothing else is one.
-        driving: the motion is known to be that of a vehicle.
+    The first frame is not counted: there is no map yet, unless the run began `in_map`. The first of the `warnings` is
+    taken for a cause; repeated images are counted instead. `dropped` frames of a live run came too late; `doubt`, of
+    `motion_doubt`, is a cause where nothing else is one.
     """
     untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
     frames, missed = len(record.statuses) - 1, len(untracked)

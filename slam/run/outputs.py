@@ -42,14 +42,9 @@ _NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\s+\]")  # as json indents th
 class RunFiles(ExitStack):
     """Writer of a run's folder; a context manager that closes the files.
 
-    The folder is locked meanwhile: two runs in one would spoil each other's files. Each method raises SlamError where a
-    file cannot be written: a whole one is then as it was, and of rows those before stay.
-
-    Args:
-        folder: made if it does not exist; files of an earlier run in it are overwritten.
-
-    Raises:
-        SlamError: the folder cannot be made or written, or another run has it.
+    The folder is made where there is none, and locked meanwhile: two runs in one would spoil each other's files, and
+    SlamError says so. Files of an earlier run are overwritten. Each method raises SlamError where a file cannot be
+    written: a whole one is then as it was, and of rows those before stay.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -127,10 +122,8 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
 def write_json(path: Path, tree: dict[str, Any]) -> None:
     """Write a JSON file at once or not at all; numbers that JSON cannot hold become null.
 
-    Each list of numbers stands on one line: a matrix has a line for each row.
-
-    Raises:
-        SlamError: it cannot be written.
+    Each list of numbers stands on one line: a matrix has a line for each row. Raises SlamError where it cannot be
+    written.
     """
 
     def on_one_line(found: re.Match[str]) -> str:
@@ -141,11 +134,7 @@ def write_json(path: Path, tree: dict[str, Any]) -> None:
 
 @contextmanager
 def naming_folder(folder: Path) -> Iterator[None]:
-    """Turn what the system says of a failed write into an error of ours.
-
-    Raises:
-        SlamError: something could not be written.
-    """
+    """Turn what the system says of a failed write into a SlamError."""
     try:
         yield
     except OSError as error:

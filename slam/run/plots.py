@@ -100,15 +100,9 @@ def _read(folders: Sequence[Path]) -> list[RunData]:
 
 
 def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
-    """Draw runs of one sequence into a file; another picture there is overwritten.
+    """Draw runs of one sequence into a PNG, PDF or SVG by the suffix of `path`, a picture of one of the `KINDS`.
 
-    Args:
-        runs: of the same sequence.
-        path: PNG, PDF or SVG by its suffix.
-        kind: one of `KINDS`.
-
-    Raises:
-        SlamError: the format or the kind is not known, or the file cannot be written.
+    Another file there is overwritten. Raises SlamError where format or kind is unknown, or the file cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix not in _METADATA:

@@ -43,12 +43,9 @@ def load(
 ) -> tuple[RunOptions, dict[str, str]]:
     """Read the ``config.json`` of a run: its options, and the versions that it was made with.
 
-    `path` is the file, or the run's folder; the others are taken in place of the run's own. The sequence is where it
-    is found now; empty where it is not known.
-
-    Raises:
-        SlamError: it cannot be read, is none of a run of a sequence, or a file of its is not found any more.
-        ConfigurationError: its settings are not those of this version.
+    `path` is the file, or the run's folder; the others are taken in place of the run's own. The sequence is where it is
+    found now; empty where it is not known. Raises SlamError where it cannot be read, is none of a run of a sequence, or
+    a file of its is not found any more, and ConfigurationError where its settings are not those of this version.
     """
     file = path / CONFIG if os.path.isdir(path) else path  # noqa: PTH112 unlike Path's, without errors
     try:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
-from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
+from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.input.features import Rectification
 from slam.interfaces import Backend, RevisingBackend
 from slam.run.recording import RecordedFrame, Recording

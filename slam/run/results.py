@@ -209,10 +209,8 @@ def _ratios(found: Mapping[str, float]) -> dict[str, float]:
 def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     """Whether covariances are as large as the errors, by which figure and which band; empty where no NEES is known.
 
-    Args:
-        found: `figures` of a run, or their means over several.
-        runs: how many. The band is that of as many independent values: it holds even if all frames of a run are as good
-            as one, which errors of the rig make them.
+    `found` are `figures` of a run, or their means over `runs`. The band is that of as many independent values: it holds
+    even if all frames of a run are as good as one, which errors of the rig make them.
     """
     low, high = (np.sqrt(bound / 6) for bound in chi_square_band(6, max(runs, 1)))
     ratios = _ratios(found)

@@ -73,8 +73,7 @@ def _of_class(configs: dict[str, Any], section: str) -> Iterator[Setting]:
 def listing(wanted: str | None, width: int) -> Iterator[str]:
     """Lines of at most `width` characters on all settings, or those of a section, front end or back end, or one.
 
-    Raises:
-        UnknownNameError: there is no such section or setting, or a class of one's own has no options.
+    Raises UnknownNameError where there is no such section or setting, or a class of one's own has no options.
     """
     if wanted is not None and ":" in wanted:  # a class of one's own
         part = registry.resolve("backends", wanted)

@@ -253,15 +253,10 @@ event.register("numba:compile", _Notice())
 
 
 class Stages:
-    """Stages of one step, entered one after the other.
-
-    Attributes:
-        begun: whether one has been entered.
-        milliseconds: wall time of each stage that was completed [ms], without that in which kernels were compiled.
-    """
+    """Stages of one step, entered one after the other; their wall times [ms], without that in which kernels compile."""
 
     def __init__(self) -> None:
-        self.begun = False
+        self.begun = False  # whether one has been entered
         self.milliseconds: dict[str, float] = {}
 
     @contextmanager

@@ -23,11 +23,7 @@ _LEAST = 2 * 10**9  # bytes of address space: with less, libraries crash or wait
 
 
 def require_address_space() -> None:
-    """Raise where the process is allowed too little memory to load the libraries that it needs (``ulimit -v``).
-
-    Raises:
-        SlamError: it is.
-    """
+    """Raise SlamError where a limit (``ulimit -v``) leaves too little memory to load the libraries that are needed."""
     try:
         import resource
     except ImportError:  # Windows

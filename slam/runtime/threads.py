@@ -124,15 +124,9 @@ def _set(numbers: _Changed) -> None:
 
 
 class OneThread:
-    """``with`` this around what one thread may do at a time; not to be nested.
+    """``with`` this around what one thread may do at a time, not nested; SlamError refuses `what` to another.
 
     A copy, also a pickled one, is free.
-
-    Args:
-        what: is refused, for the message.
-
-    Raises:
-        SlamError: on entry, while another thread is inside.
     """
 
     def __init__(self, what: str) -> None:

@@ -20,14 +20,11 @@ _LINES_PER_KIND = 5
 
 
 class FaultLog:
-    """Reports faults on the logger ``slam.sequences`` and keeps the lines; a context manager.
+    """Reports faults on the logger ``slam.sequences`` and keeps them in `lines`; a context manager.
 
-    The first few faults of a kind get a line each; the number of the others is reported when the log is closed. A
-    line that is known already (a second pass over the same sequence) is logged again, but kept once.
-
-    Args:
-        lines: where lines are kept.
-        at_the_end: log them when the log is closed, and not at all above an error, which is said alone.
+    The first few faults of a kind get a line each; the number of the others is reported when the log is closed. A line
+    that is known already (a second pass over the same sequence) is logged again, but kept once. `at_the_end` logs them
+    when the log is closed, and not at all above an error, which is said alone.
     """
 
     def __init__(self, lines: list[str], at_the_end: bool = False) -> None:

@@ -91,11 +91,7 @@ def hostile_calls_have_one_meaning(factory: Factory) -> None:
 
 
 def play(factory: Factory, seed: int, calls: int = _CALLS) -> None:
-    """One generated sequence.
-
-    Raises:
-        AssertionError: an answer is not of the kind that the interface promises; the message names seed and call.
-    """
+    """One generated sequence; AssertionError, with seed and call, where an answer is not of the promised kind."""
     life = _Life(factory(RIG, models=MODELS), np.random.default_rng(seed))
     for number in range(calls):
         call = life.next()

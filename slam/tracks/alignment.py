@@ -33,10 +33,8 @@ def align(
     """Move landmarks' features to where the landmarks' patches are found; those without a patch are unchanged.
 
     Patches that are to be taken anew are dropped, in place. Without a pose on which the matches agree nothing is
-    aligned. `positions` returns landmarks' positions (M, 3) [m] in the world by their ids (M,).
-
-    Raises:
-        SlamError: the front end does not return pixels.
+    aligned. `positions` returns landmarks' positions (M, 3) [m] in the world by their ids (M,). Raises SlamError where
+    the front end does not return pixels.
     """
     landmarks.patches[landmarks.unseen > _FORGOTTEN] = None
     at = landmarks.rows(matches.ids)
@@ -71,8 +69,7 @@ def take_patches(
 ) -> None:  # fmt: skip
     """Landmarks that were seen from a pose (4, 4) and have no patch get one, in place, at their aligned features.
 
-    Raises:
-        SlamError: the front end returns no patches, or not one for each landmark.
+    Raises SlamError where the front end returns no patches, or not one for each landmark.
     """
     at = np.flatnonzero((landmarks.ids >= 0) & ~landmarks.has_patch)
     at = at[isin(landmarks.ids[at], seen.ids)]

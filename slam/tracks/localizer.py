@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
-from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
@@ -28,11 +27,7 @@ from slam.window.consensus import CLEAR_MAJORITY, PoseConsensus, find_consensus
 class Localizer:
     """How landmarks are searched for in frames, and when the pose that they give is credible.
 
-    Args:
-        rig: the cameras.
-        config: settings.
-        models: noise of uL, vL, uR [px], and how fast a camera may move.
-        lost_after: frames without a measured pose after which a camera with an uncertain prediction is lost.
+    After `lost_after` frames without a measured pose a camera with an uncertain prediction is lost.
     """
 
     def __init__(self, rig: StereoRig, config: AssociationConfig, models: EstimatorModels, lost_after: int = 5) -> None:

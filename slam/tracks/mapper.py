@@ -16,8 +16,7 @@ from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array, isin
-from slam.geometry.pnp import MINIMAL_POINTS
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse, transform
 from slam.interfaces import Backend, MapBackend
 from slam.third_party import checked
@@ -59,14 +58,7 @@ class MapView:
 class Mapper:
     """Keeps the map of a system; within a step, nothing else adds landmarks to a back end or removes them.
 
-    Args:
-        rig: the cameras.
-        config: settings.
-        localizer: says which landmarks are seen from a similar viewpoint as before.
-        backend: the first one; it must have `place` if `config.monocular` is true.
-
-    Raises:
-        ConfigurationError: the back end cannot place landmarks.
+    Raises ConfigurationError where `config.monocular` is true and the first back end has no `place`.
     """
 
     def __init__(self, rig: StereoRig, config: MapConfig, localizer: Localizer, backend: Backend) -> None:
@@ -297,7 +289,7 @@ def undetected_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArr
     unconfirmed = (landmarks.seen < config.confirmed) & (landmarks.unseen > config.erase_missed)
     unconfirmed &= landmarks.last_seen >= 0  # a loaded map's landmarks stay until this run has seen them
     unseen = landmarks.last_seen.max(initial=0) - landmarks.last_seen
-    forgotten = unseen > config.forget_after if config.forget_after else np.zeros(len(landmarks), bool)
+    forgotten = unseen > config.forget_after if config.forget_after else np.zeros_like(lost)
     return np.asarray(lost | rare | unconfirmed | forgotten)
 
 
@@ -307,7 +299,7 @@ def redundant_landmarks(landmarks: LandmarkTable, positions: Array, config: MapC
     Landmarks that have just gone out of view are compared with each other and with all others out of view. Those of a
     loaded map that this run has not seen yet count among the others only.
     """
-    out = np.zeros(len(landmarks), bool)
+    out = np.zeros(len(landmarks.ids), bool)
     gone = np.flatnonzero((landmarks.unseen > config.erase_missed) & np.isfinite(landmarks.seen_from[:, 0]))
     just = gone[(landmarks.unseen[gone] <= 2 * config.erase_missed) & (landmarks.last_seen[gone] >= 0)]
     if not len(just) or not config.spacing:
@@ -329,8 +321,8 @@ def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
     First those that were measured in a single frame, then the others by their last measurement, oldest first; those
     measured in the newest frame last.
     """
-    out = np.zeros(len(landmarks), bool)
-    surplus = len(landmarks) - config.max_landmarks
+    out = np.zeros(len(landmarks.ids), bool)
+    surplus = len(out) - config.max_landmarks
     if surplus > 0:
         now = landmarks.last_seen == landmarks.last_seen.max()
         order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
@@ -345,7 +337,7 @@ def features_of_landmarks(
 
     Positions are the same if they are within `same_distance`, or differ in depth by no more than stereo's uncertainty.
     """
-    out = np.zeros(len(features), bool)
+    out = np.zeros(len(view.points), bool)
     feature, rows = _near_landmarks(features.uv_left, view)
     offset = view.points[feature] - view.local[rows]
     along = np.abs(offset[:, 2]) < SIGMAS * view.depth_sigma[feature]
@@ -357,7 +349,7 @@ def features_of_landmarks(
 
 def doubled_landmarks(view: MapView, landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
     """Which landmarks in view (N,) duplicate another one that was seen more often, or as often and is older."""
-    out = np.zeros(len(landmarks), bool)
+    out = np.zeros_like(view.in_image)
     shown = np.flatnonzero(view.in_image)
     row, rival = _near_landmarks(view.uv_left[shown], view)
     row = shown[row]

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from slam.chi_square import SIGMAS, chi_square_limit
 from slam.data import StereoFeatures
 from slam.geometry.arrays import Table, median
-from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts

@@ -11,10 +11,10 @@ import numpy as np
 
 from slam.chi_square import chi_square_limit
 from slam.geometry import kernels
-from slam.geometry.arrays import BoolArray, median
-from slam.geometry.pnp import MINIMAL_POINTS, poses_of_three
-from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
+from slam.geometry.arrays import BoolArray, IndexArray, median
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig
+from slam.geometry.se3 import Array, inverse
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.problem import Rows, Window
 from slam.window.solver import STEPS, solve
@@ -42,20 +42,11 @@ def find_consensus(
 ) -> PoseConsensus:
     """The pose with which most matches agree (RANSAC on minimal sets of three, then least squares on all that agree).
 
-    The guess is tried first, refined on what agrees with it, then on what disagrees with it least, and is enough where
-    a clear majority agrees. Other hypotheses are poses from the left pixels of three matches (P3P).
-
-    Args:
-        rig: the rectified pair.
-        points: landmark positions (M, 3) in world coordinates [m].
-        measured: (M, 3) = (uL, vL, uR), uR NaN for monocular rows.
-        guess: expected pose T_world_left (4, 4).
-        threshold: largest reprojection error of an inlier, on each of uL, vL, uR [px].
-        hypotheses: how many minimal sets are tried.
-        seed: of the random choice.
-
-    Raises:
-        CalibrationError: the rig is not rectified.
+    The guess of T_world_left (4, 4) is tried first, refined on what agrees with it, then on what disagrees with it
+    least, and is enough where a clear majority agrees. The other `hypotheses` are poses from the left pixels of three
+    matches (P3P). Landmarks are at `points` (M, 3) in the world [m], `measured` (M, 3) = (uL, vL, uR) [px], uR NaN for
+    monocular rows; an inlier is off by `threshold` at most in each. Raises CalibrationError where the rig is not
+    rectified.
     """
     matches = _Matches.of(rig, points, measured, threshold)
     clear = CLEAR_MAJORITY * len(points)
@@ -73,14 +64,9 @@ def find_consensus(
 
 
 def landmarks_pose(measure: RectifiedMeasurement, points: Array, z: Array, T: Array, seed: int) -> Array | None:
-    """The pose (4, 4) on which most landmarks agree; None if fewer than five agree.
+    """The pose (4, 4) on which most landmarks (M, 3) in the world [m] agree, by T; None if fewer than five agree.
 
-    Args:
-        measure: projection, pixel noise and gate.
-        points: the landmarks (M, 3) in the world [m].
-        z: measurements (M, 3), see `RectifiedStereo.measure`.
-        T: guess of the pose T_world_left (4, 4).
-        seed: of the random choice.
+    Measurements z (M, 3) are those of `RectifiedStereo.measure`.
     """
     sigma, probability = measure.models.pixel_sigma, measure.models.gate_probability
     threshold = sigma * float(np.sqrt(_AS_NEW * chi_square_limit(3, probability)))
@@ -164,7 +150,7 @@ class _Matches:
         while tried < hypotheses:
             count = min(_BATCH, hypotheses - tried)
             triples = among[rng.random((count, len(among))).argsort(axis=1)[:, :MINIMAL_POINTS]]
-            poses = poses_of_three(rig, self.points, measured, triples)
+            poses = _poses_of_three(rig.left, self.points, measured, triples)
             tried += count
             if not len(poses):
                 continue
@@ -174,3 +160,19 @@ class _Matches:
             if (1 - (most / len(self.points)) ** MINIMAL_POINTS) ** tried < 0.01:
                 break
         return best
+
+
+def _poses_of_three(camera: PinholeCamera, points: Array, measured: Array, triples: IndexArray) -> Array:
+    """Poses T_world_left (H, 4, 4) from left pixels of triples (K, 3) of points (M, 3) [m]: up to four each (P3P)."""
+    import cv2
+
+    bearings = camera.normalise(measured[:, :2])
+    poses = []
+    for three in triples:
+        _, turns, shifts = cv2.solveP3P(points[three], bearings[three], np.eye(3), None, cv2.SOLVEPNP_P3P)
+        for turn, shift in zip(turns, shifts):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+            poses.append(inverse(T))
+    found = np.array(poses).reshape(-1, 4, 4)
+    return found[np.isfinite(found).all(axis=(1, 2))]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainc
 
-from slam.chi_square import chi_square_limit, chi_square_limits
-from slam.data import BoolArray
+from slam.chi_square import chi_square_limit
 from slam.geometry.se3 import Array
 
 MIN_OBSERVATIONS = 6  #: fewest observations whose agreement is tested
@@ -16,13 +15,10 @@ INFLATION = (3.0, 10.0)  #: factors on the process noise's standard deviation tr
 
 
 def share_by_chance(rejected: Array, limit: float) -> float:
-    """The share of wrong observations that pass a gate by chance.
+    """The share of wrong observations that pass a gate of `limit` by chance.
 
-    The rejected observations show how widely wrong ones scatter about their predictions.
-
-    Args:
-        rejected: squared Mahalanobis distances (R,) of the rejected observations, χ² with three degrees of freedom.
-        limit: the gate.
+    The rejected observations show how widely wrong ones scatter about their predictions: `rejected` (R,) has their
+    squared Mahalanobis distances, χ² with three degrees of freedom.
     """
     median = chi_square_limit(3, 0.5)
     spread = float(np.median(rejected)) / median  # in units of the innovation covariances
@@ -30,13 +26,10 @@ def share_by_chance(rejected: Array, limit: float) -> float:
 
 
 def squared_distances(residuals: Array, covariances: Array) -> Array:
-    """Squared Mahalanobis distances ``νᵀ S⁻¹ ν`` (M,).
+    """Squared Mahalanobis distances ``νᵀ S⁻¹ ν`` (M,) of residuals ν (M, 3) = (uL, vL, uR) [px].
 
-    Args:
-        residuals: ν (M, 3) = (uL, vL, uR) [px]; where uR is NaN the left pixel alone is tested.
-        covariances: S (M, 3, 3) [px²], lower triangles; the last row of a missing uR does not count.
-
-    A row that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
+    Where uR is NaN the left pixel alone is tested. Of the covariances S (M, 3, 3) [px²] lower triangles count. A row
+    that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
     """
     from slam.geometry import kernels
 
@@ -45,27 +38,10 @@ def squared_distances(residuals: Array, covariances: Array) -> Array:
 
 
 def whiteners(covariances: Array) -> Array:
-    """``W = L⁻¹`` (M, 3, 3) with ``S = L Lᵀ``, so that ``W ν`` has covariance I where ν has S (M, 3, 3).
-
-    Raises:
-        numpy.linalg.LinAlgError: a covariance is not positive definite.
-    """
+    """``W = L⁻¹`` (M, 3, 3) with ``S = L Lᵀ`` (M, 3, 3): W ν has covariance I; LinAlgError if S is not definite."""
     from slam.geometry import kernels
 
     W = np.asarray(kernels.whiteners(np.ascontiguousarray(covariances)))
     if not np.isfinite(W).all():
         raise np.linalg.LinAlgError("a covariance is not positive definite")
     return W
-
-
-def chi_square_gate(residuals: Array, innovation_covariances: Array, probability: float) -> BoolArray:
-    """Which observations (M,) lie inside the χ² quantile `probability` of their own innovation covariance.
-
-    Args:
-        residuals: measured less predicted (uL, vL, uR), (M, 3) [px]; uR NaN for a left pixel alone (two degrees of
-            freedom).
-        innovation_covariances: (M, 3, 3) [px²], measurement noise included.
-        probability: share of correct measurements that pass if the covariances are right, in (0, 1).
-    """
-    dof = np.where(np.isnan(residuals[:, 2]), 2, 3)
-    return np.asarray(squared_distances(residuals, innovation_covariances) <= chi_square_limits(dof, probability))

@@ -49,24 +49,16 @@ def _distance(E: Array) -> Array:
 def marginalised(
     w: Window, poses: Sequence[int], leaving: BoolArray, field: Array | None = None
 ) -> tuple[RelativePrior, Conditional, float]:
-    """Marginalise poses and some of the prior's points out of a window, with all that is measured of them.
+    """Marginalise `poses` and points of the prior `leaving` (D,) out of a window, with all that is measured of them.
 
-    The window holds just that: the prior, the rows of the poses that leave and of the points that leave, and what else
-    is known of them. Its `joining` points join the prior; all others that are not in it leave as well.
+    The window, all its poses free, holds just that: the prior, the rows of the poses that leave and of the points that
+    leave, and what else is known of them. Its `joining` points join the prior; all others that are not in it leave as
+    well. If the first pose leaves, the first of those that stay becomes the reference. `field` (M, 3, m) derives the
+    rows' true measurements by errors of the rig.
 
-    Args:
-        w: the window, all poses free.
-        poses: which poses leave. If the first does, the first of those that stay becomes the reference.
-        leaving: which of the prior's points leave (D,).
-        field: derivatives (M, 3, m) of the rows' true measurements by errors of the rig; None for none.
-
-    Returns:
-        the prior on the other poses and the points that stay, in their order, then those that joined (points as
-        indices of this window); where the points that left, then the poses, are given the others; and what all that
-        cost at the present values.
-
-    Raises:
-        numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
+    Returns the prior on the other poses and the points that stay, in their order, then those that joined (points as
+    indices of this window); where the points that left, then the poses, are given the others; and what all that cost at
+    the present values. Raises LinAlgError where the information of what leaves is not positive definite.
     """
     gone_poses = among(len(w.poses), np.asarray(poses))
     reference = int(np.argmin(gone_poses))

@@ -35,18 +35,11 @@ def is_first(before: float | None, dt: float) -> bool:
 def predicted(
     models: EstimatorModels, poses: Array, before: float | None, dt: float, rests: bool = False
 ) -> tuple[Array, Array, Array, bool]:
-    """The next pose by the motion model.
+    """The next pose by the motion model, after the time `dt` [s]; where the camera `rests`, it is the last one.
 
-    Args:
-        models: noise and priors.
-        poses: the last two (2, 4, 4); only the last counts where the velocity is unknown.
-        before: time between them [s]; None where there is no earlier one.
-        dt: time to the next [s].
-        rests: whether the camera stands: the pose is the last one.
-
-    Returns:
-        the pose (4, 4), its Jacobian (6, 12) by the perturbations of the last two, the noise (6, 6) that is added, and
-        whether the velocity was unknown, with mean zero.
+    Of the last two `poses` (2, 4, 4), `before` [s] apart, only the last counts where `before` is None. Returns the pose
+    (4, 4), its Jacobian (6, 12) by the perturbations of the last two, the noise (6, 6) that is added, and whether the
+    velocity was unknown, with mean zero.
     """
     J: Array = np.zeros((6, 12))
     T: Array = poses[-1].copy()
@@ -62,10 +55,9 @@ def predicted(
 
 
 def predict(T0: Array, T1: Array, dt01: float, dt12: float) -> tuple[Array, Array, Array, Array]:
-    """The pose after T1 at the velocity between T0 and T1.
+    """The pose T2 (4, 4) after T1 at the velocity between T0 and T1.
 
-    Returns:
-        T2 (4, 4), its Jacobians (6, 6) by the perturbations of T0 and T1, and by w = [w_ω, w_v].
+    And its Jacobians (6, 6) by the perturbations of T0 and T1, and by w = [w_ω, w_v].
     """
     s = dt12 / dt01
     R0, R1 = T0[:3, :3], T1[:3, :3]

@@ -63,8 +63,7 @@ class PoseProblem:
 def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
     """Pose (4, 4) and which measurements (M,) agree with it: first robust, then least squares on what agrees.
 
-    Raises:
-        numpy.linalg.LinAlgError: a value is not finite.
+    Raises LinAlgError where a value is not finite.
     """
     w = problem.window(start)
     rows = w.rows

@@ -17,7 +17,7 @@ from scipy.special import bdtrc, comb
 
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
-from slam.geometry.pnp import MINIMAL_POINTS
+from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log
 from slam.window import pose_only
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
@@ -45,14 +45,9 @@ Search = Callable[[], "Array | None"]
 def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, contradicted: int, lost: bool) -> Agreement:
     """The newest pose with which most observations agree.
 
-    Agreement of less than a third of the observations counts only if so many cannot agree by chance.
-
-    Args:
-        problem: landmarks and measurements.
-        guess: pose (4, 4) to begin with.
-        search: finds the pose on which the landmarks agree; only called where most contradict the first solution.
-        contradicted: updates just before this one in which most observations agreed on another pose.
-        lost: whether the problem shall be restarted in any case.
+    Agreement of less than a third of the observations counts only if so many cannot agree by chance. `search` is only
+    called where most contradict the solution that begins at `guess` (4, 4); so they did in `contradicted` updates just
+    before.
     """
     T, used = pose_only.solve(problem, guess)
     if 2 * used.sum() >= len(used):

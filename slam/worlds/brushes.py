@@ -62,13 +62,7 @@ def words(rng: Rng, letters: int) -> str:
 
 
 class Page:
-    """A picture on which things are put, in place; (0, 0) is the outer corner of the first texel.
-
-    Args:
-        picture: the ground (H, W, 3) uint8.
-        rng: of everything random that is put on it.
-        density: texels per metre.
-    """
+    """A picture (H, W, 3) of `density` texels a metre on which things are put; (0, 0) is the first texel's corner."""
 
     def __init__(self, picture: np.ndarray, rng: Rng, density: float = 1.0) -> None:
         self.picture, self.rng, self.density = picture, rng, density

@@ -30,8 +30,7 @@ _TURNED = 25.0  # what lies so much further along the path is another drive alon
 def read_path(text: str) -> Trajectory:
     """The path of a file: rows of twelve numbers (KITTI, at 10 Hz) or of eight (TUM); stamps begin at 0.
 
-    Raises:
-        SequenceError: no file is named, it is missing or no path, or nobody could drive along it.
+    Raises SequenceError where no file is named, it is missing or no path, or nobody could drive along it.
     """
     if not text:
         raise SequenceError("no path is named: drive?path=FILE, poses in the form of KITTI or TUM")

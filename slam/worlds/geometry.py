@@ -92,14 +92,10 @@ def cuboid(
     faces: Mapping[str, Texture], size: Sequence[float] | Array, corner: Sequence[float] | Array = (0, 0, 0),
     body: int = 0, T_body_box: Array | None = None,
 ) -> list[Rectangle]:  # fmt: skip
-    """The outer faces of a box.
+    """The outer faces of a box of lengths `size` (3,) [m], with its lowest `corner` in its own axes.
 
-    Args:
-        faces: textures by face name: front (−y), back (+y), left (−x), right (+x), top (+z), bottom (−z).
-        size: lengths (3,) [m] along the box's x, y and z axes.
-        corner: its corner with the lowest coordinates, in box axes.
-        body: the object that it is part of.
-        T_body_box: pose (4, 4) of the box axes in the body frame; identity if None.
+    Textures are by face name: front (−y), back (+y), left (−x), right (+x), top (+z), bottom (−z). `T_body_box` is the
+    pose (4, 4) of the box axes in the body frame; identity if None.
     """
     T, out = np.eye(4) if T_body_box is None else T_body_box, []
     for name, texture in faces.items():

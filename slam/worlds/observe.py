@@ -214,13 +214,9 @@ class Appearance:
     def describe(
         self, landmark: IdArray, views: Array | None, time: float, rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """Descriptors (N, D) of landmarks, with noise, not of unit length.
+        """Descriptors (N, D) of landmarks at a time [s], with noise, not of unit length.
 
-        Args:
-            landmark: which ones (N,).
-            views: unit vectors (N, 3) to the camera in axes along, down and out of their surfaces; where they drift.
-            time: of the frame [s].
-            rng: of the noise.
+        Where they drift, `views` are unit vectors (N, 3) to the camera in axes along, down and out of their surfaces.
         """
         visit = self._visit(landmark, time) if self.change > 0 else None
         like = landmark

@@ -14,13 +14,9 @@ R_LEVEL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def camera_poses(positions: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
-    """Poses ``T_world_left`` (N, 4, 4) of cameras at `positions` (N, 3) [m].
+    """Poses ``T_world_left`` (N, 4, 4) of cameras at `positions` (N, 3) [m], with angles (N,) [rad].
 
-    Args:
-        positions: camera centres in the world.
-        yaw: turn to the left about the vertical (N,) [rad]; 0 looks along +y.
-        pitch: turn upwards (N,) [rad].
-        roll: turn clockwise about the optical axis, as the camera sees it (N,) [rad].
+    Yaw turns to the left about the vertical (0 looks along +y), pitch upwards, roll clockwise as the camera sees it.
     """
     return pose(about(yaw, 2) @ R_LEVEL @ about(pitch, 0) @ about(roll, 2), positions)
 
@@ -82,13 +78,9 @@ CAMERAS = ("still", "sway", "moving")
 
 
 def watching(t: Array, stamps: Array, way: str, rng: np.random.Generator) -> Array:
-    """Poses (N, 4, 4) of a camera at the world's origin that looks along +y.
+    """Poses (N, 4, 4) of a camera at the world's origin that looks along +y, at path times t (N,) [s].
 
-    Args:
-        t: path times (N,) [s].
-        stamps: times (N,) [s] of the sway.
-        way: still; sway, as a robot that stands; or moving, half a metre to and fro.
-        rng: of its sway.
+    `way` is still; sway, as a robot that stands, by `stamps` (N,) [s] and `rng`; or moving, half a metre to and fro.
     """
     zero = np.zeros(len(t))
     if way == "still":

@@ -65,15 +65,9 @@ def draw(
     rectangles: RectangleArrays, textures: Callable[[int], Ripmap], T_world_body: Array, T_world_camera: Array,
     view: View, background: Sequence[int],
 ) -> np.ndarray:  # fmt: skip
-    """Samples of a view (H, W[, 3]) uint8.
+    """Samples of a view (H, W[, 3]) uint8 of rectangles in body frames, on a background of one grey value, or BGR.
 
-    Args:
-        rectangles: what to draw, in body frames.
-        textures: the texture of a rectangle, by its index.
-        T_world_body: body poses (B + 1, 4, 4), row 0 the identity.
-        T_world_camera: the camera's pose (4, 4).
-        view: the camera.
-        background: what is where nothing is: one grey value, or BGR.
+    `T_world_body` has body poses (B + 1, 4, 4), row 0 the identity, and `T_world_camera` (4, 4) is the camera's.
     """
     picture = np.empty((view.height, view.width, len(background)), np.uint8)
     picture[:] = background
@@ -207,14 +201,7 @@ class Placed:
 
 
 def place(rectangles: RectangleArrays, T_world_body: Array, T_world_camera: Array, view: View) -> Placed:
-    """The rectangles that may be seen in a view.
-
-    Args:
-        rectangles: all rectangles in their body frames.
-        T_world_body: body poses (B + 1, 4, 4), row 0 the identity.
-        T_world_camera: the camera's pose (4, 4).
-        view: the camera.
-    """
+    """The rectangles that may be seen in a view, of all in body frames; for the poses see `draw`."""
     R, c = T_world_camera[:3, :3], T_world_camera[:3, 3]
     world = rectangles.placed(T_world_body)
     source = _in_frustum(world, R, c, view)

@@ -24,13 +24,7 @@ _SKY = (230, 225, 220)  # where no surface is, BGR
 
 
 class Recorder:
-    """Renders the frames of a world; every frame's noise has a seed of its own.
-
-    Args:
-        world: what to render.
-        values: values of all options.
-        faults: which frames suffer from what.
-    """
+    """Renders the frames of a world, with the faults of each; every frame's noise has a seed of its own."""
 
     def __init__(self, world: World, values: Mapping[str, Any], faults: Mapping[str, BoolArray]) -> None:
         self._world, self._values, self._faults = world, values, faults

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slam.bodies.finder import Displacements, Scene
 from slam.bodies.proof import PROVEN, Way, by_left_image, with_frame
-from slam.bodies.scene import Displacements, Scene
 from slam.geometry.se3 import points_by_pose
 from slam.tracks.table import Tracks
 

@@ -43,8 +43,8 @@ def step(monkeypatch, r, points, velocities, rng, still=(), test=50.0, dt=DT, ca
     yes, no = np.ones(n, bool), np.zeros(n, bool)
     tracks: Any = SimpleNamespace(found=yes, body=np.full(n, -1), still=no, count=lambda rows: np.full(len(rows), 4))
     now = frame(dt, camera)
-    r = follow_regions(r, now, tracks)
-    return r, [one for one in r if one.has_moved(now)]
+    going_on, moved = follow_regions(r, now, tracks)
+    return going_on + moved, moved
 
 
 def run(monkeypatch, frames, speed, seed, velocity=VELOCITY, around=0, camera=0.0):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.bodies.bodies import in_body_axes
-from slam.bodies.scene import _SIZES, Displacements, _full_windows, classify_scene, displacements, tail
+from slam.bodies.finder import _SIZES, Displacements, _full_windows, classify_scene, displacements, tail
 from slam.geometry.se3 import hat, transform
 from tests.slam.bodies.test_membership import SIGMA, SLOT, TIMES, WINDOW, body_along, path, seen_from, table
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.calibration import RigCorrection, RigModel, SelfCalibration, SelfCalibrationConfig
-from slam.calibration.evidence import field_variance
 from slam.calibration.model import RESIDUAL
+from slam.calibration.posterior import field_variance
 from slam.data import StereoFeatures
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig

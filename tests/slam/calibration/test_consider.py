@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.calibration import RigCorrection, RigModel, RigPosterior, SelfCalibration, SelfCalibrationConfig
-from slam.calibration.consider import BASELINE, RemainingRigError
+from slam.calibration.estimator import BASELINE, RemainingRigError
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import inverse, log

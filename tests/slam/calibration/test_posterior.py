@@ -3,9 +3,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.calibration.evidence import Accumulator, Evidence, RigEvidence, field_variance, row_evidence
 from slam.calibration.model import RigModel
-from slam.calibration.posterior import Prior, factory_prior, residual_likelihoods, solve
+from slam.calibration.posterior import (
+    Accumulator,
+    Evidence,
+    Prior,
+    RigEvidence,
+    factory_prior,
+    field_variance,
+    residual_likelihoods,
+    row_evidence,
+    solve,
+)
 from tests.slam.calibration.drives import CAR, parameters, residual_fields
 
 NONE = np.zeros(1)

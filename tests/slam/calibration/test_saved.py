@@ -8,8 +8,7 @@ import pytest
 
 import slam
 from slam.calibration import RigModel, SavedCalibration, SelfCalibration, SelfCalibrationConfig
-from slam.calibration.evidence import RESIDUAL_SCALES, Evidence, RigEvidence
-from slam.calibration.posterior import factory_prior, systematic_variance
+from slam.calibration.posterior import RESIDUAL_SCALES, Evidence, RigEvidence, factory_prior, systematic_variance
 from slam.calibration.saved import agreement, agreement_in_words, joint_calibration
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.rig import StereoRig

@@ -5,8 +5,7 @@ import pytest
 
 from slam.errors import CalibrationError
 from slam.geometry import se3
-from slam.geometry.pnp import measurement_rows
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import StereoRig, measurement_rows
 from slam.window.consensus import find_consensus
 from tests.slam.scene import RIG, Cloud
 
