@@ -67,8 +67,7 @@ class Patches:
     size: Array  # of the features at the pixels (N,) [px]
 
 
-#: Columns of `StereoFeatures`.
-_COLUMNS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+_COLUMNS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")  # of `StereoFeatures`
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """The parts of a system and the stages of a step, each a function of the frame in work; `slam.system` orders them.
 
 `State` is what a step starts from and leaves behind. A step builds a new one beside it, which takes its place at the
-end. What lies outside of it, the back end's map, the detector's bodies and the columns of tracks that are followed, is
-undone or forgotten by `Tracker.roll_back` after a step that an exception ended.
+end; so landmarks, and what waits for a depth, outlast a step that an exception ended. What such a step did to the back
+end's map is undone by `Tracker.roll_back`, which forgets the detector's bodies and the tracks that it follows.
 """
 
 from __future__ import annotations

@@ -120,6 +120,11 @@ def test_no_circle_of_imports():
         visit(name, ())
 
 
+def test_no_module_has_more_than_400_lines():
+    files = modules("slam", "backends", "frontends")
+    assert not [name for name, file in files.items() if len(file.read_text(encoding="utf-8").splitlines()) > 400]
+
+
 def test_every_room_says_what_it_is_for():
     for room in MAY_IMPORT:
         if (SLAM / room).is_dir():

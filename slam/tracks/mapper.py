@@ -121,7 +121,6 @@ class Mapper:
             backend.remove(strangers)
         if tracks is not None:
             tracks = tracks.begun(0, tracks.dof.shape[1])
-            tracks.waiting_since[:] = -1
             tracks.erase_landmarks(np.flatnonzero(~np.isin(tracks.ids, in_backend)))
         return tracks
 

@@ -1,14 +1,15 @@
 """The table of tracks: each point that is followed, or is in the map, has one row of it for as long as it lasts.
 
 The landmarks of the map, the members of each body, and what is not decided yet are selections of the rows. A frame's
-step changes the table in place: `Tracks.begun` makes a copy for it, which a step that fails leaves behind.
+step changes the table in place: `Tracks.begun` makes a copy for it, which a step that fails leaves behind. Landmarks,
+and what waits for a depth, are then as they were; what is followed is not copied, so it is forgotten.
 """
 # ruff: noqa: RUF009  (what a column is called with is a description, and no value that rows would share)
 
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +22,9 @@ from slam.geometry.se3 import Array
 from slam.naming import count
 
 _ROOM = 1000  # cost: rows that a table begins with
+
+#: Columns of `Tracks` that say, besides the Laplacian, what waits for a depth.
+_WAITING = ("look", "waiting_since", "first_pixel", "first_pose", "first_covariance", "direction")
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,15 +181,13 @@ class Tracks(LandmarkTable):
     def begun(self, new: int, window: int) -> Tracks:
         """A copy for another frame: in it there is room for so many `new` rows, and nothing is found yet.
 
-        The landmarks' columns are copied; what is followed is shared with the copy, unless it has windows of another
-        number of frames. After a step that fails, `Tracker.roll_back` therefore forgets what was followed.
+        The columns of landmarks and of what waits for a depth are copied; those of what is followed are shared with the
+        copy, unless it has windows of another number of frames.
         """
-        tracks = self
-        if self.dof.shape[1] != window:
-            empty = Tracks.empty(self.descriptors.shape[1], window, len(self))
-            tracks = replace(empty, **{name: getattr(self, name) for name in LandmarkTable.__dataclass_fields__})
-        tracks = copy(tracks)
-        vars(tracks).update({name: getattr(self, name).copy() for name in LandmarkTable.__dataclass_fields__})
+        kept = {name: getattr(self, name).copy() for name in (*LandmarkTable.__dataclass_fields__, *_WAITING)}
+        same = self.dof.shape[1] == window
+        tracks = copy(self) if same else Tracks.empty(self.descriptors.shape[1], window, len(self))
+        vars(tracks).update(kept)
         missing = new - int((~self.used).sum())
         if missing > 0:
             tracks = tracks.joined(Tracks.empty(self.descriptors.shape[1], window, max(len(self), missing)))

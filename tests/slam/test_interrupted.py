@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import slam
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError, PartError
+from slam.geometry import se3
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.system import StereoSlam
@@ -118,6 +120,27 @@ def test_interrupted_where_a_body_moves(backend):
     assert interrupted(system, next(frames), 100)
     assert system.process_features(next(frames)).objects  # interrupted elsewhere, the detector goes on
     interrupt_often(system, frames, 5)
+
+
+@pytest.mark.parametrize("stage", ["update", "close_loops"])
+def test_what_waits_for_a_depth_waits_on_after_an_interrupted_step(stage):
+    """Features without a right pixel, before a camera that moves sideways, join the map as without an interrupt."""
+    added = []
+    for stopped in (None, 3):
+        cloud, config = Cloud(150), CONFIG.with_settings(["map.monocular=true", "map.target_in_view=150"])
+        system, joined = StereoSlam(RIG, None, "ekf", config=config), []
+        for k in range(8):
+            features, ids = cloud.features(se3.exp(np.array([0, 0, 0, 0.012 * k, 0, 0])), k / 30)
+            features.uv_right[ids >= 60] = np.nan
+            with pytest.MonkeyPatch.context() as patch:
+                if k == stopped:
+                    patch.setattr(system._tracker, stage, Mock(side_effect=KeyboardInterrupt))
+                    with pytest.raises(KeyboardInterrupt):
+                        system.process_features(features)
+                else:
+                    joined.append(len(system.process_features(features).added))
+        added.append(joined[-4:])
+    assert added[0] == added[1] and sum(added[0]) > 10
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -9,10 +9,11 @@ import pytest
 
 from slam.atlas.map_io import SavedMap
 from slam.config import SystemConfig
-from slam.data import FrameStatus
+from slam.data import FrameStatus, StereoFeatures
 from slam.geometry import se3
 from slam.system import StereoSlam
-from slam.tracks.monocular import frame_covariance, two_view_depth
+from slam.tracks.monocular import depths_by_motion, frame_covariance, two_view_depth
+from slam.tracks.table import Tracks
 from tests.slam.scene import RIG, Cloud
 
 BACKENDS = ("ekf", "smoother", "window")
@@ -81,6 +82,26 @@ def test_a_frames_own_covariance_is_that_of_its_least_squares_pose():
         errors.append(se3.log(found.T_world_left))
     share = np.mean([e @ np.linalg.solve(expected, e) for e in errors]) / 6
     assert 0.85 < share < 1.15  # 300 draws of six degrees: sure to 3 %
+
+
+def left_features(n, stamp, uv):
+    """Features (n,) of the left image that look alike to the bit."""
+    one, look = np.ones(n), np.tile(np.eye(1, 8, dtype=np.float32), (n, 1))
+    return StereoFeatures(stamp, uv, uv * np.nan, one, one, one, one.astype(np.int8), look)
+
+
+def test_of_waiting_tracks_that_look_alike_to_the_bit_one_has_the_feature():
+    """Two corners are seen, then one of them: it becomes one landmark, and nothing waits on for it."""
+    points, tracks = np.array([[0.0, 0, 3], [0.06, 0, 3]]), Tracks.empty(8)
+    for k, n in enumerate((2, 1)):
+        T = se3.exp(np.array([0, 0, 0, 0.06 * k, 0, 0]))
+        features = left_features(n, k / 30, RIG.left.project(se3.transform(se3.inverse(T), points[:n])))
+        tracks = tracks.begun(n, 0)
+        rows, depths = depths_by_motion(RIG, tracks, features, np.arange(n), T, 1e-10 * np.eye(6), k, SIGMA, 0.5)
+    assert rows.tolist() == [0] and not (tracks.waiting_since >= 0).any()
+    np.testing.assert_allclose(depths.local, [[-0.06, 0, 3]], atol=1e-6)
+    tracks.enter_landmarks(1, np.array([7]), features, rows, np.zeros(3))
+    assert tracks.landmarks().ids.tolist() == [7]
 
 
 def map_of(cloud, rows=slice(None)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from slam.data import StereoFeatures
 from slam.tracks.table import LandmarkTable, Tracks
@@ -63,6 +64,23 @@ def test_a_frame_s_copy_has_room_and_leaves_the_landmarks_of_the_frame_before_as
     for name in LandmarkTable.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name), name)
     assert step.landmarks().ids.tolist() == [6] and step.landmarks().seen.tolist() == [2]
+
+
+@pytest.mark.parametrize("window", [4, 6])
+def test_a_frame_s_copy_leaves_what_waits_for_a_depth_as_it_was(window):
+    tracks, waits = followed(1), np.array([1])
+    tracks.wait(3, features(3), waits, np.ones((1, 3)), np.eye(4), np.eye(6))
+    copies = [tracks.begun(0, window) for _ in range(2)]
+    assert copies[0].waiting_since.tolist() == [-1, 3, -1]
+    copies[0].waiting_since[:] = -1  # it has a depth, and another feature begins to wait in its row
+    copies[0].wait(4, features(3), waits + 1, np.zeros((1, 3)), 2 * np.eye(4), 2 * np.eye(6))
+    for table in (tracks, copies[1]):
+        assert table.waiting_since.tolist() == [-1, 3, -1] and table.laplacian[1] == 1
+        for column, first in (
+            (table.look, np.eye(8)[1]), (table.direction, 1), (table.first_pixel, 0), (table.first_pose, np.eye(4)),
+            (table.first_covariance, np.eye(6)),
+        ):  # fmt: skip
+            np.testing.assert_array_equal(column[1], np.broadcast_to(first, column[1].shape))
 
 
 def test_landmarks_of_a_saved_map_take_unused_rows():
