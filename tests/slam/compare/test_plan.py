@@ -8,6 +8,7 @@ from slam.commands import compare as command
 from slam.commands.compare import compare, variants_of
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
 from slam.compare.statistics import fewest
+from slam.compare.sweep import check
 from slam.compare.tables import most_tests
 from slam.compare.wording import caution
 from slam.errors import ConfigurationError, UnknownNameError
@@ -53,6 +54,12 @@ def test_a_mistyped_front_end_is_answered_with_all_of_them():
 def test_no_more_workers_than_anybody_has(tmp_path):
     with pytest.raises(ConfigurationError, match="at most 1024 workers"):
         compare(Plan(("synthetic:desk",), ("ekf",)), tmp_path, workers=10**9)
+
+
+def test_a_recording_that_is_not_rectified_can_be_compared(tmp_path):
+    """Back ends were tried on the rig itself, which they refuse."""
+    sequence = "synthetic:desk?rig=toedin&frames=3"
+    assert check(Plan((sequence,), ("ekf", "smoother")), tmp_path / "out") == {sequence: 3}
 
 
 def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
