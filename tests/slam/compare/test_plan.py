@@ -80,6 +80,8 @@ def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     assert [(trial.sequence, trial.seed, trial.stop) for trial in tried] == [(name, 0, 15) for name in plan.sequences]
     tried.clear()
     assert command._seconds(plan.every[-1:], frames) == pytest.approx(40 * 0.02) and len(tried) == 1
+    tried.clear()  # a run of fewer frames than those was asked for more than it has
+    assert command._seconds(plan.every[-1:], {"/data": 8}) == pytest.approx(8 * 0.02) and tried[0].stop == 8
     outcome = "failed: SlamError: no"
     assert command._seconds(plan.every, frames) is None
 
