@@ -207,7 +207,7 @@ def replay_command(
     require_settable(settings or [], default.to_json(), "")
     config = replace(default, models=loaded.models).with_settings(settings or [])
     with run_folder(out, loaded.name, name) as folder:
-        options = RunOptions(name, "recording", config, folder, command=command_line())
+        options = RunOptions(name, "recording", config, folder, kind=loaded.kind, command=command_line())
         require_outputs(options.outputs, [recording], overwrite)
         shown_as = len(loaded), title(loaded, name), quiet
         with progress(*shown_as) as tell, whole_frames(tell, folder) as end_of_frame:

@@ -107,7 +107,8 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
         kind = trial.sequence, trial.variant
         if kind not in tried:
             with said_before(), TemporaryDirectory(prefix="slam_trial_") as folder:
-                run_alone(replace(trial, seed=0, mode=CLOSED_LOOP, stop=trial.start + _TRIED), Path(folder))
+                stop = trial.start + min(_TRIED, frames[trial.sequence])
+                run_alone(replace(trial, seed=0, mode=CLOSED_LOOP, stop=stop), Path(folder))
                 result = read_object(Path(folder) / RESULT)
             if result["outcome"] != COMPLETED:
                 return None

@@ -24,6 +24,7 @@ from slam.compare.plan import CLOSED_LOOP, REPLAY, SIMULATED, Plan, Trial
 from slam.compare.trial import COMPLETED, RECORDING, RESULT, config_of, keep_result, run_trial
 from slam.errors import SlamError
 from slam.files import noting_inputs, read_object
+from slam.input.features import Rectification
 from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder, write_json
 from slam.run.repeat import changed_versions, running_code
@@ -196,7 +197,9 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
             config = config_of(trial, sequence)
             if trial.variant.frontend != SIMULATED:
                 registry.create("frontends", trial.variant.frontend, sequence.rig, **config.frontend)
-            registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
+            inside = Rectification(sequence.rig)
+            models = inside.models(config.models)
+            registry.create("backends", trial.backend, inside.rig, models=models, **config.backend)
     goes_on = not overwrite and (out / SWEEP).is_file()
     if goes_on:
         held = read_object(out / SWEEP)

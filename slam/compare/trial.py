@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,12 +119,13 @@ def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, flo
     with said_before():
         sequence = open_sequence(trial.source)
     collected = MapRecord(sequence, trial.start, closed)
-    names = trial.backend, trial.variant.frontend, config_of(trial, sequence), out
+    config = config_of(trial, sequence)
+    options = RunOptions(trial.backend, trial.variant.frontend, config, out, kind=sequence.kind)
     if recording is not None:
-        summary = run_recording(load_recording(recording), RunOptions(*names), collected.add, record)
+        summary = run_recording(load_recording(recording), options, collected.add, record)
     else:
         simulated = _Simulated(sequence) if trial.variant.frontend == SIMULATED else None  # type: ignore[arg-type]
-        options = RunOptions(*names, trial.start, trial.stop, out / RECORDING)
+        options = replace(options, start=trial.start, stop=trial.stop, record=out / RECORDING)
         summary = run(sequence if simulated is None else simulated, options, collected.add, simulated, record=record)
     if not summary["frames"]:
         raise SlamError("the run has no frame")

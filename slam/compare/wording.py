@@ -85,7 +85,8 @@ def honesty(group: Group) -> list[str]:
     """Whether the covariances of each back end hold, by the means over its runs."""
     said = {}
     for backend in group.runs:
-        means = {metric.key: mean_and_sd(group.finite(backend, metric.key))[0] for metric in group.metrics}
+        keys = dict.fromkeys(key for run in group.runs[backend] for key in run.metrics)
+        means = {key: mean_and_sd(group.finite(backend, key))[0] for key in keys}
         said[backend] = verdict(means, group.trials - group.failures(backend))
     return [f"{backend}: {text}." for backend, text in said.items() if text]
 

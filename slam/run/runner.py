@@ -55,7 +55,8 @@ def run(
     """Run a sequence; returns the summary that is also written to ``summary.json``.
 
     The files are completed however the run ends: on an error or an interrupt the frames done so far are kept, the
-    summary says how it ended, recording and map are written, and the exception goes on. Where a file cannot be written
+    summary says how it ended, recording and map are written, and the exception goes on; before the first frame is done
+    it leaves no file. Where a file cannot be written
     the others are; of several errors the first one is raised. Files of an earlier run in the folder are replaced.
 
     Args:
@@ -201,7 +202,10 @@ class _Run:
                 if self.live is not None and self.live.ended_early and stopped_by is None:
                     ended = "ended by the user"
                 summary = names | {"ended": ended} | self._tracking()
-                self._write_last(files, summary, score)
+                if stopped_by is None or record.numbers:
+                    self._write_last(files, summary, score)
+                else:
+                    files.discard()
                 self._raise_failures(stopped_by)
         return summary
 

@@ -8,6 +8,7 @@ from slam.commands import compare as command
 from slam.commands.compare import compare, variants_of
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
 from slam.compare.statistics import fewest
+from slam.compare.sweep import check
 from slam.compare.tables import most_tests
 from slam.compare.wording import caution
 from slam.errors import ConfigurationError, UnknownNameError
@@ -55,6 +56,12 @@ def test_no_more_workers_than_anybody_has(tmp_path):
         compare(Plan(("synthetic:desk",), ("ekf",)), tmp_path, workers=10**9)
 
 
+def test_a_recording_that_is_not_rectified_can_be_compared(tmp_path):
+    """Back ends were tried on the rig itself, which they refuse."""
+    sequence = "synthetic:desk?rig=toedin&frames=3"
+    assert check(Plan((sequence,), ("ekf", "smoother")), tmp_path / "out") == {sequence: 3}
+
+
 def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     """It was told by a time of a frame from another machine."""
     tried = []
@@ -73,6 +80,8 @@ def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     assert [(trial.sequence, trial.seed, trial.stop) for trial in tried] == [(name, 0, 15) for name in plan.sequences]
     tried.clear()
     assert command._seconds(plan.every[-1:], frames) == pytest.approx(40 * 0.02) and len(tried) == 1
+    tried.clear()  # a run of fewer frames than those was asked for more than it has
+    assert command._seconds(plan.every[-1:], {"/data": 8}) == pytest.approx(8 * 0.02) and tried[0].stop == 8
     outcome = "failed: SlamError: no"
     assert command._seconds(plan.every, frames) is None
 

@@ -5,7 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from slam.compare import trial
+from slam.compare.plan import Trial, Variant
 from slam.data import Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
+from slam.errors import SlamError
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import exp
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -75,6 +78,23 @@ def test_frames_that_are_not_tracked_are_counted_and_left_out_of_the_accuracy():
     honest = consistency(path.select(rows), covariances[rows], SEQUENCE)["mean NEES"]
     assert found["nees_per_dof"] == pytest.approx(honest / 6)
     assert found["tracked"] == pytest.approx(97 / 120)
+
+
+@pytest.mark.parametrize("mode", ["closed loop", "replay"])
+def test_a_run_knows_the_kind_of_motion_of_its_sequence(mode, tmp_path, monkeypatch):
+    """Drives were doubted as too fast for a hand."""
+    kinds = []
+
+    def stopped(sequence, options, *others, **more):
+        kinds.append(options.kind)
+        raise SlamError("enough")
+
+    for name in ("run", "run_recording"):
+        monkeypatch.setattr(trial, name, stopped)
+    monkeypatch.setattr(trial, "load_recording", lambda path: path)
+    drive = Trial("synthetic:street?frames=2", Variant("surf"), "ekf", 0, mode)
+    trial.run_trial(drive, tmp_path, None if mode == "closed loop" else tmp_path / "recording.npz")
+    assert kinds == ["driving"]
 
 
 def test_nothing_tracked_gives_no_accuracy_and_is_no_fault():

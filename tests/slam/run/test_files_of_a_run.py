@@ -124,6 +124,20 @@ def test_an_estimator_that_fails_in_the_end_loses_no_summary(tmp_path, monkeypat
     assert (tmp_path / "out" / "trajectory_final.txt").read_text().count("\n") == 5
 
 
+@pytest.mark.parametrize("there", [False, True])
+def test_a_run_that_is_refused_before_its_first_frame_leaves_what_was_there(tmp_path, there):
+    """Its files were in the way of the same command with the fault mended."""
+    out, tape = tmp_path / "new" / "out", tmp_path / "a.npz"
+    if there:
+        out.mkdir(parents=True)
+        (out / "notes.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    options = RunOptions("ekf", "none", SystemConfig(), out, record=tape)
+    with pytest.raises(SlamError, match="swapped"):
+        runner.run(Scripted(SlamError("left and right look swapped"), 0), options, frontend=Features())
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_an_error_on_its_way_is_not_replaced(tmp_path, caplog):
     class Stop(BaseException):
         pass

@@ -54,11 +54,16 @@ def test_frames_that_are_not_judged_are_counted_beside_the_verdict():
     assert "not judged" not in verdict_of_run(summary(1.0))
 
 
-def test_covariances_that_are_too_large_on_an_exact_world_say_why():
+def test_covariances_that_are_too_large_on_an_exact_world_say_why(tmp_path):
+    plan = Plan(("synthetic:desk",), ("ekf",), replay=False)
+    trial = Trial("synthetic:desk", Variant("surf"), "ekf", 0, "closed loop")
     for exact in (True, False):
         tree = summary(0.1)
         tree["consistency"]["exact calibration"] = exact
-        assert ("this world's cameras have none" in verdict_of_run(tree)) == exact
+        said = verdict_of_run(tree)
+        assert said.endswith("this world's cameras have none") == exact
+        (group,) = groups(plan, [Run(trial, "completed", figures(tree), {}, tmp_path)])
+        assert honesty(group) == [f"ekf: {said}."]
 
 
 def test_a_nees_of_which_most_stretches_had_no_covariance_is_no_figure():
