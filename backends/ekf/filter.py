@@ -37,8 +37,9 @@ class EkfConfig:
     """Options of `EkfBackend`.
 
     Attributes:
-        papers: the papers' own filter, printed as it is there: the left pixel alone, one linearisation, landmarks in
-            the world, a covariance that is not transported. The other options do not count then.
+        papers: closest to the papers' filter: the left pixel alone, one linearisation, landmarks in the world, a
+            covariance that is not transported. The other options do not count then. What stays is the gate by what all
+            others predict, the outlier test, the recovery, and the limit of 300 landmarks in the state.
         measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
         iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
             updates where the first is not linear to within the noise.
@@ -106,8 +107,8 @@ class EkfBackend:
     left), in the landmarks' coordinates (inverse depth, `backends.ekf.landmarks`), in updates that are linearised again
     where the first time is not enough, in landmarks tested against all others and in recovery (`backends.ekf.solve`,
     `backends.ekf.recovery`), and in a covariance that is transported to each corrected state, so that nothing seems to
-    be learnt of where the world is (`backends.ekf.state`). The option ``papers=True`` gives the plain filter: the left
-    pixel alone, one linearisation, landmarks in the world, no transport. The angles refer to a world of their own in
+    be learnt of where the world is (`backends.ekf.state`). The option ``papers=True`` undoes four of these: the left
+    pixel alone, one linearisation, landmarks in the world, no transport; tests and recovery stay. The angles refer to a world of their own in
     both (`backends.ekf.angles`).
 
     Args:
