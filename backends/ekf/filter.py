@@ -261,12 +261,13 @@ class EkfBackend:
         """See `slam.interfaces.RevisingBackend.revise`: landmarks in view move to where they are seen at from now on.
 
         The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
-        were corrected before, and seen at pixels as they are now, would look as if the camera had moved.
+        were corrected before, and seen at pixels as they are now, would look as if the camera had moved. Those of a
+        prior map that were not measured yet were placed by no pixels: they stay.
         """
         s, stereo = replace(self.state, measured=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
-            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2]))
+            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[: s.covariance.correlated])
             z = stereo.corrected(self._form.name, z[rows], correct)
             points = se3.transform(s.pose, stereo.triangulate(z))
             good = np.isfinite(points).all(axis=1)

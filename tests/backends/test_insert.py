@@ -191,3 +191,17 @@ def test_bad_input_is_refused_with_one_line(name, change, words):
         backend.insert(scene.ids, scene.believed, scene.covariances)
     with pytest.raises(MeasurementError, match="before the first predict"):
         backend.place(scene.ids + 1000, scene.believed, scene.covariances)
+
+
+@pytest.mark.parametrize("name", (*NAMES, "iekf"))
+def test_a_revision_leaves_known_landmarks_that_were_never_measured(name):
+    """No pixels have placed them, so that corrected pixels cannot move them, nor what is said of the rig's errors."""
+    backend, ids = backends.create(name, RIG, models=models()), np.arange(3)
+    positions = np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 8.0], [-1.0, 0.5, 20.0]])
+    backend.consider(lambda z: np.ones((len(z), 3, 1)))
+    backend.insert(ids, positions, np.tile(1e-4 * np.eye(3), (3, 1, 1)))
+    backend.predict(0.0)
+    before = backend.positions(ids), backend.sensitivities(ids)[1]
+    backend.revise(lambda z: z + np.array([0.0, 0.0, 0.5]))
+    np.testing.assert_array_equal(backend.positions(ids), before[0])
+    np.testing.assert_array_equal(backend.sensitivities(ids)[1], before[1])
