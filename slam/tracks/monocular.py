@@ -136,9 +136,9 @@ def depths_by_motion(
     directions = _rays(rig, features.uv_left[rows]) @ T_world_left[:3, :3].T
     waiting = np.flatnonzero(tracks.waiting_since >= 0)
     pairs = _followed(rig, tracks, waiting, features.select(rows), T_world_left)
-    first = np.sort(np.unique(pairs.features, return_index=True)[1])
-    tracks.waiting_since[np.delete(waiting[pairs.tracks], first)] = -1  # alike to the bit: the first has the feature
-    pairs = pairs.select(first)
+    shared = np.bincount(pairs.features, minlength=len(rows))[pairs.features] > 1  # by tracks alike to the bit
+    tracks.waiting_since[waiting[pairs.tracks[shared]]] = -1  # whose it is cannot be told: it begins to wait anew
+    pairs = pairs.select(np.flatnonzero(~shared))
     at, seen = waiting[pairs.tracks], rows[pairs.features]
     then = tracks.first_pose[at]
     motion = adjoint(inverse(T_world_left) @ then)

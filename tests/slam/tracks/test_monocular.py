@@ -90,16 +90,17 @@ def left_features(n, stamp, uv):
     return StereoFeatures(stamp, uv, uv * np.nan, one, one, one, one.astype(np.int8), look)
 
 
-def test_of_waiting_tracks_that_look_alike_to_the_bit_one_has_the_feature():
-    """Two corners are seen, then one of them: it becomes one landmark, and nothing waits on for it."""
+def test_a_feature_that_is_as_like_to_two_waiting_tracks_is_nobodys():
+    """Two corners are seen, then one of them: it waits anew, and becomes one landmark in the frame after that."""
     points, tracks = np.array([[0.0, 0, 3], [0.06, 0, 3]]), Tracks.empty(8)
-    for k, n in enumerate((2, 1)):
+    for k, n in enumerate((2, 1, 1)):
         T = se3.exp(np.array([0, 0, 0, 0.06 * k, 0, 0]))
         features = left_features(n, k / 30, RIG.left.project(se3.transform(se3.inverse(T), points[:n])))
         tracks = tracks.begun(n, 0)
         rows, depths = depths_by_motion(RIG, tracks, features, np.arange(n), T, 1e-10 * np.eye(6), k, SIGMA, 0.5)
-    assert rows.tolist() == [0] and not (tracks.waiting_since >= 0).any()
-    np.testing.assert_allclose(depths.local, [[-0.06, 0, 3]], atol=1e-6)
+        assert rows.tolist() == ([0] if k == 2 else [])
+    assert not (tracks.waiting_since >= 0).any()
+    np.testing.assert_allclose(depths.local, [[-0.12, 0, 3]], atol=1e-6)
     tracks.enter_landmarks(1, np.array([7]), features, rows, np.zeros(3))
     assert tracks.landmarks().ids.tolist() == [7]
 
