@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainc
 
-from slam.chi_square import chi_square_limit, chi_square_limits
-from slam.data import BoolArray
+from slam.chi_square import chi_square_limit
 from slam.geometry.se3 import Array
 
 MIN_OBSERVATIONS = 6  #: fewest observations whose agreement is tested
@@ -56,16 +55,3 @@ def whiteners(covariances: Array) -> Array:
     if not np.isfinite(W).all():
         raise np.linalg.LinAlgError("a covariance is not positive definite")
     return W
-
-
-def chi_square_gate(residuals: Array, innovation_covariances: Array, probability: float) -> BoolArray:
-    """Which observations (M,) lie inside the χ² quantile `probability` of their own innovation covariance.
-
-    Args:
-        residuals: measured less predicted (uL, vL, uR), (M, 3) [px]; uR NaN for a left pixel alone (two degrees of
-            freedom).
-        innovation_covariances: (M, 3, 3) [px²], measurement noise included.
-        probability: share of correct measurements that pass if the covariances are right, in (0, 1).
-    """
-    dof = np.where(np.isnan(residuals[:, 2]), 2, 3)
-    return np.asarray(squared_distances(residuals, innovation_covariances) <= chi_square_limits(dof, probability))
