@@ -17,7 +17,7 @@ from slam.window.chart_kernels import chart
 #: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
 KNOWN, ELIMINATED = -2, -1
 
-_BEHIND = 1e4  # numerics: squared whitened residual of a point that is behind its camera
+_BEHIND = 100.0  # numerics: whitened residual of a point that is behind its camera
 
 
 @helper
@@ -130,7 +130,8 @@ def add_rows(camera, poses, column, points, place, E, rows, places, huber, whole
             transform_back(poses[k], points[p], q)
             front = whitened_residual(camera, q, z[m], root[m], r, D)
         if not front:
-            cost += _BEHIND
+            robust = at < 0 and place[p] == KNOWN and huber < _BEHIND  # one wrong match shall not stop a good step
+            cost += huber * (2.0 * _BEHIND - huber) if robust else _BEHIND * _BEHIND
             continue
         square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
         if at < 0 and square > huber * huber:
