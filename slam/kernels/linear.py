@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.runtime.compilation import helper
+from slam.runtime.compilation import disjoint_vector_helper, helper
 
 
 @helper
@@ -34,6 +34,51 @@ def solve_factorised(M, n, v):
         for h in range(i + 1, n):
             value -= M[h, i] * v[h]
         v[i] = value
+
+
+@helper
+def cholesky(M, U):
+    """``M = Uᵀ U`` (n, n), of which U is filled in above its diagonal; whether M is positive definite.
+
+    NumPy's raises an exception, which leaves a kernel's arrays behind in memory. Two rows at a time less four others:
+    what is loaded once serves twice.
+    """
+    n = len(M)
+    for j in range(n):
+        for i in range(j, n):
+            U[j, i] = M[i, j]
+    for j in range(0, n, 2):
+        h, end = 0, min(n, j + 2)
+        while end == j + 2 and h + 4 <= j:
+            _subtract_four(
+                U[j, j:], U[j + 1, j:], U[h, j:], U[h + 1, j:], U[h + 2, j:], U[h + 3, j:],
+                (U[h, j], U[h + 1, j], U[h + 2, j], U[h + 3, j]),
+                (U[h, j + 1], U[h + 1, j + 1], U[h + 2, j + 1], U[h + 3, j + 1]),
+            )  # fmt: skip
+            h += 4
+        for row in range(j, end):
+            for k in range(h, row):
+                for i in range(row, n):
+                    U[row, i] -= U[k, row] * U[k, i]
+            if not U[row, row] > 0.0:
+                return False
+            root = np.sqrt(U[row, row])
+            for i in range(row, n):
+                U[row, i] /= root
+        if end == j + 2:
+            U[j + 1, j] = 0.0
+    return True
+
+
+@disjoint_vector_helper
+def _subtract_four(v, w, x0, x1, x2, x3, a, b):
+    """``v − Σ a_h x_h`` and ``w − Σ b_h x_h``, in place."""
+    a0, a1, a2, a3 = a
+    b0, b1, b2, b3 = b
+    for i in range(len(v)):
+        y0, y1, y2, y3 = x0[i], x1[i], x2[i], x3[i]
+        v[i] -= a0 * y0 + a1 * y1 + a2 * y2 + a3 * y3
+        w[i] -= b0 * y0 + b1 * y1 + b2 * y2 + b3 * y3
 
 
 @helper

@@ -16,72 +16,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import invert_symmetric, row_times, square, turn
+from slam.kernels.linear import cholesky, invert_symmetric, row_times, square, turn
 from slam.kernels.se3 import move, transform_back
 from slam.kernels.stereo import residual
 from slam.runtime.compilation import helper, kernel
 from slam.window.chart_kernels import charts, displace
-from slam.window.terms import ELIMINATED, add_motion, add_own_priors, add_prior, add_rows, whitened_residual
+from slam.window.terms import ELIMINATED, add_motion, add_own_priors, add_prior, add_rows, sees, whitened_residual
 
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
 _NEAR = 50.0  # numerics: a step with a factor of its own is the last at this many times `close`: it leaves the square
-
-
-@kernel
-def gauss_newton(
-    camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first,
-    order, n, huber, close, steps,
-):  # fmt: skip
-    """Gauss-Newton with halved steps on a window's normal equations ``H x = b`` (n,), its points eliminated.
-
-    `camera` (7,) is as in `slam.kernels.stereo`; `basis` (D + J, 3, 3) are charts of the points that are unknowns, in
-    the first pose's axes; inverse distances of all others count from the pose `centre`; `own` are independent means
-    (N, 3) and information (N, 3, 3) of points in world coordinates, or of none. A whitened residual beyond `huber`
-    pulls no more than one there. A step that lessens the cost by less than `close` is the last; it is taken with the
-    factor of the step before. `steps` are most with a factor of their own; without any, there is no factor at all.
-
-    Returns poses, points, and the cost there; whether it is a minimum; the factor L (n, n); H; and of both, where they
-    were linearised: poses, points, E, the inverse information (N, 3, 3) and the gradient of points, cross, b, the cost
-    (∞ where a point has left the prior's chart), derivatives (m, 6) of the prior's numbers by the first pose.
-    """
-    H, L, x = np.zeros((n, n)), np.zeros((n, n)).T, np.zeros(n)
-    whole, minimum, best, halvings, taken = True, False, np.inf, 0, 0
-    while True:
-        b, cost, A, E, inverse, gradient, cross = _equations(
-            camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first,
-            order, huber, whole, H,
-        )  # fmt: skip
-        if whole or cost <= best + 1e-9 * abs(best) + 1e-12:
-            start = poses, points, E, inverse, gradient, cross
-            if whole:
-                linearised, best = (*start, b, cost, A), cost
-                if steps == 0:
-                    break
-                if n:
-                    L = np.linalg.cholesky(H)
-            rest = _solve(L, b, gradient, inverse, x)
-            if not np.isfinite(rest):
-                raise np.linalg.LinAlgError("a window's step is not finite")
-            minimum = rest < (_NEAR * close if whole else close)
-            if not minimum and not whole:
-                whole = True
-                continue
-            if not minimum and taken == steps:
-                break
-            taken, halvings = taken + 1, 0
-        else:
-            halvings += 1
-            for i in range(n):
-                x[i] *= 0.5
-            if halvings == _HALVINGS:
-                poses, points, cost = linearised[0], linearised[1], best
-                break
-        poses, points = _stepped(column, place, pose_of, first, order, start, x)
-        if minimum:
-            cost -= rest
-            break
-        whole = False
-    return poses, points, cost, minimum, L, H, linearised
 
 
 @helper
@@ -217,6 +160,64 @@ def _eliminate(column, place, pose_of, cross, first, order, information, gradien
 
 
 @kernel
+def gauss_newton(
+    camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first,
+    order, n, huber, close, steps,
+):  # fmt: skip
+    """Gauss-Newton with halved steps on a window's normal equations ``H x = b`` (n,), its points eliminated.
+
+    `camera` (7,) is as in `slam.kernels.stereo`; `basis` (D + J, 3, 3) are charts of the points that are unknowns, in
+    the first pose's axes; inverse distances of all others count from the pose `centre`; `own` are independent means
+    (N, 3) and information (N, 3, 3) of points in world coordinates, or of none. A whitened residual beyond `huber`
+    pulls no more than one there. A step that lessens the cost by less than `close` is the last; it is taken with the
+    factor of the step before. `steps` are most with a factor of their own; without any, there is no factor at all.
+
+    Returns poses, points, and the cost there, NaN where H is not positive definite or a step not finite; whether it is
+    a minimum; the factor L (n, n); H; and of both, where they were linearised: poses, points, E, the inverse
+    information (N, 3, 3) and the gradient of points, cross, b, the cost (∞ where a point has left the prior's chart),
+    derivatives (m, 6) of the prior's numbers by the first pose.
+    """
+    H, U, x = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
+    L = U.T
+    whole, minimum, best, halvings, taken = True, False, np.inf, 0, 0
+    while True:
+        b, cost, A, E, inverse, gradient, cross = _equations(
+            camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first,
+            order, huber, whole, H,
+        )  # fmt: skip
+        if whole or cost <= best + 1e-9 * abs(best) + 1e-12:
+            start = poses, points, E, inverse, gradient, cross
+            if whole:
+                linearised, best = (*start, b, cost, A), cost
+                if steps == 0:
+                    break
+            rest = _solve(L, b, gradient, inverse, x) if not whole or cholesky(H, U) else np.nan
+            if not np.isfinite(rest):
+                cost = np.nan
+                break
+            minimum = rest < (_NEAR * close if whole else close)
+            if not minimum and not whole:
+                whole = True
+                continue
+            if not minimum and taken == steps:
+                break
+            taken, halvings = taken + 1, 0
+        else:
+            halvings += 1
+            for i in range(n):
+                x[i] *= 0.5
+            if halvings == _HALVINGS:
+                poses, points, cost = linearised[0], linearised[1], best
+                break
+        poses, points = _stepped(column, place, pose_of, first, order, start, x)
+        if minimum:
+            cost -= rest
+            break
+        whole = False
+    return poses, points, cost, minimum, L, H, linearised
+
+
+@kernel
 def by_point(point, count):
     """Rows by point: those of point p are ``order[first[p]:first[p + 1]]``."""
     first, order = np.zeros(count + 1, np.int64), np.empty(len(point), np.int64)
@@ -235,13 +236,13 @@ def by_point(point, count):
 
 @kernel
 def row_distances(camera, poses, points, rows):
-    """Square of each whitened residual (M,), ∞ where the point is not in front of the camera."""
+    """Square of each whitened residual (M,), ∞ without a left pixel or where the point is not before the camera."""
     pose, point, z, root = rows
     out, q, r, D = np.empty(len(pose)), np.empty(3), np.empty(3), np.empty((3, 3))
     for m in range(len(pose)):
         transform_back(poses[pose[m]], points[point[m]], q)
         front = whitened_residual(camera, q, z[m], root[m], r, D)
-        out[m] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if front else np.inf
+        out[m] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] if front and sees(z[m]) else np.inf
     return out
 
 
@@ -251,8 +252,8 @@ def left_out_distances(camera, T, points, z, covariances, sigma, least, T_then, 
 
     With r the residual, ``rᵀ (σ² 1 − J C Jᵀ)⁻¹ r``, C the point's covariance (3, 3) in the newest camera T, in which
     the row itself takes part, and J as linearised for C, at `T_then` and `points_then`: elsewhere the difference need
-    not be positive. ∞ where the point is not in front of the camera; 0 where a residual has less than the share
-    `least` of the row's noise.
+    not be positive. ∞ without a left pixel or where the point is not in front of the camera; 0 where a residual has
+    less than the share `least` of the row's noise.
     """
     out, q, r, D = np.empty(len(points)), np.empty(3), np.empty(3), np.empty((3, 3))
     S, inverse, r_then = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -260,7 +261,7 @@ def left_out_distances(camera, T, points, z, covariances, sigma, least, T_then, 
         transform_back(T, points[m], q)
         front = residual(camera, q, z[m], r, D)
         transform_back(T_then, points_then[m], q)
-        if not (residual(camera, q, z[m], r_then, D) and front):
+        if not (residual(camera, q, z[m], r_then, D) and front and sees(z[m])):
             out[m] = np.inf
             continue
         if np.isnan(r[2]):

@@ -52,7 +52,7 @@ class PoseProblem:
         return W
 
     def distances(self, T: Array) -> Array:
-        """Squared distance of each measurement (M,) from what a pose (4, 4) predicts, ∞ behind the camera."""
+        """Squared distance of each measurement (M,) from what a pose (4, 4) predicts, see `row_distances`."""
         return row_distances(self.window(T))
 
     def derivatives(self, T: Array) -> Array:

@@ -202,7 +202,7 @@ class Window:
 
     @cached_property
     def by_point(self) -> tuple[IndexArray, IndexArray]:
-        """Rows, then places, by point: see `slam.window.kernels.normal_equations`."""
+        """Rows, then places, by point: see `slam.window.kernels.by_point`."""
         first, order = kernels.by_point(np.concatenate([self.rows.point, self.places.point]), len(self.points))
         return first, order
 

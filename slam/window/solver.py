@@ -143,6 +143,8 @@ def solve(window: Window, close: float = CLOSE, huber: float = np.inf, steps: in
         numpy.linalg.LinAlgError: something is not determined, or a value is not finite.
     """
     poses, points, cost, minimum, L, H, at = _gauss_newton(window, 0, huber, close, steps)
+    if np.isnan(cost):
+        raise np.linalg.LinAlgError("a window does not determine its unknowns, or holds a value that is not finite")
     return Solution(window.at(poses, points), NormalEquations(window.at(*at[:2]), H, *at[2:]), L, cost, minimum)
 
 
@@ -158,7 +160,10 @@ def _gauss_newton(w: Window, centre: int, huber: float, close: float, steps: int
 
 
 def row_distances(w: Window) -> Array:
-    """Squared distance of each row (M,) from its prediction by poses and points as they are, ∞ behind the camera."""
+    """Squared distance of each row (M,) from its prediction by poses and points as they are.
+
+    It is ∞ for a row without a left pixel, and behind the camera.
+    """
     return np.asarray(kernels.row_distances(w.stereo.intrinsics, w.poses, w.points, w.rows.arrays))
 
 

@@ -17,7 +17,7 @@ from slam.window.chart_kernels import chart
 #: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
 KNOWN, ELIMINATED = -2, -1
 
-_BEHIND = 1e4  # numerics: squared whitened residual of a point that is behind its camera
+_BEHIND = 100.0  # numerics: whitened residual of a point that is behind its camera
 
 
 @helper
@@ -130,7 +130,8 @@ def add_rows(camera, poses, column, points, place, E, rows, places, huber, whole
             transform_back(poses[k], points[p], q)
             front = whitened_residual(camera, q, z[m], root[m], r, D)
         if not front:
-            cost += _BEHIND
+            robust = at < 0 and place[p] == KNOWN and huber < _BEHIND  # one wrong match shall not stop a good step
+            cost += huber * (2.0 * _BEHIND - huber) if robust else _BEHIND * _BEHIND
             continue
         square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
         if at < 0 and square > huber * huber:
@@ -146,15 +147,23 @@ def add_rows(camera, poses, column, points, place, E, rows, places, huber, whole
 
 
 @helper
+def sees(z):
+    """Whether a row z (3,) has its left pixel."""
+    return not (np.isnan(z[0]) or np.isnan(z[1]))
+
+
+@helper
 def whitened_residual(camera, q, z, root, r, D):
     """Residual r (3,) of a point q in the camera and derivatives D (3, 3) of its prediction, times `root` (3, 3).
 
-    What is not measured is zero in both. Returns whether the point is in front of the camera.
+    What is not measured is zero in both, all where the left pixel is not. Returns whether the point is in front of the
+    camera.
     """
     if not residual(camera, q, z, r, D):
         return False
+    blind = not sees(z)
     for i in range(2, -1, -1):  # `root` is lower triangular
-        if np.isnan(r[i]):
+        if blind or np.isnan(r[i]):
             r[i] = D[i, 0] = D[i, 1] = D[i, 2] = 0.0
             continue
         r[i] *= root[i, i]

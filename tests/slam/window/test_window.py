@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numba.core.runtime import _nrt_python, rtsys
 
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.window import chart_kernels, solver
+from slam.kernels.linear import cholesky
+from slam.runtime.compilation import kernel
+from slam.window import chart_kernels, pose_only, solver
 from slam.window.marginal import Conditional, marginalised
+from slam.window.pose_only import PoseProblem
 from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
 from slam.window.solver import linearised
 from slam.window.stereo import RectifiedStereo
@@ -18,6 +22,11 @@ STEREO = RectifiedStereo.of(RIG)
 POSES, POINTS, SIGMA = 5, 40, 0.5
 START = np.diag([1e-10] * 3 + [1e-8] * 3)  # covariance of the first pose
 VELOCITY = np.array([0.01, 0.02, -0.01, 0.05, 0.01, 0.1])
+
+
+@kernel
+def factor(M, U):
+    return cholesky(M, U)
 
 
 def truth(poses=POSES, points=POINTS, seed=0):
@@ -277,6 +286,71 @@ def test_what_nothing_determines_is_refused():
     w = window(prior=RelativePrior.none())
     with pytest.raises(np.linalg.LinAlgError):
         solve(replace(w, rows=w.rows.select(w.rows.pose != 2)))
+
+
+def test_what_is_refused_leaves_nothing_in_memory():
+    """An exception inside a kernel would: all of its arrays, megabytes for each window that is not determined."""
+    w = window(prior=RelativePrior.none())
+    w = replace(w, rows=w.rows.select(w.rows.pose != 2), joining=np.arange(POINTS))
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(w)
+    _nrt_python.memsys_enable_stats()
+    before = rtsys.get_allocation_stats()
+    for _ in range(3):
+        with pytest.raises(np.linalg.LinAlgError):
+            solve(w)
+    after = rtsys.get_allocation_stats()
+    _nrt_python.memsys_disable_stats()
+    assert after.alloc - before.alloc == after.free - before.free > 0
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5, 8, 13, 150])
+def test_the_factor_is_that_of_numpy(n):
+    A = np.random.default_rng(n).standard_normal((n, n + 5))
+    H = A @ A.T
+    lower = np.tril(H) + np.triu(np.full((n, n), np.nan), 1)
+    U = np.zeros((n, n))
+    assert factor(lower, U)
+    np.testing.assert_allclose(U.T, np.linalg.cholesky(H), atol=1e-12 * max(n, 1))
+    for i in range(n):
+        for bad in (-1.0, np.nan):
+            wrong = lower.copy()
+            wrong[i, i] = bad
+            assert not factor(wrong, U)
+
+
+def test_a_wrong_match_to_a_near_landmark_does_not_stop_the_pose():
+    """The step that all others ask for takes that landmark behind the camera."""
+    rng, true = np.random.default_rng(5), np.eye(4)
+    true[2, 3] = 2.0
+    points = np.concatenate([rng.uniform([-2, -1.5, 6], [2, 1.5, 14], (60, 3)), [[0.1, 0.05, 0.45]]])
+    z = STEREO.project(points - true[:3, 3])[0]
+    z[60] = rng.uniform([200, 150, 150], [500, 350, 400])
+    noise = np.tile(0.1 * np.eye(3), (61, 1, 1))
+    noise[60] *= 1000  # so near, its own uncertainty is many pixels
+    problem = PoseProblem(STEREO, points, z, noise, np.eye(4), 0.1 * np.eye(6), 0.99)
+    T, used = pose_only.solve(problem, np.eye(4))
+    np.testing.assert_allclose(T, true, atol=0.01)
+    assert used[:60].all() and not used[60]
+
+
+@pytest.mark.parametrize("entry", [0, 1])
+def test_a_row_without_its_left_pixel_agrees_with_nothing(entry):
+    _, points = truth()
+    z = STEREO.project(points)[0]
+    z[3, entry] = np.nan
+    noise = np.tile(np.eye(3), (POINTS, 1, 1))
+    T, used = pose_only.solve(PoseProblem(STEREO, points, z, noise, np.eye(4), np.eye(6), 0.99), np.eye(4))
+    np.testing.assert_allclose(T, np.eye(4), atol=1e-9)
+    assert used.sum() == POINTS - 1 and not used[3]
+    found = solve(window())
+    w = found.window
+    newest = w.rows.pose == POSES - 1
+    z, m = w.rows.z[newest], w.rows.point[newest]
+    z[3, entry] = np.nan
+    local, _ = found.point_covariances(-1)
+    infinite = np.isinf(found.left_out_distances(-1, m, z, local[m], SIGMA, 2.0))
+    np.testing.assert_array_equal(np.flatnonzero(infinite), [3])
 
 
 def test_a_reference_that_leaves_without_points_leaves_a_prior_of_poses():
