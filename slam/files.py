@@ -59,8 +59,8 @@ def note_input(path: str | Path) -> None:
         noted.append(Path(path).absolute())
 
 
-def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError) -> bytes:
-    """The content of a regular file of at most `limit` bytes.
+def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError, expected: str = "") -> bytes:
+    """The content of a regular file of at most `limit` bytes; `expected` says which file, where it is none.
 
     Raises:
         SlamError: of type `error`, where the file is missing, not a regular file, unreadable or too large.
@@ -75,7 +75,7 @@ def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceEr
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
-            raise error(f"{path}: not a regular file")
+            raise error(f"{path}: not a regular file{expected and f'; expected is {expected}'}")
         if status.st_size > limit:
             raise error(f"{path}: the file is larger than {limit / _MEBI:.3g} MiB")
         # No more than the stated size: files in /proc state none, may be endless, and may block.
