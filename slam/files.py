@@ -59,8 +59,11 @@ def note_input(path: str | Path) -> None:
         noted.append(Path(path).absolute())
 
 
-def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError) -> bytes:
-    """The content of a regular file; raises `error` where it is missing, unreadable or larger than `limit`."""
+def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError, expected: str = "") -> bytes:
+    """The content of a regular file; raises `error` where it is missing, unreadable or larger than `limit`.
+
+    `expected` says which file is meant, where it is none.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except OSError as fault:
@@ -71,7 +74,7 @@ def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceEr
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
-            raise error(f"{path}: not a regular file")
+            raise error(f"{path}: not a regular file{expected and f'; expected is {expected}'}")
         if status.st_size > limit:
             raise error(f"{path}: the file is larger than {limit / _MEBI:.3g} MiB")
         # No more than the stated size: files in /proc state none, may be endless, and may block.

@@ -43,6 +43,20 @@ def half_image(image: NDArray, full_scale: float) -> HalfImage:
     return HalfImage(shape, *_halved(np.ascontiguousarray(image), shape, np.float32(0.25 * 255.0 / full_scale)))
 
 
+@vector_helper
+def _halve_row(upper, lower, column, scale, pixels, between):
+    """Means of blocks of four pixels, and of those a column further to the right; `column` takes sums of two rows."""
+    two, one = np.uint64(2), np.uint64(1)
+    for x in range(len(upper)):
+        column[x] = np.uint32(upper[x]) + np.uint32(lower[x])
+    column[len(upper)] = column[len(upper) - 1]
+    for x in range(len(upper) // 2):
+        k = two * np.uint64(x)
+        middle = column[k + one]
+        pixels[x] = scale * np.float32(np.int32(column[k] + middle))
+        between[x] = scale * np.float32(np.int32(middle + column[k + two]))
+
+
 @kernel
 def _halved(image, shape, scale):
     """The planes of a `HalfImage`."""
@@ -60,20 +74,6 @@ def _halved(image, shape, scale):
         _column_sums(pixels, y, sums, squares)
         _row_weights(sums, squares, weight, y)
     return flat[0], flat[1], flat[2]
-
-
-@vector_helper
-def _halve_row(upper, lower, column, scale, pixels, between):
-    """Means of blocks of four pixels, and of those a column further to the right; `column` takes sums of two rows."""
-    two, one = np.uint64(2), np.uint64(1)
-    for x in range(len(upper)):
-        column[x] = np.uint32(upper[x]) + np.uint32(lower[x])
-    column[len(upper)] = column[len(upper) - 1]
-    for x in range(len(upper) // 2):
-        k = two * np.uint64(x)
-        middle = column[k + one]
-        pixels[x] = scale * np.float32(np.int32(column[k] + middle))
-        between[x] = scale * np.float32(np.int32(middle + column[k + two]))
 
 
 @vector_helper

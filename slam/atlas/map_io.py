@@ -269,7 +269,8 @@ def load_map(path: str | Path) -> SavedMap:
         SlamError: the file is missing, is no map, is of a version that this program does not know, or was altered or
             cut short.
     """
-    return decode(read_bytes(path, _LARGEST, SlamError), str(path))
+    expected = "a map, which `slam run --save-map FILE` leaves"
+    return decode(read_bytes(path, _LARGEST, SlamError, expected), str(path))
 
 
 def encode(saved: SavedMap) -> bytes:

@@ -45,15 +45,6 @@ def field(points, focal):
 
 
 @kernel
-def linearise(first, second, points, R, t, focal, noise):
-    """The fields of `slam.calibration.pairs.Linear`; see `slam.calibration.pairs.linearised` for the arguments."""
-    n = len(points)
-    out = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3)), np.empty((n, 3, 3))
-    _linearise(first, second, points, R, t, focal, noise, *out)
-    return out
-
-
-@kernel
 def fit(first, second, R, t, focal, noise, median):
     """Gauss-Newton of `slam.calibration.pairs.fit_motion`; see there for the arguments.
 
@@ -159,3 +150,12 @@ def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_moti
                 for k in range(3):
                     C[i, j] += B[i, k] * J_point[p, j, k]
         invert_symmetric(C, 0.0, information[p])
+
+
+@kernel
+def linearise(first, second, points, R, t, focal, noise):
+    """The fields of `slam.calibration.pairs.Linear`; see `slam.calibration.pairs.linearised` for the arguments."""
+    n = len(points)
+    out = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3)), np.empty((n, 3, 3))
+    _linearise(first, second, points, R, t, focal, noise, *out)
+    return out

@@ -70,6 +70,12 @@ def compare(
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         wanted = "at least one worker" if workers < 1 else f"at most {_MOST_WORKERS} workers"
         raise ConfigurationError(f"comparison: there must be {wanted}, got {workers}")
+    for text in plan.sequences:
+        if text in registry.names("backends") and not Path(text).exists():
+            names = ",".join([*plan.backends, text])
+            raise ConfigurationError(
+                f"{text}: a back end, no sequence; several are joined by commas: --backends {names}"
+            )
     count = workers or available_cores()
     where = f"{count} at a time on this machine"
     frames = check(plan, out, overwrite)  # before there is a progress bar

@@ -39,8 +39,8 @@ _NO_PAIRS = (
     "take longer recordings in which the camera moves on"
 )
 _UNSOLVED = (
-    "most views agree on no motion ({unsolved} pairs; {pairs} do): is the calibration of these cameras, and of "
-    "images of this size?"
+    "{unsolved} of {every} pairs of views agree on no motion: is the calibration of these cameras, and of images of "
+    "this size?"
 )
 
 _AWAY = 50.0  # baselines at which the error of the depth is said
@@ -111,7 +111,9 @@ def calibrate(
     agreed = "" if apart is None else agreement_in_words(apart)
     corrected = corrected_rig(model, kept.posterior.mean)
     pairs, unsolved = sum(one.pairs for one in found), sum(one.unsolved for one in found)
-    warning = _UNSOLVED.format(pairs=pairs, unsolved=unsolved) if unsolved > pairs else "" if pairs else _NO_PAIRS
+    warning = "" if pairs else _NO_PAIRS
+    if unsolved > pairs:
+        warning = _UNSOLVED.format(unsolved=unsolved, every=pairs + unsolved)
     matched = float(np.median([one.matched for one in found]))
     noise = configs[0].models.pixel_sigma
     judgement, worth = ("", False) if unsolved > pairs else _judged(model, kept.posterior, noise, matched, apart)

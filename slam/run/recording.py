@@ -78,7 +78,7 @@ def load_recording(path: str | Path) -> Recording:
     Raises:
         SequenceError: the file is missing, no recording, of another version, or damaged.
     """
-    content = read_bytes(path, _LARGEST)
+    content = read_bytes(path, _LARGEST, expected="a recording, which `slam run --record FILE.npz` leaves")
     if content.startswith(b"surf-stereo-slam map"):
         raise SequenceError(f"{path}: a saved map, which a run starts in with --map, no recording")
     members = unpack(content, str(path), SequenceError)

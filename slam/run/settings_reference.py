@@ -86,6 +86,9 @@ def listing(wanted: str | None, width: int) -> Iterator[str]:
         every = list(settings())
         chosen = [s for s in every if wanted is None or wanted in (s.key, s.owner) or s.key.startswith(f"{wanted}.")]
         if not chosen:
+            if any(wanted in registry.names(f"{section}s") for section in _PARTS):
+                yield f"{wanted} has no options."
+                return
             names = dict.fromkeys(name for s in every for name in (s.key.partition(".")[0], s.owner) if name)
             same = dict.fromkeys(s.key for s in every if s.key.rpartition(".")[2] == wanted)
             line = unknown("section or setting", wanted or "", names)

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from slam.calibration import RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
 from slam.commands.cli import app
 from slam.errors import SlamError
+from slam.run import calibrating
 from slam.run.calibrating import _judged
 from slam.run.repeat import load
 
@@ -79,6 +82,16 @@ def test_a_correction_is_advised_only_where_it_is_expected_to_help(off, sigma, a
     words, worth = _judged(model, posterior, 0.4, 100.0, differing)
     assert worth == (word in ("This is worth correcting", "This is bad"))  # only then it is said how to use it
     assert f"{off:.2f} ± {sigma:.2f} px in disparity" in words and word in words
+
+
+@pytest.mark.parametrize(("pairs", "unsolved", "words"), [(12, 21, "21 of 33 pairs of views"), (12, 11, "")])
+def test_pairs_that_agree_on_no_motion_are_counted_among_all(pairs, unsolved, words, tmp_path, monkeypatch):
+    """With 12 others, 21 were told as "21 pairs; 12 do", as if 12 of them did."""
+    run = calibrating._run
+    monkeypatch.setattr(calibrating, "_run", lambda *given: replace(run(*given), pairs=pairs, unsolved=unsolved))
+    show = nullcontext(lambda result: None)
+    warning = calibrating.calibrate([slam.open_sequence(WORLD)], tmp_path / "rig.json", lambda *_: show).warning
+    assert warning.startswith(words) and bool(warning) == bool(words)
 
 
 def test_it_is_the_prior_of_a_run_and_of_its_repetition(made, tmp_path):

@@ -144,3 +144,7 @@ def test_an_unknown_section(read):
         list(listing("mapp", 80))
     with pytest.raises(SlamError, match=r"there is map\.max_landmarks"):
         list(listing("max_landmarks", 80))
+
+
+def test_a_back_end_without_options_is_known():
+    assert list(listing("batch", 80)) == ["batch has no options."]

@@ -56,6 +56,11 @@ def test_no_more_workers_than_anybody_has(tmp_path):
         compare(Plan(("synthetic:desk",), ("ekf",)), tmp_path, workers=10**9)
 
 
+def test_back_ends_without_commas_are_told_how_they_are_given(tmp_path):
+    with pytest.raises(ConfigurationError, match="joined by commas: --backends ekf,smoother"):
+        compare(Plan(("synthetic:desk", "smoother"), ("ekf",)), tmp_path / "out")
+
+
 def test_a_recording_that_is_not_rectified_can_be_compared(tmp_path):
     """Back ends were tried on the rig itself, which they refuse."""
     sequence = "synthetic:desk?rig=toedin&frames=3"
