@@ -108,8 +108,8 @@ class EkfBackend:
     where the first time is not enough, in landmarks tested against all others and in recovery (`backends.ekf.solve`,
     `backends.ekf.recovery`), and in a covariance that is transported to each corrected state, so that nothing seems to
     be learnt of where the world is (`backends.ekf.state`). The option ``papers=True`` undoes four of these: the left
-    pixel alone, one linearisation, landmarks in the world, no transport; tests and recovery stay. The angles refer to a world of their own in
-    both (`backends.ekf.angles`).
+    pixel alone, one linearisation, landmarks in the world, no transport; tests and recovery stay. The angles refer to a
+    world of their own in both (`backends.ekf.angles`).
 
     Args:
         rig: the cameras, rectified.
