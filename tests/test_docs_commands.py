@@ -57,7 +57,8 @@ def reader(tmp_path_factory):
         images = [getattr(frame, side) for frame in sequence]
         write_images(root / "recording" / side, images)
         write_video(root / "mine" / f"{side[0]}.mp4", images)
-    shutil.copy(DOCS / "examples" / "pose_fit.py", root)
+    for name in ("pose_fit.py", "orb_front.py"):
+        shutil.copy(DOCS / "examples" / name, root)
     (root / "poses").mkdir()
     straight = np.tile(np.eye(4), (60, 1, 1))
     straight[:, 2, 3] = np.arange(60)

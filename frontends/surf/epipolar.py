@@ -57,25 +57,6 @@ def _halve_row(upper, lower, column, scale, pixels, between):
         between[x] = scale * np.float32(np.int32(middle + column[k + two]))
 
 
-@kernel
-def _halved(image, shape, scale):
-    """The planes of a `HalfImage`."""
-    rows, columns = shape
-    flat = np.zeros((3, rows * columns + _LANES), np.float32)
-    pixels, weight, between = (
-        flat[0, : rows * columns].reshape(shape), flat[1, : rows * columns].reshape(shape),
-        flat[2, : rows * columns].reshape(shape),
-    )  # fmt: skip
-    column = np.zeros(image.shape[1] + 1, np.uint32)
-    for y in range(image.shape[0] // 2):
-        _halve_row(image[2 * y], image[2 * y + 1], column, scale, pixels[y], between[y])
-    sums, squares = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    for y in range(_HALF, rows - _HALF):
-        _column_sums(pixels, y, sums, squares)
-        _row_weights(sums, squares, weight, y)
-    return flat[0], flat[1], flat[2]
-
-
 @vector_helper
 def _row_weights(sums, squares, weight, y):
     """Weights of a row from the column sums of its patches."""
@@ -101,6 +82,25 @@ def _column_sums(pixels, y, sums, squares):
             s += v
             q += v * v
         sums[x], squares[x] = s, q
+
+
+@kernel
+def _halved(image, shape, scale):
+    """The planes of a `HalfImage`."""
+    rows, columns = shape
+    flat = np.zeros((3, rows * columns + _LANES), np.float32)
+    pixels, weight, between = (
+        flat[0, : rows * columns].reshape(shape), flat[1, : rows * columns].reshape(shape),
+        flat[2, : rows * columns].reshape(shape),
+    )  # fmt: skip
+    column = np.zeros(image.shape[1] + 1, np.uint32)
+    for y in range(image.shape[0] // 2):
+        _halve_row(image[2 * y], image[2 * y + 1], column, scale, pixels[y], between[y])
+    sums, squares = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    for y in range(_HALF, rows - _HALF):
+        _column_sums(pixels, y, sums, squares)
+        _row_weights(sums, squares, weight, y)
+    return flat[0], flat[1], flat[2]
 
 
 @vector_helper
