@@ -50,7 +50,7 @@ class Graph:
 
     Args:
         make: makes the factors.
-        lag: number of poses that are smoothed; None for all.
+        lag: number of poses before the newest one that are smoothed with it; None for all.
 
     Attributes:
         rebuilds: how often it was built anew after a failure.
@@ -79,7 +79,7 @@ class Graph:
         self._kind = False, 0
 
     def followed(self, s: SmootherState) -> tuple[Solved, str]:
-        """The solution for a state with more poses than the last one; and why the graph was built anew, if it was.
+        """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
 
         After a failure there are no landmarks among its variables.
 

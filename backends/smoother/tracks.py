@@ -51,7 +51,7 @@ class Tracks:
 
     Args:
         make: makes the factors.
-        lag: number of poses that are smoothed; None for all.
+        lag: number of poses before the newest one that are smoothed with it; None for all.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
@@ -70,7 +70,7 @@ class Tracks:
                 factor = self._make.tie(number - 1, number, tie.relative, tie.covariance)
             else:
                 keys = [pose_key(i) for i in range(number - (1 if unknown else 2), number + 1)]
-                factor = self._make.motion(keys, np.diff(tie.times))
+                factor = self._make.motion(keys, np.diff(tie.times), tie.over)
             problem.factors.add(factor)
         problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
         problem.stamps[pose_key(number)] = float(number)
