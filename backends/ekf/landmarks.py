@@ -19,7 +19,7 @@ from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array, hat
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
-_NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
+_LEFT = 0.1  # share of its inverse depth that a landmark keeps at least in an update
 _ASIDE = 1e3  # guard: largest |x/z|, |y/z|; 89.9 degrees from the axis of the camera that saw it first
 _STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
@@ -119,7 +119,7 @@ class FilterLandmarks(LandmarkRows):
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""
         c, points, gauge, anchors = self.c.copy(), self.points.copy(), self.gauge.copy(), self.anchors[rows]
-        c[rows] = coordinates.moved(self.c[rows], change, _NEARER)
+        c[rows] = coordinates.moved(self.c[rows], change, _LEFT)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
         return replace(self, c=c, points=points, gauge=gauge, seen=self.seen.copy())

@@ -92,7 +92,7 @@ class Graph:
             try:
                 return self._update(s, range(number + 1, s.number + 1), GraphProblem()), ""
             except FAILURES as error:
-                why, self.rebuilds = _line(error), self.rebuilds + 1
+                why, self.rebuilds = line(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
         if why:
             s = replace(s, landmarks=s.landmarks.without_variables(s.number))
@@ -113,7 +113,7 @@ class Graph:
             begin.factors.add(self._make.prior(oldest, self._first, prior))
             return self._update(s, range(oldest, s.number + 1), begin, again)
         except FAILURES as error:
-            raise SolverError(_line(error)) from error
+            raise SolverError(line(error)) from error
 
     def oldest(self, s: SmootherState, newest: int | None = None) -> int:
         """Number of the oldest pose in the graph, where the newest one is that of the state, or has another number."""
@@ -234,12 +234,12 @@ def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
         values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
         after = problem.factors.error(values)
     except FAILURES as error:
-        raise SolverError(_line(error)) from error
+        raise SolverError(line(error)) from error
     if not np.isfinite(after) or after > before:
         raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
     return values
 
 
-def _line(error: BaseException) -> str:
+def line(error: BaseException) -> str:
     """What gtsam says, in one line."""
     return f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}"
