@@ -6,6 +6,7 @@ three successive frames; nothing is approximated.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
-from backends.smoother.graph import FAILURES, minimised
+from backends.smoother.graph import FAILURES, line, minimised
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Tracks
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
@@ -38,7 +39,8 @@ class BatchBackend:
     `estimate` and `trajectory` raise `SlamError` where gtsam cannot solve the problem.
 
     A smoother runs along, of whose graph every measured frame is a pose: it predicts, gates and gives the first values.
-    The problem is solved when the trajectory or the landmarks are asked for; the pose alone is the smoother's.
+    The problem is solved when the trajectory or the landmarks are asked for; the pose alone is the smoother's. Where
+    gtsam cannot give covariances for the solution they are the smoother's, too, and a warning is logged.
 
     Args:
         rig: the cameras.
@@ -63,23 +65,19 @@ class BatchBackend:
 
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`: the smoother's."""
-        self._solution = None
         return self._smoother.update(observations, guess)
 
     def add(self, observations: Observations) -> None:
         """See `slam.interfaces.Backend.add`."""
         self._smoother.add(observations)
-        self._solution = None
 
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         self._smoother.insert(ids, positions, covariances)
-        self._solution = None
 
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         self._smoother.place(ids, local, covariances)
-        self._solution = None
 
     def consider(self, field: Field, pose: Array | None = None) -> None:
         """See `slam.interfaces.ConsideringBackend.consider`: the smoother follows the errors."""
@@ -98,7 +96,6 @@ class BatchBackend:
     def revise(self, correct: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`."""
         self._smoother.revise(correct)
-        self._solution = None
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
@@ -197,7 +194,10 @@ class _BatchSolution:
     def _marginals(self) -> gtsam.Marginals | None:
         try:
             return gtsam.Marginals(self._factors, self.values)
-        except FAILURES:
+        except FAILURES as error:
+            logging.getLogger(__name__).warning(
+                "batch: covariances are the smoother's, gtsam gives none: %s", line(error)
+            )
             return None
 
     def covariance(self, key: int, otherwise: Array) -> Array:

@@ -19,7 +19,7 @@ from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array, hat
 
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
-_NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
+_LEFT = 0.1  # share of its inverse depth that a landmark keeps at least in an update
 _ASIDE = 1e3  # guard: largest |x/z|, |y/z|; 89.9 degrees from the axis of the camera that saw it first
 _STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
@@ -57,15 +57,15 @@ class InverseDepth:
         D[:, 2, 2] = -w * w
         return np.asarray(D @ np.swapaxes(anchors[:, :, :3], 1, 2))
 
-    def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:
-        """Coordinates of points after a change of c (M, 3); of an inverse depth at least this share is left.
+    def moved(self, c: Array, change: Array) -> Array:
+        """Coordinates of points after a change of c (M, 3); of an inverse depth at least a share `_LEFT` is left.
 
         The measurements of a far point may want its inverse depth negative: then it goes away, step by step. Nor does
         a step, which has no meaning so far from where it is linear, put it beside the camera that saw it first.
         """
         out, aside = c + change, np.maximum(np.abs(c[:, :2]), _ASIDE)
         out[:, :2] = np.clip(out[:, :2], -aside, aside)
-        out[:, 2] = np.maximum(out[:, 2], np.maximum(least * c[:, 2], _FARTHEST))
+        out[:, 2] = np.maximum(out[:, 2], np.maximum(_LEFT * c[:, 2], _FARTHEST))
         return np.asarray(out)
 
 
@@ -83,7 +83,7 @@ class Euclidean:
 
     inverse_jacobian = jacobian
 
-    def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:  # noqa: D102
+    def moved(self, c: Array, change: Array) -> Array:  # noqa: D102
         return c + change
 
 
@@ -119,7 +119,7 @@ class FilterLandmarks(LandmarkRows):
     def moved(self, coordinates: Coordinates, rows: IndexArray | slice, change: Array) -> FilterLandmarks:
         """With a change (M, 3) of the coordinates of some rows."""
         c, points, gauge, anchors = self.c.copy(), self.points.copy(), self.gauge.copy(), self.anchors[rows]
-        c[rows] = coordinates.moved(self.c[rows], change, _NEARER)
+        c[rows] = coordinates.moved(self.c[rows], change)
         points[rows] = coordinates.points(anchors, c[rows])
         gauge[rows] = gauge_jacobian(coordinates, anchors, c[rows], points[rows])
         return replace(self, c=c, points=points, gauge=gauge, seen=self.seen.copy())

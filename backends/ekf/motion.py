@@ -175,8 +175,10 @@ def motion_noise(models: EstimatorModels, dt: float) -> Array:
 def after_gap(models: EstimatorModels, P: Array, dt: float) -> Array | None:
     """Covariance (12, 12) of a camera that may have turned anyhow in the last `dt` [s]; None where it may not.
 
-    P (12, 12) is that before, of position, attitude, velocity, and rate. The position is as uncertain as the prior of
-    the speed makes it meanwhile. Larger numbers would mean nothing, and leave a double too few digits for the map.
+    P (12, 12) is that before, of position, attitude, velocity, and rate; of the Euler angles and their rates in the
+    papers' camera. What is returned is of a turn about the body's axes and of the body's rate. The position is as
+    uncertain as the prior of the speed makes it meanwhile. Larger numbers would mean nothing, and leave a double too
+    few digits for the map.
     """
     attitude, rate = np.arange(3, 6), np.arange(9, 12)
     variance = P[attitude, attitude] + 2 * dt * P[attitude, rate] + dt * dt * P[rate, rate]

@@ -37,15 +37,15 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     smallest first; `search` is only called where nothing else helps. Raises UnsolvableError where the reason is
     numerical.
     """
-    found, error, most = None, None, (len(update.z) + 1) // 2
+    found, error, majority = None, None, (len(update.z) + 1) // 2
     try:
-        for gated in _gated(update, noises, max(MIN_OBSERVATIONS, most)):
+        for gated in _gated(update, noises, max(MIN_OBSERVATIONS, majority)):
             found = _agreed(gated) or found
-            if found is not None and found.used.sum() >= most:
+            if found is not None and found.used.sum() >= majority:
                 return found
     except UnsolvableError as reason:
         error = reason
-    least = max(MIN_CONSENSUS, most)
+    least = max(MIN_CONSENSUS, majority)
     finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
     T = search() if finite and len(update.z) >= least else None
     if T is not None:
@@ -61,18 +61,19 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     return found
 
 
-def _gated(update: Update, noises: Iterable[Array], most: int) -> Iterable[Gated]:
+def _gated(update: Update, noises: Iterable[Array], majority: int) -> Iterable[Gated]:
     """The first prior, with more noise or seen from the guess, with which most pass the gate; then it as it is.
 
     What still disagrees is taken out later by `solve`.
     """
     first = gate(update)
-    if len(update.z) >= most > first.used.sum():
-        priors = itertools.chain([update], map(update.wider, noises))
-        tries = ((one, at_guess) for one in priors for at_guess in (False, True)[: 1 + (update.guess is not None)])
+    if len(update.z) >= majority > first.used.sum():
+        places = (False, True)[: 1 + (update.guess is not None)]
+        wider = ((one, at_guess) for one in map(update.wider, noises) for at_guess in places)
+        tries = itertools.chain(((update, at_guess) for at_guess in places[1:]), wider)
         for one, at_guess in tries:
             gated = gate(one, at_guess)
-            if gated.used.sum() >= most:
+            if gated.used.sum() >= majority:
                 yield gated
                 break
     yield first

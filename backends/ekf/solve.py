@@ -105,8 +105,8 @@ class Linearisation:
     update: Update
     camera: Any  # the prior's at another pose
     J: Array  # (12, 12): an error of the prior's camera is J times that, as an error of this one
-    mean: Array  # the error (12,) of the prior's camera less that of this one
-    change: Array  # of the state (n,) from the prior, but for the pose
+    mean: Array  # the error (12,) of this camera less that of the prior's, in the prior's coordinates
+    change: Array  # of the state (n,) from the prior; 0 for the pose, which counts from here
     z: Array  # what is predicted here (M, 3) [px]
     own: Array  # its derivatives (M, 3, 3) by the coordinates
     lever: Array  # (M, 3, 6), see the module
@@ -235,7 +235,7 @@ class Posterior:
     """The maximum of the posterior (or one step towards it)."""
 
     whitened: Whitened  # the last innovation, from which the covariance follows
-    change: Array  # of the state (n,), see `Linearisation.camera_after`
+    change: Array  # of the state (n,) from the prior; the pose's part counts from the last linearisation
 
     @property
     def update(self) -> Update:

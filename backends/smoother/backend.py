@@ -34,7 +34,8 @@ class SmootherBackend:
     (`slam.window.pose_only`), and becomes a pose of the factor graph: its measurements go into the smart factors, from
     which gtsam eliminates the landmarks, and the last poses are estimated together. Frames that saw nothing hang at the
     last pose of the graph. A landmark stands where its last measurements put it, given the poses; where few are in view
-    those that are measured for longer than the lag are variables. Covariances are gtsam's marginals.
+    those that are measured for longer than the lag are variables. Covariances of poses and variables are gtsam's
+    marginals; those of other landmarks follow from their measurements and the poses'.
 
     Args:
         rig: the cameras, rectified.

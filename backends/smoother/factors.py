@@ -66,12 +66,13 @@ class FactorMaker:
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         return gtsam.BetweenFactorPose3(pose_key(earlier), pose_key(later), to_pose3(relative), noise)
 
-    def motion(self, keys: Sequence[int], dt: Array) -> gtsam.NonlinearFactor:
+    def motion(self, keys: Sequence[int], dt: Array, over: float | None = None) -> gtsam.NonlinearFactor:
         """The velocity between the last two poses is that before but for noise.
 
         gtsam linearises it where it linearises the rest: at other poses it would pull at the path as a whole, which
         nothing else holds. `keys` are three successive poses with the times `dt` (2,) [s] between them; or two of which
-        the first velocity is unknown, and then the first time does not count.
+        the first velocity is unknown, and then the first time does
+        not count. `over` is the time [s] over which the velocity changed; None for the last one of these.
         """
         n, before, last = len(keys), float(dt[0]), float(dt[1])
 
@@ -82,7 +83,7 @@ class FactorMaker:
                     jacobians[i] = J[:, 6 * (i + 3 - n) : 6 * (i + 4 - n)]
             return r
 
-        sigmas = velocity_sigmas(self._models, last, n == 2)
+        sigmas = velocity_sigmas(self._models, last if over is None else over, n == 2)
         return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), keys, error)
 
     def point(self, z: Sequence[float]) -> gtsam.StereoPoint2:

@@ -46,7 +46,8 @@ class Graph:
 
     Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
     world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
-    known in the world the first pose has its own covariance instead. With a `lag` of None all poses are smoothed.
+    known in the world the first pose has its own covariance instead. So many poses before the newest one as
+    `lag` says are smoothed with it; None for all.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
@@ -72,7 +73,7 @@ class Graph:
         self._kind = False, 0
 
     def followed(self, s: SmootherState) -> tuple[Solved, str]:
-        """The solution for a state with more poses than the last one; and why the graph was built anew, if it was.
+        """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
 
         After a failure there are no landmarks among its variables. Raises SolverError where gtsam fails with the new
         graph as well.
@@ -83,7 +84,7 @@ class Graph:
             try:
                 return self._update(s, range(number + 1, s.number + 1), GraphProblem()), ""
             except FAILURES as error:
-                why, self.rebuilds = _line(error), self.rebuilds + 1
+                why, self.rebuilds = line(error), self.rebuilds + 1
                 self._careful = s.number + (self._lag or _CAREFUL)
         if why:
             s = replace(s, landmarks=s.landmarks.without_variables(s.number))
@@ -100,7 +101,7 @@ class Graph:
             begin.factors.add(self._make.prior(oldest, self._first, prior))
             return self._update(s, range(oldest, s.number + 1), begin, again)
         except FAILURES as error:
-            raise SolverError(_line(error)) from error
+            raise SolverError(line(error)) from error
 
     def oldest(self, s: SmootherState, newest: int | None = None) -> int:
         """Number of the oldest pose in the graph, where the newest one is that of the state, or has another number."""
@@ -217,12 +218,12 @@ def minimised(problem: GraphProblem, iterations: int) -> gtsam.Values:
         values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
         after = problem.factors.error(values)
     except FAILURES as error:
-        raise SolverError(_line(error)) from error
+        raise SolverError(line(error)) from error
     if not np.isfinite(after) or after > before:
         raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
     return values
 
 
-def _line(error: BaseException) -> str:
+def line(error: BaseException) -> str:
     """What gtsam says, in one line."""
     return f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}"

@@ -88,8 +88,8 @@ class SmootherLandmarks(LandmarkRows):
         away = self.away.copy()
         away[rows] = 0.0
         zs, poses = self.z.copy(), self.pose.copy()
-        oldest = poses[rows].argmin(axis=1)
-        zs[rows, oldest], poses[rows, oldest] = z, pose
+        slot = poses[rows].argmin(axis=1)
+        zs[rows, slot], poses[rows, slot] = z, pose
         return replace(self, z=zs, pose=poses, away=away, begun=begun)
 
     def with_variables(
@@ -112,15 +112,15 @@ class SmootherLandmarks(LandmarkRows):
         deviation = np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2))
         offset = np.linalg.norm(self.position[rows] - self.linearised[rows], axis=1)
         apart = linear * np.where(variable[rows], offset, deviation)
-        close = apart >= np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
+        nonlinear = apart >= np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
         full = ~variable[rows] & (self.begun[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
-        new = rows[full & ~close & np.isfinite(z[:, 2])]
-        away = np.flatnonzero(variable & (last < pose - track))
-        away = away[np.argsort(last[away], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
+        new = rows[full & ~nonlinear & np.isfinite(z[:, 2])]
+        leaving = np.flatnonzero(variable & (last < pose - track))
+        leaving = leaving[np.argsort(last[leaving], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
         begun = self.begun.copy()
-        begun[away] = 0
-        begun[rows[variable[rows] & close]] = 0
-        new = np.sort(new)[: most - int(variable.sum()) + len(away)]
+        begun[leaving] = 0
+        begun[rows[variable[rows] & nonlinear]] = 0
+        new = np.sort(new)[: most - int(variable.sum()) + len(leaving)]
         begun[new] = VARIABLE
         linearised = self.linearised.copy()
         linearised[new] = self.position[new]

@@ -45,9 +45,9 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     D = now[0] @ inverse(s.poses[s.of(first)])
     moved = np.concatenate([D @ s.poses[: s.of(first)], now])
     marks = s.landmarks
-    away = ~marks.world & ~(marks.pose >= first).any(axis=1)
-    position = np.where(away[:, None], transform(D, marks.position), marks.position)
-    marks = replace(marks, position=position, mean=np.where(away[:, None], position, marks.mean))
+    unseen = ~marks.world & ~(marks.pose >= first).any(axis=1)
+    position = np.where(unseen[:, None], transform(D, marks.position), marks.position)
+    marks = replace(marks, position=position, mean=np.where(unseen[:, None], position, marks.mean))
     last = s.last.copy()
     if s.anchored:
         last[1] = moved[-1] @ inverse(s.poses[-1]) @ s.last[1]

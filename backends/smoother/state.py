@@ -36,14 +36,18 @@ class Sight(Table):
 class Tie:
     """What the motion model said of a pose before it was measured.
 
-    The times are of the three frames that the motion model ties [s]; the first is NaN where the velocity is unknown.
-    Where not all of them are poses of the graph, one after the other, they are None, and the rest counts instead.
+    The velocity between two poses of the graph is that between the two before them, but for noise. Where frames that
+    saw nothing lie between two poses the velocity is the mean one, and the impulses of all frames are in the noise: see
+    `over`. Where the model does not say that (at rest, or after a gap that hides a turn) `times` is None, and the
+    pose is tied by where it was predicted, as if that did not depend on the graph: it counts the velocity twice.
     """
 
     relative: Array  # the pose relative to the one before it in the graph (4, 4)
     covariance: Array  # of that (6, 6)
-    direct: bool  # whether the pose before it in the graph is the frame before it
-    times: Array | None = None  # (3,)
+    span: float | None = None  # time since that one [s]; None where the model's velocity does not tell what it moved by
+    weight: float = 0.0  # sum [s²] over the frames since of their intervals times the time from their start to the pose
+    times: Array | None = None  # (3,) of the three poses [s]; the first is NaN where the velocity is unknown
+    over: float = 0.0  # time [s] over which the motion model's impulses give the noise
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,14 @@ from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
 from backends.smoother.state import Known, Sight, SmootherState, Tie
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
-from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, rotation_angle, transform
 from slam.window import motion, pose_only
 from slam.window.consensus import landmarks_pose
 from slam.window.gating import MIN_CONSENSUS
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.stereo import RectifiedMeasurement, relative_covariance
+
+_SURE = 3.0  # guard: deviations of a turn in frames that saw nothing; half a turn and more looks like another one
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +54,11 @@ class Steps(RectifiedMeasurement):
         cross = J @ s.pair[:, 6:]
         own = _carried(J, s.pair) + noise
         own = 0.5 * (own + own.T)
-        tie = Tie(inverse(s.poses[-1]) @ T, own, s.inside)
-        if s.inside and not rests and (first or before is None or (s.tie is not None and s.tie.direct)):
-            tie = replace(tie, times=np.array([np.nan if first or before is None else -before, 0.0, dt]))
         return replace(
             s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
             pair=np.block([[s.own, cross.T], [cross, own]]),
             by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]), since=s.since + 1, inside=False, measured=False,
-            tie=tie,
+            tie=_tie(s, inverse(s.poses[-1]) @ T, own, dt, first, rests),
         )  # fmt: skip
 
     def in_view(self, s: SmootherState) -> tuple[IndexArray, Array, Array, Array]:
@@ -117,7 +116,7 @@ class Steps(RectifiedMeasurement):
     def _corrected(
         self, s: SmootherState, graph: Graph, one: pose_only.PoseProblem, found: Agreement, rows: IndexArray, z: Array
     ) -> tuple[SmootherState, float, str]:
-        """The state after an update, its NIS, and why the graph was built anew, if it was."""
+        """The state after an update, its NIS, and why gtsam failed, if it did."""
         used, marks = found.used, s.landmarks
         seen, number = rows[used], s.number + (found.jump is not None or not s.inside)
         if found.jump is not None:
@@ -220,6 +219,34 @@ class Steps(RectifiedMeasurement):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
         return C
+
+
+def _tie(s: SmootherState, relative: Array, own: Array, dt: float, first: bool, rests: bool) -> Tie:
+    """What the motion model says of the frame `dt` [s] after the last one, which is there relative to the graph.
+
+    In a gap of frames of d_j [s], T together, impulses w_j change the velocity: the mean one in the gap differs from
+    that before by ``Σ w_j a_j / T``, with a_j the time from frame j's start to the gap's end, and from the last one by
+    ``Σ w_j b_j / T`` with ``b_j = T − a_j``. What the two ends of a gap share correlates the factors there. Each has
+    the variance of its own and the covariance of both besides, with which they are as good as independent, and never
+    too sure: ``Σ d_j a_j / T`` at its beginning and ``Σ d_j b_j / T`` at its end, times the model's variance by time.
+    """
+    tie, span, weight = Tie(relative, own), dt, dt * dt
+    if not s.inside:
+        if s.tie is None or s.tie.span is None or s.tie.times is None or first or rests:
+            return tie
+        span, first = s.tie.span + dt, bool(np.isnan(s.tie.times[0]))
+        weight = s.tie.weight + dt * span
+    tie, before, earlier, changed = replace(tie, span=span, weight=weight), s.ties[-1], math.nan, 0.0
+    if rests:
+        return tie
+    if not first:
+        if before is None or before.span is None or motion.is_first(before.span, span):
+            return tie
+        turn = rotation_angle(before.relative[:3, :3]) * span / before.span
+        if not s.inside and turn + _SURE * math.sqrt(own[:3, :3].diagonal().max()) > math.pi:
+            return tie
+        earlier, changed = -before.span, before.span - before.weight / before.span
+    return replace(tie, times=np.array([earlier, 0.0, span]), over=weight / span + changed)
 
 
 def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> SmootherState:

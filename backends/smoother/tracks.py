@@ -48,7 +48,7 @@ class Tracks:
     A landmark is a smart factor that grows until the landmark goes on in a new one (`SmootherLandmarks.measured`):
     factors end before their first pose leaves the lag. A landmark of which more is known than what was measured is a
     variable of its own, and so are some that were measured for longer: those take over what is in their smart factor.
-    With a `lag` of None all poses are smoothed.
+    So many poses before the newest one as `lag` says are smoothed with it; None for all.
     """
 
     def __init__(self, make: FactorMaker, lag: int | None) -> None:
@@ -67,7 +67,7 @@ class Tracks:
                 factor = self._make.tie(number - 1, number, tie.relative, tie.covariance)
             else:
                 keys = [pose_key(i) for i in range(number - (1 if unknown else 2), number + 1)]
-                factor = self._make.motion(keys, np.diff(tie.times))
+                factor = self._make.motion(keys, np.diff(tie.times), tie.over)
             problem.factors.add(factor)
         problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
         problem.stamps[pose_key(number)] = float(number)

@@ -70,7 +70,7 @@ def test_landmarks_seen_once_are_the_smoothers():
 
 
 @pytest.mark.parametrize("error", [RuntimeError("Indeterminant linear system\ndetected"), KeyError("x1")], ids=str)
-def test_covariances_that_gtsam_cannot_give_are_the_smoothers(monkeypatch, error):
+def test_covariances_that_gtsam_cannot_give_are_the_smoothers(monkeypatch, caplog, error):
     class Broken:
         def __init__(self, *_):
             raise error
@@ -81,6 +81,7 @@ def test_covariances_that_gtsam_cannot_give_are_the_smoothers(monkeypatch, error
     run(smoother, data)
     monkeypatch.setattr(gtsam, "Marginals", Broken)
     estimate, rough = backend.estimate(), smoother.estimate()
+    assert [record.getMessage()[:40] for record in caplog.records] == ["batch: covariances are the smoother's, g"]
     np.testing.assert_allclose(estimate.covariance, rough.covariance, rtol=1e-9)
     np.testing.assert_allclose(estimate.covariances, rough.covariances, rtol=1e-9)
     off = np.abs(estimate.positions - rough.positions).max(axis=1)

@@ -43,6 +43,25 @@ def test_frames_that_see_nothing_at_uneven_times_leave_the_same_uncertainty(name
     assert np.abs(off / deviations(filtered)).max() < 0.02
 
 
+@pytest.mark.parametrize("dark", [{4}, {3}, {3, 4}], ids=str)
+def test_few_landmarks_after_dark_frames_leave_the_optimums_uncertainty(dark):
+    """The velocity before a gap counts once: the smoother was as sure as 0.72 of the deviations with two landmarks."""
+    data, found = scene(path(7, 0.1, np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.02, 0.0])), 60, seed=3), []
+    for name in ("batch", "smoother", "window"):
+        backend = backends.create(name, RIG, models=EstimatorModels(MotionModel(0.1, 0.1), pixel_sigma=0.5))
+        known = data.observations[0].ids
+        for k, (stamp, _, seen) in enumerate(data):
+            backend.predict(stamp)
+            if not k:
+                backend.add(seen)
+                continue
+            seen = seen.select(np.arange(len(seen)) < (0 if k in dark else 2 if k > 4 else len(seen)))
+            backend.update(seen.select(np.isin(seen.ids, known)))
+        found.append(deviations(backend))
+    for others in found[1:]:
+        assert (others / found[0] > 0.98).all() and (others / found[0] < 1.06).all(), others / found[0]
+
+
 def test_drift_adds_up_while_a_landmark_is_not_seen():
     none, certain = np.zeros((1, 3, 3)), 1e-4 * np.eye(3)[None]
     marks = SmootherLandmarks.of(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 import shutil
 import subprocess
 import sys
@@ -12,7 +14,7 @@ import pytest
 
 from slam.kernels.linear import factorise
 from slam.kernels.se3 import move
-from slam.runtime.compilation import makes_arrays, stamp
+from slam.runtime.compilation import kernel, makes_arrays, stamp
 
 ROOT = Path(__file__).parents[3]
 
@@ -96,3 +98,21 @@ def test_what_makes_arrays_is_told_by_its_text_and_its_helpers():
 
 def _moves(T, step):
     move(T, step)
+
+
+def test_every_kernel_stands_below_its_helpers():
+    """A kernel's stamp is taken where it is defined; helpers further below would not be in it, and it would go stale."""
+    kernels, wrong = 0, []
+    for root in ("slam", "backends", "frontends"):
+        package = importlib.import_module(root)
+        for found in pkgutil.walk_packages(package.__path__, f"{root}."):
+            if found.name.endswith("__main__"):
+                continue
+            for name, value in list(vars(importlib.import_module(found.name)).items()):
+                file = getattr(getattr(value, "_cache", None), "_cache_file", None)
+                function = getattr(value, "py_func", None)
+                if file is not None and function is not None and function.__module__ == found.name:
+                    kernels += 1
+                    if file._source_stamp[1] != stamp(function, kernel):
+                        wrong.append(f"{found.name}.{name}")
+    assert kernels > 40 and not wrong
