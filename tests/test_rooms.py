@@ -39,7 +39,7 @@ MAY_IMPORT = {
         "system", "calibration", "bodies", "atlas", "tracks", "window", "input", "sequences", "worlds", "evaluation",
         "data", "geometry", "runtime",
     },
-    "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "bodies"},
+    "compare": {"run", "system", "input", "sequences", "worlds", "evaluation", "data", "geometry", "bodies"},
     "testing": {"system", "worlds", "data", "geometry"},
     "commands": {
         "compare", "run", "bodies", "system", "sequences", "worlds", "evaluation", "data", "geometry", "runtime",
