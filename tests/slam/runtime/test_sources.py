@@ -101,7 +101,7 @@ def _moves(T, step):
 
 
 def test_every_kernel_stands_below_its_helpers():
-    """A kernel's stamp is taken where it is defined: helpers further below would not be in it, and it would be stale."""
+    """A stamp is taken where a kernel is defined: helpers further below would not be in it, and it would be stale."""
     kernels, wrong = 0, []
     for root in ("slam", "backends", "frontends"):
         package = importlib.import_module(root)
