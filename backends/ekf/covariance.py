@@ -138,7 +138,7 @@ class Covariance:
         marks, new = kernels.gather(self.marks, numbers, numbers), np.flatnonzero(order >= first)
         each = numbers_of(new).reshape(-1, 3)
         marks[each[:, :, None], each[:, None, :]] = self.known[order[new] - first]
-        head = kernels.gather(self.head[:, h:], np.arange(h), numbers)
+        head = kernels.gather(self.head, np.arange(h), np.where(numbers < 0, -1, h + numbers))
         by_rig = kernels.gather(self.by_rig[h:], numbers, np.arange(self.by_rig.shape[1]))
         return Covariance(
             np.concatenate([self.head[:, :h], head], axis=1), marks, np.concatenate([self.by_rig[:h], by_rig]),
