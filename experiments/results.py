@@ -38,11 +38,11 @@ class Experiment:
     page: str  # one of `PAGES`
     title: str  # heading of its section
     paper: str = ""  # what the paper had; empty for our own
-    says: str = ""  # what its table says, where it does not say so itself
     pictures: dict[str, str] | None = None  # captions of those that are shown, by name
     arguments: tuple[str, ...] = ()  # of its long form
     left_out: tuple[str, ...] = ()  # columns that are not shown on the page; they are in the files that it leaves
     folder: str = "experiments"
+    says: str = ""  # what its table says, where it does not say so itself
 
     def command(self, quick: bool) -> list[str]:
         """Script and arguments, without the folder for what it leaves."""
