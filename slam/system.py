@@ -297,7 +297,7 @@ class StereoSlam:
         return out(result)
 
     def _roll_back(self) -> None:
-        """After a step that an exception ended: what it did to the back end's map is undone."""
+        """After a step that an exception ended: table and back end hold the same landmarks again."""
         if self._stages.begun:
             self._state, self._stages = self._tracker.roll_back(self._state), Stages()
 

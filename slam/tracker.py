@@ -1,8 +1,8 @@
 """The parts of a system and the stages of a step, each a function of the frame in work; `slam.system` orders them.
 
 `State` is what a step starts from and leaves behind. A step builds a new one beside it, which takes its place at the
-end; so landmarks, and what waits for a depth, outlast a step that an exception ended. What such a step did to the back
-end's map is undone by `Tracker.roll_back`, which forgets the detector's bodies and the tracks that it follows.
+end. After a step that an exception ended, `Tracker.roll_back` makes table and back end hold the same landmarks again,
+and bodies are forgotten; what the back end has learnt in that step stays in its estimate.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ NEW_MAP = "the place is not in the map: a new map begins"
 class State:
     """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end."""
 
-    backend: Backend  # holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`.
+    backend: Backend  # holds the estimate; see `Mapper.reconcile` for what an interrupted step left in it
     tracks: Tracks | None = None  # the table of all that is followed or in the map; None before the first frame
     atlas: Atlas = field(default_factory=Atlas)  # keyframes and loops
     index: int = -1  # of the last frame
@@ -233,7 +233,7 @@ class Tracker:
         return step
 
     def close_loops(self, state: State, step: Step) -> tuple[Step, Atlas]:
-        """The step, its pose with the rig's uncertainty, and the atlas after it.
+        """The step, its pose with the rig's uncertainty, and the atlas after it, with a keyframe more where one is due.
 
         The frame becomes a keyframe where its view differs; a loop corrects the path.
         """
@@ -243,7 +243,7 @@ class Tracker:
         return step, self.loop_closer.update(state.atlas, step, state.path)
 
     def roll_back(self, state: State) -> State:
-        """The state after an interrupted step: what that did to the back end's map is undone, bodies are forgotten."""
+        """The state after an interrupted step: landmarks that only table or back end has are erased, bodies forgotten."""
         self.objects.restart()
         if state.prior_map is not None or not np.isfinite(self.advanced):  # that back end has not begun
             return state

@@ -169,7 +169,7 @@ class Atlas:
     def with_loops(self, chosen: Sequence[Loop], believed: Sequence[Loop]) -> Atlas:
         """A copy with other loops in the pose graph; previous ones that are not `believed` any more become refused.
 
-        `held` and `believed` are in order of their second keyframes.
+        `chosen` and `believed` are in order of their second keyframes.
         """
         good, in_graph = {x.pair for x in believed}, {x.pair for x in chosen}
         out = [x for x in self.loops if x.pair not in in_graph]

@@ -42,6 +42,8 @@ _WORSE = -9.0  # a member for which the still world is better by more leaves
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
 _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
+_APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
+_LEAST_SPREAD = 1e-8  # numerics: variance that is added to that of a known pose [m²]
 _RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
 _LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
@@ -231,10 +233,31 @@ def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.int
         near = _distances(body, tracks, rows, wider) < _NEAR
         if not body.measured or 2 * near.sum() <= len(rows) or _explained(body, tracks, rows) >= 2 * EXPLAINED:
             continue
-        theirs = np.flatnonzero((tracks.body == body.id) & tracks.found)
-        if body.seen <= PROBATION or distinctness(own, rows, body, theirs, tracks) < 1.0:
+        if body.seen <= PROBATION or not _moves_otherwise(body, own, tracks, rows):
             return body
     return None
+
+
+def _moves_otherwise(body: Body, own: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
+    """Whether `own`, a body made of these tracks alone, leaves far less χ² than chance would make of the body's.
+
+    In every frame the tracks share the displacement by the error of the body's pose, of known covariance.
+    """
+    alone = float(squares(*in_body_axes(own, tracks, rows)[:2]).sum())
+    points, A, known = in_body_axes(body, tracks, rows)
+    y = weighted_means(points, A)
+    pull = times_vectors(A, points - y[:, None]).sum(axis=0)
+    pose = np.linalg.inv(_spread_of_place(body, y.mean(axis=0)) + _LEAST_SPREAD * np.eye(3))
+    shared = (pull * np.linalg.solve(A.sum(axis=0) + pose, pull[..., None])[..., 0]).sum()
+    certain = float(squares(points, A).sum() - shared)
+    by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
+    return certain - alone > _APART * by_chance and certain > 2 * _APART * alone
+
+
+def _spread_of_place(body: Body, y: Array) -> Array:
+    """Covariance (3, 3), in body axes, of where the body's point y (3,) is, given that of its pose."""
+    J = -points_by_pose(y[None])[0]
+    return np.asarray(J @ body.covariance @ J.T)
 
 
 def _explained(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> float:
@@ -256,9 +279,8 @@ def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body 
         gap, size = new.middle - body.middle, 0.5 * (body.across + new.across)
         if np.linalg.norm(gap) > size + max_speed * (new.seen_at - body.seen_at):
             continue
-        J = -points_by_pose(0.5 * (body.lower + body.upper)[None])[0]
-        R = body.T[:3, :3]
-        place = R @ J @ body.covariance @ J.T @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
+        R, spread = body.T[:3, :3], _spread_of_place(body, 0.5 * (body.lower + body.upper))
+        place = R @ spread @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
         change = new.velocity[3:] - body.velocity[3:]
         velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
         off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))

@@ -162,7 +162,11 @@ _NOWHERE = Estimate(-np.inf, np.eye(4), np.eye(6), _NONE, np.zeros((0, 3)), np.z
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A frame in work. Each stage returns a copy that says more; nothing refers to a frame whose step did not end."""
+    """A frame in work. Each stage returns a copy that says more.
+
+    What a stage changes in place is the table of tracks, which is this step's own copy but for what is followed, and the
+    back end, the detector and the calibration.
+    """
 
     index: int  # of the frame
     measured: StereoFeatures  # the features as measured; those of landmarks aligned with earlier images

@@ -23,8 +23,6 @@ from slam.window.stereo import RectifiedMeasurement, RectifiedStereo
 CLEAR_MAJORITY = 0.7  #: share of the matches that agree with the guess at which no other pose is tried
 _BATCH = 10  # cost: hypotheses tried at once
 _ENOUGH = 100  # cost: matches that fix a pose far better than is needed to tell which others agree
-
-
 _HYPOTHESES = 200  # cost: poses tried in the search for one on which the landmarks agree
 _AS_NEW = 2.0  # innovation variance of a landmark as uncertain as a new one, in units of the pixel variance
 
