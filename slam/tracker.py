@@ -243,7 +243,7 @@ class Tracker:
         return step, self.loop_closer.update(state.atlas, step, state.path)
 
     def roll_back(self, state: State) -> State:
-        """The state after an interrupted step: landmarks that only table or back end has are erased, bodies forgotten."""
+        """The state after an interrupted step: landmarks that only table or back end has go, bodies are forgotten."""
         self.objects.restart()
         if state.prior_map is not None or not np.isfinite(self.advanced):  # that back end has not begun
             return state

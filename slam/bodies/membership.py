@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.bodies.belief import MAX_REJECTIONS
-from slam.bodies.bodies import Body, continued, in_body_axes, with_extent
+from slam.bodies.bodies import Body, continued, in_body_axes, spread_of_place, with_extent
 from slam.bodies.config import ObjectsConfig
 from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
 from slam.bodies.frame import Frame
@@ -227,13 +227,18 @@ def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
 
 
 def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
-    """The body in whose extent most of these tracks lie, if it moves as `own`, a body made of them alone; else None."""
+    """The body in or beside which most of these tracks lie and whose motion explains them; None for none.
+
+    In it as far as its pose is known; beside it, as far as `own`, a body of them alone, is long, as one rigid body's.
+    """
     for body in bodies.values():
-        wider = _MERGED * (1.0 + own.across / body.across)
-        near = _distances(body, tracks, rows, wider) < _NEAR
+        near = _distances(body, tracks, rows, _MERGED * (1.0 + own.across / body.across)) < _NEAR
         if not body.measured or 2 * near.sum() <= len(rows) or _explained(body, tracks, rows) >= 2 * EXPLAINED:
             continue
-        if body.seen <= PROBATION or not _moves_otherwise(body, own, tracks, rows):
+        inside = 2 * (_distances(body, tracks, rows, _MERGED) < _NEAR).sum() > len(rows)
+        if body.seen <= PROBATION or (inside and not _moves_otherwise(body, own, tracks, rows)):
+            return body
+        if not inside and distinctness(own, rows, body, _members(tracks, body.id), tracks) < 1.0:
             return body
     return None
 
@@ -247,17 +252,11 @@ def _moves_otherwise(body: Body, own: Body, tracks: Tracks, rows: NDArray[np.int
     points, A, known = in_body_axes(body, tracks, rows)
     y = weighted_means(points, A)
     pull = times_vectors(A, points - y[:, None]).sum(axis=0)
-    pose = np.linalg.inv(_spread_of_place(body, y.mean(axis=0)) + _LEAST_SPREAD * np.eye(3))
+    pose = np.linalg.inv(spread_of_place(body, y.mean(axis=0)) + _LEAST_SPREAD * np.eye(3))
     shared = (pull * np.linalg.solve(A.sum(axis=0) + pose, pull[..., None])[..., 0]).sum()
     certain = float(squares(points, A).sum() - shared)
     by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
     return certain - alone > _APART * by_chance and certain > 2 * _APART * alone
-
-
-def _spread_of_place(body: Body, y: Array) -> Array:
-    """Covariance (3, 3), in body axes, of where the body's point y (3,) is, given that of its pose."""
-    J = -points_by_pose(y[None])[0]
-    return np.asarray(J @ body.covariance @ J.T)
 
 
 def _explained(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> float:
@@ -269,8 +268,7 @@ def _explained(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> float:
 def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body | None:
     """The body out of view that a new one is, by position and velocity, perhaps seen from another side; else None.
 
-    The middle of the part that is seen may be off the body's middle by half its size, and no body is faster than
-    `max_speed` [m/s].
+    The middle of what is seen may be off the body's by half its size, and no body is faster than `max_speed` [m/s].
     """
     best, least = None, _RETURNED
     for body in bodies.values():
@@ -279,7 +277,7 @@ def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body 
         gap, size = new.middle - body.middle, 0.5 * (body.across + new.across)
         if np.linalg.norm(gap) > size + max_speed * (new.seen_at - body.seen_at):
             continue
-        R, spread = body.T[:3, :3], _spread_of_place(body, 0.5 * (body.lower + body.upper))
+        R, spread = body.T[:3, :3], spread_of_place(body, 0.5 * (body.lower + body.upper))
         place = R @ spread @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
         change = new.velocity[3:] - body.velocity[3:]
         velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]

@@ -164,8 +164,8 @@ _NOWHERE = Estimate(-np.inf, np.eye(4), np.eye(6), _NONE, np.zeros((0, 3)), np.z
 class Step:
     """A frame in work. Each stage returns a copy that says more.
 
-    What a stage changes in place is the table of tracks, which is this step's own copy but for what is followed, and the
-    back end, the detector and the calibration.
+    What a stage changes in place is the table of tracks, which is this step's own copy but for what is followed, and
+    the back end, the detector and the calibration.
     """
 
     index: int  # of the frame
