@@ -1,4 +1,4 @@
-"""The papers' filter: an extended Kalman filter over camera and landmarks. See `backends.ekf.filter`.
+"""The papers' filter: an extended Kalman filter over camera and landmarks. See `backends.ekf.backend`.
 
 In the papers' order:
 
@@ -8,9 +8,9 @@ In the papers' order:
   is tried where it fails.
 - `covariance`: ``A P Aᵀ + W Q Wᵀ`` (B, section 2), landmarks that join (A, Eq. 10), ``P − K S Kᵀ`` (A, Eq. 11).
 - `state`: camera, landmarks and covariance, and the steps from one such state to the next.
-- `filter`: the back end.
+- `filter`: a back end for any camera; `backend`: the papers'.
 """
 
-from backends.ekf.filter import EkfBackend, EkfConfig
+from backends.ekf.backend import EkfBackend, EkfConfig
 
 __all__ = ["EkfBackend", "EkfConfig"]

@@ -32,10 +32,6 @@ class Motion:
     J: Array = field(default_factory=lambda: np.eye(CAMERA))  # its error is J (12, 12) times what it was before,
     noise: Array = field(default_factory=lambda: np.zeros((CAMERA, CAMERA)))  # plus a Gaussian of this covariance
 
-    def then(self, camera: Any, J: Array, noise: Array | float = 0.0) -> Motion:
-        """Followed by another one."""
-        return Motion(camera, J @ self.J, J @ self.noise @ J.T + noise)
-
 
 @dataclass(frozen=True, eq=False)
 class EulerCamera:
@@ -99,25 +95,28 @@ class EulerCamera:
         return J
 
     def advanced(self, models: EstimatorModels, P: Array, dt: float) -> Motion:
-        """After `dt` [s], with the error's covariance P (12, 12): the printed transition (paper B, section 2).
+        """After `dt` [s], with the error's covariance P (12, 12): ``A P Aᵀ + W Q Wᵀ`` (paper B, section 2).
 
-        It is made in pieces where it would run into the angles' singularity.
+        It is made in pieces where it would run into the angles' singularity. Q is of impulses at its beginning: they
+        change the velocities, which A carries to the pose.
         """
         gap = after_gap(models, P, dt)
         if gap is not None:  # it may be turned anyhow: it stays, independent of the map
-            camera = replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
-            return Motion(camera, np.zeros((CAMERA, CAMERA)), _of_angles(gap, self.x[3:6]))
+            return Motion(self._stopped(), np.zeros((CAMERA, CAMERA)), _of_angles(gap, self.x[3:6]))
         turn = np.linalg.norm(body_rate_matrix(self.x[3:6]) @ self.x[9:]) * dt  # φy turns by no more
-        motion, pieces = Motion(self), math.ceil(np.clip(turn / LIMIT, 1, _PIECES))
-        for _ in range(pieces):
-            phi_y, rate = motion.camera.x[[4, 10]]
+        pieces = math.ceil(np.clip(turn / LIMIT, 1, _PIECES))
+        camera, J, W = self, np.eye(CAMERA), np.eye(CAMERA)[:, POSE:]
+        for piece in range(pieces):
+            phi_y, rate = camera.x[[4, 10]]
             if max(abs(phi_y), abs(phi_y + rate * dt / pieces)) > LIMIT:
-                motion = motion.then(*motion.camera._reanchored())
-            motion = motion.then(*motion.camera._transition(models, dt / pieces))
-        return motion
+                camera, G = camera._reanchored()
+                J, W = G @ J, G @ W if piece else W
+            camera, A = camera._transition(dt / pieces)
+            J, W = A @ J, A @ W
+        return Motion(camera, J, motion_noise(models, dt, W))
 
-    def _transition(self, models: EstimatorModels, dt: float) -> tuple[EulerCamera, Array, Array]:
-        """``x ← f(x)`` and ``P ← A P Aᵀ + W Q Wᵀ`` with the printed A and W.
+    def _transition(self, dt: float) -> tuple[EulerCamera, Array]:
+        """``x ← f(x)`` with the printed A.
 
         If the covariance is transported, the attitude's error is carried as a turn about the world's axes, not as one
         of the angles φ. The printed transition has constant rates of the angles, which is not the same in another
@@ -130,12 +129,14 @@ class EulerCamera:
             J, R = np.eye(CAMERA), self.R_world_angles
             J[3:6, 3:6] = np.linalg.solve(turning(R, x), turning(R, self.x))
             A = A @ J
-        return replace(self, x=x), A, motion_noise(models, dt)
+        return replace(self, x=x), A
 
     def at_rest(self) -> Motion:
         """After a step of a camera that stands: the pose stays, and the velocity is zero for certain."""
-        camera = replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
-        return Motion(camera, np.diag(np.repeat([1.0, 0.0], POSE)))
+        return Motion(self._stopped(), np.diag(np.repeat([1.0, 0.0], POSE)))
+
+    def _stopped(self) -> EulerCamera:
+        return replace(self, x=np.concatenate([self.x[:POSE], np.zeros(POSE)]))
 
     def _reanchored(self) -> tuple[EulerCamera, Array]:
         """With a new angles' world, far from its singularity."""
@@ -164,12 +165,10 @@ def prior(models: EstimatorModels) -> Array:
     return np.diag(np.repeat(np.array(sigmas) ** 2, 3))
 
 
-def motion_noise(models: EstimatorModels, dt: float) -> Array:
-    """``W Q Wᵀ`` (12, 12) of a step of `dt` [s]."""
-    noise, each = np.zeros((2, POSE, 2, POSE)), np.arange(POSE)
-    variances = np.repeat(models.motion.velocity_variance(dt), 3)
-    noise[:, each, :, each] = variances[:, None, None] * np.array([[dt * dt, dt], [dt, 1.0]])
-    return noise.reshape(CAMERA, CAMERA)
+def motion_noise(models: EstimatorModels, dt: float, W: Array | None = None) -> Array:
+    """``W Q Wᵀ`` (12, 12) of the impulses of a step of `dt` [s], with the printed W (12, 6) or another."""
+    W = np.concatenate([dt * np.eye(POSE), np.eye(POSE)]) if W is None else W
+    return np.asarray(W * np.repeat(models.motion.velocity_variance(dt), 3) @ W.T)
 
 
 def after_gap(models: EstimatorModels, P: Array, dt: float) -> Array | None:

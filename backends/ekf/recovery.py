@@ -29,7 +29,7 @@ from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, s
 Search = Callable[[], "Array | None"]
 
 
-def agreement(update: Update, noises: Iterable[Array], search: Search, models: EstimatorModels) -> Posterior | None:
+def agreement(update: Update, noises: Iterable[Array], search: Search) -> Posterior | None:
     """Solve with the prior that most observations agree with; None where there is none.
 
     Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
@@ -49,7 +49,7 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
     T = search() if finite and len(update.z) >= least else None
     if T is not None:
-        there = replace(update, guess=T).wider(restart_noise(update.camera.pose, T, models))
+        there = replace(update, guess=T).wider(restart_noise(update.camera.pose, T, update.measure.models))
         try:
             restarted = solve(gate(there, at_guess=True))
             if restarted is not None and restarted.used.sum() >= least:
@@ -88,8 +88,8 @@ def _agreed(gated: Gated) -> Posterior | None:
     rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
     if not len(rejected):
         return None
-    share = share_by_chance(rejected, float(gated.limits.max()))
-    return None if bdtrc(used - 1, count, share) > 1 - gated.innovation.at.update.gate_probability else found
+    share, models = share_by_chance(rejected, float(gated.limits.max())), gated.innovation.at.update.measure.models
+    return None if bdtrc(used - 1, count, share) > 1 - models.gate_probability else found
 
 
 def restart_noise(before: Array, after: Array, models: EstimatorModels) -> Array:

@@ -28,7 +28,7 @@ from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
-from slam.window.stereo import Field, RectifiedStereo, no_field
+from slam.window.stereo import RectifiedMeasurement
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
@@ -53,13 +53,15 @@ class Update:
     landmarks: FilterLandmarks  # those that were measured (M,); all are in the state
     rows: IndexArray  # their rows (M,) in the table of all
     z: Array  # measurements (M, 3) [px], NaN where a component is not measured
-    sigma: float  # pixel noise [px]
-    stereo: RectifiedStereo
+    measure: RectifiedMeasurement  # what they measure, their noise, and the gate
     coordinates: Coordinates
     iterations: int  # most linearisations
-    gate_probability: float  # quantile of χ² beyond which a landmark's measurement is rejected
     guess: Array | None = None  # a pose (4, 4) worth trying where the prior is far off
-    field: Field = no_field  # derivatives of measurements by errors of the rig
+
+    @property
+    def sigma(self) -> float:
+        """Pixel noise [px]."""
+        return self.measure.models.pixel_sigma
 
     def wider(self, noise: Array) -> Update:
         """With more noise (12, 12) of the camera."""
@@ -81,20 +83,25 @@ class Update:
         """
         anchors, moved = self.landmarks.anchors, change[CAMERA + self.numbers].reshape(-1, 3)
         c = self.coordinates.moved(self.landmarks.c, moved)
-        z, J = self.stereo.project((self.coordinates.points(anchors, c) - T[:3, 3]) @ T[:3, :3])
+        z, J = self.measure.stereo.project((self.coordinates.points(anchors, c) - T[:3, 3]) @ T[:3, :3])
         return z, J @ (T[:3, :3].T @ self.coordinates.jacobian(anchors, c))
 
     def at(self, camera: Any = None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
-        """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose."""
-        there, J, mean = self.camera, np.eye(CAMERA), np.zeros(CAMERA)
+        """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose.
+
+        Where the covariance is transported, so is an error of the pose: it moves landmarks as it does at the prior.
+        """
+        there, J, mean, marks = self.camera, np.eye(CAMERA), np.zeros(CAMERA), self.landmarks
         size = CAMERA + len(self.covariance.marks) - 3 * self.covariance.left
         change = np.zeros(size) if change is None else change.copy()
+        if not there.transports:
+            marks = marks.moved(self.coordinates, slice(None), change[CAMERA + self.numbers].reshape(-1, 3))
         if camera is not None:
             there = self.camera.at(camera.pose)
             J = self.camera.transport(there)
             mean = np.linalg.solve(J, self.camera.seen_from(there))
             change[:CAMERA] = np.concatenate([np.zeros(POSE), camera.seen_from(there)[POSE:]])
-        lever = self.landmarks.gauge @ (there.world() @ J[:POSE, :POSE])
+        lever = marks.gauge @ (there.world() @ J[:POSE, :POSE])
         return Linearisation(self, there, J, mean, change, *self.seen(there.pose, change), lever, from_prior)
 
 
@@ -156,12 +163,8 @@ class Innovation:
         with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h : h + b]], axis=1)
         with_marks = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
         by_rig = _times(self.own, self.by_pose, P.by_rig[:POSE], P.by_rig[h + numbers])
-        by_rig -= np.where(self.rows[:, :, None], update.field(update.z), 0.0).reshape(by_rig.shape)
+        by_rig -= np.where(self.rows[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
         return _times(self.own, self.by_pose, with_pose, with_marks), by_rig
-
-    def transposed_times(self, y: Array) -> Array:
-        """``Hᵀ y`` (6 + 3M,) of [pose, measured landmarks], for y (3M,); it is zero elsewhere."""
-        return np.concatenate([y @ self.by_pose, (y.reshape(-1, 1, 3) @ self.own).reshape(-1)])
 
     def whitened(self, used: BoolArray) -> Whitened:
         """That of some landmarks (mask (M,)), whitened; UnsolvableError where S is not positive definite."""
@@ -274,7 +277,7 @@ def gate(update: Update, at_guess: bool = False) -> Gated:
         raise UnsolvableError("the predicted state is not finite")
     visible = np.asarray(np.isfinite(start.z).all(axis=1))
     innovation = start.innovation(measured & visible[:, None])
-    m, limits = len(visible), chi_square_limits(measured.sum(axis=1), update.gate_probability)
+    m, limits = len(visible), chi_square_limits(measured.sum(axis=1), update.measure.models.gate_probability)
     blocks = innovation.S.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)]
     own = squared_distances(innovation.nu.reshape(m, 3), blocks)
     if not np.isfinite(own).all():
@@ -321,7 +324,9 @@ def _iterate(whitened: Whitened) -> Posterior:
             raise UnsolvableError("the corrected state is not finite")
         if update.iterations == 1 or _linear(whitened, change):
             return Posterior(whitened, change)
-        following, step = _descend(now, rows, whitened.innovation.transposed_times(y), change)
+        innovation = whitened.innovation
+        towards = np.concatenate([y @ innovation.by_pose, (y.reshape(-1, 1, 3) @ innovation.own).reshape(-1)])  # Hᵀ y
+        following, step = _descend(now, rows, towards, change)
         if iteration == 1 and update.guess is not None:
             following = min(following, _at_guess(update), key=lambda iterate: iterate.cost(rows))
         if following is now:

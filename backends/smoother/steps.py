@@ -110,7 +110,8 @@ class Steps(RectifiedMeasurement):
         def search() -> Array | None:
             return landmarks_pose(self, one.points, z, one.predicted, s.number)
 
-        lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(s.spread[-1])
+        R = s.poses[-1][:3, :3]
+        lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[-1][:3, :3] @ R.T - s.turned)
         return agreement(one, one.predicted if guess is None else guess, search, s.contradicted, lost)
 
     def _corrected(
@@ -255,7 +256,7 @@ def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> Smoot
     return replace(
         s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
         spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
-        since=0, inside=True, tie=None,
+        turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T, since=0, inside=True, tie=None,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from backends.ekf.filter import EkfConfig
+from backends.ekf import EkfConfig
 from backends.smoother.config import SmootherConfig
 from frontends.surf.config import SurfConfig
 from slam.bodies.config import ObjectsConfig
