@@ -2,7 +2,7 @@
 
 In the papers' order:
 
-- `motion`: the camera's state and its transition (paper B, section 2), in the angles of `angles`.
+- `motion`: the camera's state and its transition (paper B, section 2), in angles kept from their singularity.
 - `landmarks`: a landmark's three numbers, and the table of all.
 - `solve`: measurement, innovation, gate, and the update of the mean (A, Eqs. 5-11; B, Eqs. 1-5); `recovery`: what else
   is tried where it fails.

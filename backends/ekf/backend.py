@@ -56,13 +56,8 @@ class EkfBackend(LandmarkFilter):
     2), then three coordinates per landmark. The camera moves at constant velocity disturbed by impulses, with
     the printed A and W. A landmark enters with its full cross-covariance (paper A, Eqs. 8 and 10).
 
-    By default this is not the papers' plain filter. It differs in what it measures (the right pixel as well as the
-    left), in the landmarks' coordinates (inverse depth, `backends.ekf.landmarks`), in updates that are linearised again
-    where the first time is not enough, in landmarks tested against all others and in recovery (`backends.ekf.solve`,
-    `backends.ekf.recovery`), and in a covariance that is transported to each corrected state, so that nothing seems to
-    be learnt of where the world is (`backends.ekf.state`). The option ``papers=True`` undoes four of these: the left
-    pixel alone, one linearisation, landmarks in the world, no transport; tests and recovery stay. The angles refer to a
-    world of their own in both (`backends.ekf.angles`).
+    By default this is not the papers' plain filter: `EkfConfig` says what differs, and what ``papers=True`` undoes.
+    The angles refer to a world of their own in both (`backends.ekf.motion`).
 
     Args:
         rig: the cameras, rectified.

@@ -117,16 +117,16 @@ class LandmarkFilter:
 
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: what was believed at each stamp, never revised."""
-        s = self.state
-        path = [*self._past[: s.frame], (s.stamp, s.pose)] if s.frame >= 0 else []
-        return Trajectory(np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4))
+        return Trajectory(*self._path())
 
     def recent(self, n: int) -> RecentPoses:
         """The last n poses, at most five, as believed in their time; see `slam.data.RecentPoses`.
 
         Raises MeasurementError before the first `predict`, or where n is less than one.
         """
-        return self._started("recent").recent_poses(require_recent(self.name, n))
+        s, n = self._started("recent"), min(require_recent(self.name, n), self.state.covariance.poses)
+        stamps, poses = self._path()
+        return RecentPoses(stamps[-n:], poses[-n:], s.covariance.joint_poses(s.camera.by_error(), n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -194,6 +194,12 @@ class LandmarkFilter:
         self.state = s
 
     # --- the filter's parts ---
+
+    def _path(self) -> tuple[Array, Array]:
+        """Stamps (F,) [s] and poses (F, 4, 4) so far."""
+        s = self.state
+        path = [*self._past[: s.frame], (s.stamp, s.pose)] if s.frame >= 0 else []
+        return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
     def _predicted(self, stamp: float, moved: Callable[[Any, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""

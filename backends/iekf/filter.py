@@ -86,19 +86,20 @@ class InvariantCamera:
         """See `EulerCamera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
         gap = after_gap(models, P, dt)
         if gap is not None:  # it may be turned anyhow: it stays, independent of the map
-            still = replace(self, v=np.zeros(3), rate=np.zeros(3))
-            return Motion(still, np.zeros((CAMERA, CAMERA)), gap)
+            return self._stopped(), np.zeros((CAMERA, CAMERA)), gap
         R, turn = self.pose[:3, :3], self.rate * dt
         after = se3.nearest_rotation(R @ se3.so3_exp(turn))  # products of many rotations lose digits
         T = se3.pose(after, self.pose[:3, 3] + dt * self.v)
         A = np.eye(CAMERA)
         A[:3, 6:9], A[3:6, 9:] = dt * np.eye(3), dt * R @ se3.so3_left_jacobian(turn)
-        return Motion(replace(self, pose=T), A, motion_noise(models, dt, A[:, POSE:]))
+        return replace(self, pose=T), A, motion_noise(models, dt, A[:, POSE:])
 
     def at_rest(self) -> Motion:
         """See `EulerCamera`."""
-        still = replace(self, v=np.zeros(3), rate=np.zeros(3))
-        return Motion(still, np.diag(np.repeat([1.0, 0.0], POSE)))
+        return self._stopped(), np.diag(np.repeat([1.0, 0.0], POSE)), np.zeros((CAMERA, CAMERA))
+
+    def _stopped(self) -> InvariantCamera:
+        return replace(self, v=np.zeros(3), rate=np.zeros(3))
 
 
 @dataclass(frozen=True)
