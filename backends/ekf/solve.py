@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
@@ -28,6 +28,7 @@ from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
+from slam.window.solver import upper_inverse
 from slam.window.stereo import RectifiedMeasurement
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
@@ -37,7 +38,6 @@ _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
-_SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
 
 
 class UnsolvableError(ArithmeticError):
@@ -156,16 +156,6 @@ class Innovation:
     nu: Array  # innovation of the prior's mean (3M,)
     S: Array  # its covariance (3M, 3M)
 
-    def with_rest(self) -> tuple[Array, Array]:
-        """``H P`` with the last poses and what has left the state; derivatives (3M, m) of ν by errors of the rig."""
-        update, P = self.at.update, self.at.update.covariance
-        numbers, h, b = 3 * P.left + update.numbers, len(P.head), 3 * P.left
-        with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h : h + b]], axis=1)
-        with_marks = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
-        by_rig = _times(self.own, self.by_pose, P.by_rig[:POSE], P.by_rig[h + numbers])
-        by_rig -= np.where(self.rows[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
-        return _times(self.own, self.by_pose, with_pose, with_marks), by_rig
-
     def whitened(self, used: BoolArray) -> Whitened:
         """That of some landmarks (mask (M,)), whitened; UnsolvableError where S is not positive definite."""
         nu, S, out = self.nu, self.S, np.flatnonzero(np.repeat(~used, 3))
@@ -175,7 +165,7 @@ class Innovation:
         upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
         if info != 0:
             raise UnsolvableError("the innovation covariance is not positive definite")
-        inverse = _inverse(upper).T
+        inverse = upper_inverse(upper).T
         inverse[out, out] = 0.0
         return Whitened(self, used, nu, inverse)
 
@@ -213,11 +203,15 @@ class Whitened:
 
     def lost(self) -> tuple[tuple[Array, Array, Array], Array]:
         """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
-        (with_camera, with_marks), (rest, by_rig) = self.innovation.HP, self.innovation.with_rest()
-        narrow = np.concatenate([with_camera, rest], axis=1)
-        V, V_marks = (dtrmm(1.0, self.inverse.T, HX.T, side=1) for HX in (narrow, with_marks))
-        h = len(self.innovation.at.update.covariance.head)
-        return (V[:h], V[h:], V_marks), self.inverse @ by_rig
+        nu, (with_camera, with_marks), update = self.innovation, self.innovation.HP, self.innovation.at.update
+        P, H = update.covariance, (nu.own, nu.by_pose)
+        h, b, numbers = len(P.head), 3 * P.left, 3 * P.left + update.numbers
+        poses_and_left = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
+        rest = _times(*H, P.head[:POSE, CAMERA : h + b], poses_and_left)
+        V = dtrmm(1.0, self.inverse.T, np.concatenate([with_camera, rest], axis=1).T, side=1)
+        by_rig = _times(*H, P.by_rig[:POSE], P.by_rig[h + numbers])
+        by_rig -= np.where(nu.rows[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
+        return (V[:h], V[h:], dtrmm(1.0, self.inverse.T, with_marks.T, side=1)), self.inverse @ by_rig
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -239,16 +233,6 @@ class Posterior:
 
     whitened: Whitened  # the last innovation, from which the covariance follows
     change: Array  # of the state (n,) from the prior; the pose's part counts from the last linearisation
-
-    @property
-    def update(self) -> Update:
-        """What it is of."""
-        return self.whitened.innovation.at.update
-
-    @property
-    def camera(self) -> Any:
-        """The corrected camera."""
-        return self.whitened.innovation.at.camera_after(self.change)
 
     @property
     def used(self) -> BoolArray:
@@ -299,7 +283,7 @@ def solve(gated: Gated) -> Posterior | None:
         excess = found.whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            left = found.update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
+            left = gated.innovation.at.update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
             return found
@@ -337,18 +321,6 @@ def _iterate(whitened: Whitened) -> Posterior:
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
-
-
-def _inverse(U: Array) -> Array:
-    """``U⁻¹`` of an upper triangular U (N, N), by halves: LAPACK's own takes twice as long for many rows."""
-    half = len(U) // 2
-    if half < _SMALL:
-        return np.asarray(dtrtri(U)[0])
-    first, last = _inverse(U[:half, :half]), _inverse(U[half:, half:])
-    out = np.zeros(U.shape, order="F")
-    out[:half, :half], out[half:, half:] = first, last
-    out[:half, half:] = dtrmm(-1.0, first, dtrmm(1.0, last, U[:half, half:], side=1))
-    return out
 
 
 def _linear(whitened: Whitened, change: Array) -> bool:

@@ -138,8 +138,8 @@ class FilterState:
         and Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none. Raises
         UnsolvableError where the new state is not finite.
         """
-        update, before, P = found.update, self.landmarks, self.covariance
-        camera, state = found.camera, slice(P.left, P.correlated)
+        at, before, P = found.whitened.innovation.at, self.landmarks, self.covariance
+        update, camera, state = at.update, at.camera_after(found.change), slice(P.left, P.correlated)
         marks = before.moved(update.coordinates, state, found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
