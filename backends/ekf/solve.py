@@ -28,7 +28,7 @@ from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
-from slam.window.solver import upper_inverse
+from slam.window.solver import _upper_inverse
 from slam.window.stereo import RectifiedMeasurement
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
@@ -165,7 +165,7 @@ class Innovation:
         upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
         if info != 0:
             raise UnsolvableError("the innovation covariance is not positive definite")
-        inverse = upper_inverse(upper).T
+        inverse = _upper_inverse(upper).T
         inverse[out, out] = 0.0
         return Whitened(self, used, nu, inverse)
 

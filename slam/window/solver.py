@@ -66,7 +66,7 @@ class Solution:
     @cached_property
     def inverse_factor(self) -> Array:
         """``L⁻¹`` (n, n), lower triangular."""
-        return np.asarray(upper_inverse(self.factor.T).T)
+        return np.asarray(_upper_inverse(self.factor.T).T)
 
     @cached_property
     def pose_covariance(self) -> Array:
@@ -167,14 +167,14 @@ def row_distances(w: Window) -> Array:
     return np.asarray(kernels.row_distances(w.stereo.intrinsics, w.poses, w.points, w.rows.arrays))
 
 
-def upper_inverse(U: Array) -> Array:
+def _upper_inverse(U: Array) -> Array:
     """Inverse of an upper triangular matrix (n, n), by halves: products take a fraction of the time of LAPACK's own."""
     n = len(U)
     if n <= _WHOLE:
         return np.asarray(dtrtri(U, lower=0)[0] if n else U)
     half = n // 2
     out = np.zeros((n, n), order="F")
-    first, last = upper_inverse(U[:half, :half]), upper_inverse(U[half:, half:])
+    first, last = _upper_inverse(U[:half, :half]), _upper_inverse(U[half:, half:])
     out[:half, :half], out[half:, half:] = first, last
     out[:half, half:] = -first @ (U[:half, half:] @ last)
     return out
