@@ -125,8 +125,7 @@ class LandmarkFilter:
         Raises MeasurementError before the first `predict`, or where n is less than one.
         """
         s, n = self._started("recent"), min(require_recent(self.name, n), self.state.covariance.poses)
-        stamps, poses = self._path()
-        return RecentPoses(stamps[-n:], poses[-n:], s.covariance.joint_poses(s.camera.by_error(), n))
+        return RecentPoses(*self._path(n), s.covariance.joint_poses(s.camera.by_error(), n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -195,10 +194,11 @@ class LandmarkFilter:
 
     # --- the filter's parts ---
 
-    def _path(self) -> tuple[Array, Array]:
-        """Stamps (F,) [s] and poses (F, 4, 4) so far."""
+    def _path(self, last: int = 0) -> tuple[Array, Array]:
+        """Stamps (F,) [s] and poses (F, 4, 4) so far, or the last ones."""
         s = self.state
-        path = [*self._past[: s.frame], (s.stamp, s.pose)] if s.frame >= 0 else []
+        before = self._past[max(s.frame + 1 - last, 0) if last else 0 : s.frame]
+        path = [*before, (s.stamp, s.pose)] if s.frame >= 0 else []
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
     def _predicted(self, stamp: float, moved: Callable[[Any, float], Motion]) -> Prediction:

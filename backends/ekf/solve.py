@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
@@ -28,7 +28,6 @@ from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
-from slam.window.solver import _upper_inverse
 from slam.window.stereo import RectifiedMeasurement
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
@@ -38,6 +37,7 @@ _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
+_SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
 
 
 class UnsolvableError(ArithmeticError):
@@ -165,7 +165,7 @@ class Innovation:
         upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
         if info != 0:
             raise UnsolvableError("the innovation covariance is not positive definite")
-        inverse = _upper_inverse(upper).T
+        inverse = _inverse(upper).T
         inverse[out, out] = 0.0
         return Whitened(self, used, nu, inverse)
 
@@ -321,6 +321,18 @@ def _iterate(whitened: Whitened) -> Posterior:
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
+
+
+def _inverse(U: Array) -> Array:
+    """``U⁻¹`` of an upper triangular U (N, N), by halves: LAPACK's own takes twice as long for many rows."""
+    half = len(U) // 2
+    if half < _SMALL:
+        return np.asarray(dtrtri(U)[0])
+    first, last = _inverse(U[:half, :half]), _inverse(U[half:, half:])
+    out = np.zeros(U.shape, order="F")
+    out[:half, :half], out[half:, half:] = first, last
+    out[:half, half:] = dtrmm(-1.0, first, dtrmm(1.0, last, U[:half, half:], side=1))
+    return out
 
 
 def _linear(whitened: Whitened, change: Array) -> bool:
