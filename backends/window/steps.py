@@ -18,7 +18,7 @@ from slam.window.gating import MIN_CONSENSUS
 from slam.window.problem import Motion, Places, RelativePrior, Rows
 from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.solver import Solution, solve
-from slam.window.stereo import RectifiedMeasurement, relative_covariance
+from slam.window.stereo import RectifiedMeasurement
 
 #: numerics: share of its noise that a row's residual has at least, to be tested. Where a row alone tells something of
 #: the pose, its residual and the variance of that are nearly 0, and what the solution leaves of them would decide.
@@ -179,11 +179,10 @@ class Steps(RectifiedMeasurement):
 
 
 def _lost(s: WindowState) -> bool:
-    """Whether it is unknown how the newest pose that measured landmarks is turned against the window's first one."""
-    if not s.solved or np.count_nonzero(s.rows.pose == s.solved) < MIN_CONSENSUS:
-        return False
-    both = np.concatenate([np.arange(6), 6 * s.solved + np.arange(6)])
-    return unknown_turn(relative_covariance(s.covariance[np.ix_(both, both)], s.poses[0], s.poses[s.solved]))
+    """Whether the orientation in the world of the newest pose that measured landmarks is unknown."""
+    i = 6 * s.solved
+    enough = np.count_nonzero(s.rows.pose == s.solved) >= MIN_CONSENSUS
+    return bool(enough and unknown_turn(s.covariance[i : i + 6, i : i + 6]))
 
 
 def _seen_from_newest(s: WindowState, rows: IndexArray, by_motion: Array = _STILL) -> tuple[Array, Array]:
