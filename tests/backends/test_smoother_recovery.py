@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import count
 
 import gtsam
@@ -108,57 +107,6 @@ def test_impossible_measurements_do_not_end_a_run():
         assert np.isfinite(backend.estimate().T_world_left).all()
     off = se3.log(se3.inverse(data.poses[-1]) @ backend.estimate().T_world_left)
     assert np.abs(off[3:]).max() < 0.2 and np.abs(off[:3]).max() < 0.05
-
-
-def interrupt(call, number: int) -> bool:
-    """Whether a call was interrupted at the `number`-th function called within the smoother's modules."""
-    left = number
-
-    def profile(frame, event, _):
-        nonlocal left
-        if event == "call" and "backends/smoother/" in frame.f_code.co_filename.replace("\\", "/"):
-            left -= 1
-            if not left:
-                raise KeyboardInterrupt
-
-    before = sys.getprofile()
-    sys.setprofile(profile)
-    try:
-        call()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.setprofile(before)
-    return False
-
-
-@pytest.mark.parametrize("lag", [None, 12])
-def test_a_call_that_is_interrupted_did_not_happen(lag):
-    """A KeyboardInterrupt at any function call within the smoother: the same call again, and the run goes on."""
-    data, known = drive(26), set()
-    backend = SmootherBackend(RIG, MODELS, lag=lag)
-    rng, interrupted = np.random.default_rng(0), 0
-    for k, (stamp, _, seen) in enumerate(data):
-        old = np.isin(seen.ids, list(known))
-        calls = (
-            lambda stamp=stamp: backend.predict(stamp),
-            lambda seen=seen, old=old: backend.update(seen.select(old)),
-            lambda seen=seen, old=old: backend.add(seen.select(~old)),
-            lambda: backend.estimate(),
-            lambda: backend.revise(lambda z: z),
-        )
-        for call in calls:
-            before = backend.state
-            if k > 2 and interrupt(call, int(rng.integers(1, 60))):
-                interrupted += 1
-                assert backend.state is before
-                call()
-            elif k <= 2:
-                call()
-        known.update(seen.ids.tolist())
-        assert len(backend.trajectory()) == k + 1
-    assert interrupted > 10
-    near_the_truth(backend, data)
 
 
 # --- a camera that has lost its way is seated again among the landmarks, without a guess ---
