@@ -83,7 +83,7 @@ def true_path(folder: Path, estimate: Trajectory) -> np.ndarray | None:
     truth = open_sequence(folder).ground_truth
     if truth is None:
         return None
-    own, true = associate(estimate, truth, 0.02, interpolated=True)
+    own, true = associate(estimate, truth)
     return align(true, own).apply(true.positions)
 
 
