@@ -200,7 +200,7 @@ def rows(size: Size, times: dict[str, Times]) -> Iterable[list[str]]:
         ate = "–"
         if name != SIFT and seen.sum() > 2 and sequence.ground_truth is not None:
             path = Trajectory(stamps[seen], np.array([p for p in t.poses if p is not None]))
-            own, true = associate(path, sequence.ground_truth, 0.02, interpolated=True)
+            own, true = associate(path, sequence.ground_truth)
             ate = f"{1e3 * absolute_errors(own, true).rmse:.1f}"
         figures = [f"{x:.2f}" for r in ratios for x in ((np.nan, np.nan) if r is None else r)]
         lost = "–" if name == SIFT else str(int((~seen).sum()))

@@ -153,9 +153,8 @@ def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
     """How far the box's pose is from the truth over the run, by back end, after one change of body frame each."""
     with picture(path, 7, 4.5, 2, 1, sharex=True) as (turned, moved):
         for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange", "tab:green")):
-            found = score.poses_of(1)
-            if found is not None:
-                frames, own, true = found
+            frames, own, true = score.poses_of(1)
+            if len(frames):
                 errors = absolute_pose_errors(own, true)
                 turned.plot(score.stamps[frames], errors.rotation, ".", ms=3, color=colour, label=backend)
                 moved.plot(score.stamps[frames], 1e3 * errors.translation, ".", ms=3, color=colour)

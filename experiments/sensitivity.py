@@ -113,7 +113,7 @@ def run(index: int, backend: str, noise_seed: int | None = None) -> Errors:
         if score is not None and data.labels is not None:
             score.add(k, results[-1], data.labels[k])
     path = path_of(results)
-    own, true = associate(path, data.sequence.ground_truth, interpolated=True)
+    own, true = associate(path, data.sequence.ground_truth)
     camera = absolute_errors(own, true).rmse
     bodies = [] if score is None else list(score.summary()["bodies"].values())
     moved = [b["ME"]["translation RMSE [m]"] for b in bodies if b.get("ME")]

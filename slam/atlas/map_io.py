@@ -314,15 +314,8 @@ def map_arrays(saved: SavedMap) -> dict[str, np.ndarray]:
     k, loops = saved.keyframes, saved.loops
     m = max((f.jacobian.shape[1] for f in k), default=0)
     k = tuple(f if f.jacobian.shape[1] == m else replace(f, jacobian=np.zeros((6, m))) for f in k)
-    sizes = {
-        "k": len(k),
-        "m": m,
-        "l": len(loops),
-        "n": len(saved),
-        "d": saved.dimensions,
-        "f": sum(map(len, k)),
-        "r": len(saved.rig),
-    }
+    numbers = len(k), m, len(loops), len(saved), saved.dimensions, sum(map(len, k)), len(saved.rig)
+    sizes = dict(zip("kmlndfr", numbers))
     whole: dict[str, Any] = {"keyframe_features": [len(f) for f in k], "loop_pairs": [x.pair for x in loops]}
     arrays: dict[str, np.ndarray] = {}
     for name, kind in _ARRAYS.items():

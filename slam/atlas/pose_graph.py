@@ -156,22 +156,18 @@ class PoseGraph:
         singular to working precision.
         """
         ends = np.unique([0, len(chain.poses) - 1, *also, *(k for x in loops for k in x.pair)]).astype(np.intp)
-        common = np.zeros(chain.common.shape[2]) if common is None else common
-        return cls._solved(chain, tuple(loops), ends, [start[ends]], common)
-
-    @classmethod
-    def _solved(
-        cls, chain: Chain, loops: tuple[Loop, ...], ends: NDArray[np.intp], starts: Sequence[Array], common: Array
-    ) -> PoseGraph:
-        """The graph, solved from the best of some poses (M, 4, 4) of its variables."""
         propagated = chain.propagated(ends)
         motions = _Motions.of(chain, loops, ends, propagated)
-        start = min(starts, key=lambda poses: motions.cost(poses, common))
-        return cls(chain, loops, ends, propagated, motions, *motions.optimised(start, common))
+        common = np.zeros(chain.common.shape[2]) if common is None else common
+        return cls(chain, tuple(loops), ends, propagated, motions, *motions.optimised(start[ends], common))
 
     def with_loop(self, loop: Loop) -> PoseGraph:
         """The solved graph with one more loop, between keyframes that are variables."""
-        return self._solved(self.chain, (*self.loops, loop), self.ends, [self.poses, self._bent(loop)], self.common)
+        loops = (*self.loops, loop)
+        motions = _Motions.of(self.chain, loops, self.ends, self.propagated)
+        start = min((self.poses, self._bent(loop)), key=lambda poses: motions.cost(poses, self.common))
+        solution = motions.optimised(start, self.common)
+        return PoseGraph(self.chain, loops, self.ends, self.propagated, motions, *solution)
 
     def _bent(self, loop: Loop) -> Array:
         """Poses (M, 4, 4) of the variables that satisfy a loop, its correction distributed along the path.
@@ -283,25 +279,18 @@ class _Normal:
 
         Raises LinAlgError where they are singular, or not finite.
         """
-        from scipy.sparse import csr_array
+        from scipy.sparse import bsr_array
         from scipy.sparse.linalg import splu
 
-        rows, columns, values = [], [], []
-        for i, X in ((a, A), (b, B)):
-            free = np.flatnonzero(i > 0)
-            rows.append(np.repeat(6 * free[:, None] + np.arange(6), 6, axis=1).ravel())
-            columns.append(np.tile(6 * (i[free, None] - 1) + np.arange(6), 6).ravel())
-            values.append(X[free].ravel())
-        entries = np.concatenate(values)
-        if not np.isfinite(entries).all():
+        if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise np.linalg.LinAlgError("pose graph: a number is not finite")
-        shape = (6 * len(a), 6 * (count - 1))
-        J, C = csr_array((entries, (np.concatenate(rows), np.concatenate(columns))), shape), C.reshape(6 * len(a), -1)
+        blocks = np.stack([A, B], axis=1).reshape(-1, 6, 6), np.stack([a, b], axis=1).ravel(), 2 * np.arange(len(a) + 1)
+        J, C = bsr_array(blocks, (6 * len(a), 6 * count)).tocsr()[:, 6:], C.reshape(6 * len(a), -1)
         try:
             solver = splu((J.T @ J).tocsc(), permc_spec="MMD_AT_PLUS_A", options=_SYMMETRIC)
         except RuntimeError as error:  # SuperLU's word for it
             raise np.linalg.LinAlgError(f"pose graph: {error}") from error
-        through = solver.solve(J.T @ C) if C.shape[1] else np.zeros((shape[1], 0))
+        through = solver.solve(J.T @ C) if C.shape[1] else np.zeros((J.shape[1], 0))
         rest = C - J @ through  # Schur complement as a square, not as a difference of large squares
         # Part of a covariance, and used in every step; m is small.
         return cls(solver, J, C, through, np.linalg.inv(np.eye(C.shape[1]) + rest.T @ rest))
@@ -315,11 +304,9 @@ class _Normal:
 
     def covariance(self, poses: Sequence[int]) -> Array:
         """Joint covariance (6 n + m, 6 n + m) of n poses, given by their rows, and of the common errors."""
-        size, m, n = len(self.through), len(self.inner), 6 * len(poses)
-        picked = np.zeros((size, n))
-        for i, row in enumerate(poses):
-            if row > 0:  # the first one is fixed
-                picked[6 * (row - 1) + np.arange(6), 6 * i + np.arange(6)] = 1
+        m, n = len(self.inner), 6 * len(poses)
+        rows = (6 * np.array(poses)[:, None] + np.arange(6)).ravel()
+        picked = (6 + np.arange(len(self.through))[:, None] == rows).astype(float)  # the first pose is fixed
         by_common = -picked.T @ self.through
         P = np.zeros((n + m, n + m))
         P[:n, :n] = picked.T @ self.solver.solve(picked) + by_common @ self.inner @ by_common.T

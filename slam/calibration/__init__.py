@@ -3,21 +3,13 @@
 docs/selfcalibration.md derives the estimator. May import `slam.geometry` and the data.
 """
 
-from slam.calibration.config import SelfCalibrationConfig
-from slam.calibration.estimator import RemainingRigError, SelfCalibration
-from slam.calibration.model import Revision, RigCorrection, RigModel
-from slam.calibration.posterior import RigPosterior
-from slam.calibration.saved import SavedCalibration, load_calibration, save_calibration
-
-__all__ = [
-    "RemainingRigError",
-    "Revision",
-    "RigCorrection",
-    "RigModel",
-    "RigPosterior",
-    "SavedCalibration",
-    "SelfCalibration",
-    "SelfCalibrationConfig",
-    "load_calibration",
-    "save_calibration",
-]
+from slam.calibration.config import SelfCalibrationConfig as SelfCalibrationConfig
+from slam.calibration.estimator import RemainingRigError as RemainingRigError
+from slam.calibration.estimator import SelfCalibration as SelfCalibration
+from slam.calibration.model import Revision as Revision
+from slam.calibration.model import RigCorrection as RigCorrection
+from slam.calibration.model import RigModel as RigModel
+from slam.calibration.posterior import RigPosterior as RigPosterior
+from slam.calibration.saved import SavedCalibration as SavedCalibration
+from slam.calibration.saved import load_calibration as load_calibration
+from slam.calibration.saved import save_calibration as save_calibration

@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_positive
-
-_RANGES = {"systematic": (1e-4, 1e4), "minimum_parallax": (1e-4, 1e4)}  # [px]
 
 
 @dataclass(frozen=True)
@@ -18,15 +15,15 @@ class SelfCalibrationConfig:
     Attributes:
         enabled: False leaves all measurements unchanged.
         systematic: error of rows and disparities that all frames of a recording may share, for each parameter [px].
-        minimum_common: least number of features matched in both views.
-        minimum_parallax: least median displacement of the features by translation between two views [px].
     """
 
     enabled: bool = True
     systematic: float = 0.05
-    minimum_common: int = 30
-    minimum_parallax: float = 4.0
 
+    #: Least number of features matched in both views.
+    minimum_common: ClassVar[int] = 30
+    #: Least median displacement of the features by translation between two views [px].
+    minimum_parallax: ClassVar[float] = 4.0
     #: Noise of a left pixel [px] at first; it is then estimated from pairs of views.
     pixel_sigma: ClassVar[float] = 0.4
     #: The same of a disparity [px].
@@ -39,6 +36,4 @@ class SelfCalibrationConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        require_positive(self, _RANGES, "self_calibration")
-        if self.minimum_common < 10:
-            raise ConfigurationError("self_calibration: minimum_common >= 10 is required (a pose and the rig)")
+        require_positive(self, {"systematic": (1e-4, 1e4)}, "self_calibration")  # [px]

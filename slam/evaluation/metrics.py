@@ -10,14 +10,13 @@ Definitions, with P the estimated and Q the true poses ``T_world_left`` at commo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from slam.chi_square import chi_square_limit
 from slam.errors import TrajectoryError
 from slam.geometry.se3 import Array, inverse, log, pose, rotation_angle, so3_exp, so3_log
-from slam.geometry.stamps import pair
 from slam.geometry.trajectory import Trajectory, align
 
 #: Lengths of KITTI's segments [m].
@@ -49,65 +48,39 @@ class PathErrors:
         return float(np.sqrt(np.mean(self.rotation**2)))
 
 
-def associate(
-    estimate: Trajectory, truth: Trajectory, tolerance: float = 0.01, interpolated: bool = False
-) -> tuple[Trajectory, Trajectory]:
+def associate(estimate: Trajectory, truth: Trajectory, tolerance: float = 0.02) -> tuple[Trajectory, Trajectory]:
     """Both paths at common stamps, row by row: the estimate's rows that have truth, and the truth for them.
+
+    The truth is taken between two true poses: positions linearly, orientations at constant angular velocity.
 
     Args:
         estimate: the estimated path.
         truth: the true path.
-        tolerance: a true pose may lie so far away in time [s]. Each serves one estimated pose only.
-        interpolated: take the truth between two true poses, see `interpolate`; the nearer of the two must lie within
-            `tolerance`.
+        tolerance: the nearer of the two true poses may lie so far away in time [s].
 
     Raises:
-        TrajectoryError: no stamp has a partner.
+        TrajectoryError: no estimated pose has truth.
     """
-    if interpolated:
-        rows = _covered(truth.stamps, estimate.stamps, tolerance)
-        stamps = estimate.stamps[rows]
-        true = Trajectory(stamps, interpolate(truth, stamps.clip(*truth.stamps[[0, -1]])).poses) if len(rows) else truth
-    else:
-        partner = pair(estimate.stamps, truth.stamps, tolerance)
-        rows = np.flatnonzero(partner >= 0)
-        true = Trajectory(truth.stamps[partner[rows]], truth.poses[partner[rows]])
+    own, stamps = truth.stamps, estimate.stamps
+    rows = np.zeros(0, int)
+    if len(own):
+        rows = np.flatnonzero((stamps >= own[0] - _ROUNDING) & (stamps <= own[-1] + _ROUNDING))
+        after = np.searchsorted(own, stamps[rows]).clip(min(1, len(own) - 1), len(own) - 1)
+        before = (after - 1).clip(0)
+        near = np.minimum(np.abs(own[after] - stamps[rows]), np.abs(own[before] - stamps[rows])) <= tolerance
+        rows, after, before = rows[near], after[near], before[near]
     if not len(rows):
         raise TrajectoryError(
-            f"no estimated pose has a true one within {tolerance:g} s: {_span('estimate', estimate.stamps)}, "
-            f"{_span('truth', truth.stamps)}"
+            f"no estimated pose has a true one within {tolerance:g} s: {_span('estimate', stamps)}, "
+            f"{_span('truth', own)}"
         )
-    return Trajectory(estimate.stamps[rows], estimate.poses[rows]), true
-
-
-def interpolate(trajectory: Trajectory, stamps: Array) -> Trajectory:
-    """The path at other stamps (N,) inside its span: positions linearly, orientations at constant angular velocity.
-
-    Raises:
-        TrajectoryError: a stamp lies outside the path's span.
-    """
-    own = trajectory.stamps
-    if len(stamps) and (not len(own) or stamps.min() < own[0] or stamps.max() > own[-1]):
-        raise TrajectoryError(f"{_span('stamps', stamps)} lie outside of the path: {_span('path', own)}")
-    after = np.searchsorted(own, stamps, side="left").clip(min(1, len(own) - 1), len(own) - 1)
-    before = (after - 1).clip(0)
-    step = own[after] - own[before]
-    share = np.divide(stamps - own[before], step, out=np.zeros(len(stamps)), where=step > 0)[:, None]
-    first, second = trajectory.poses[before], trajectory.poses[after]
+    step, since = own[after] - own[before], stamps[rows].clip(own[0], own[-1]) - own[before]
+    share = np.divide(since, step, out=np.zeros(len(rows)), where=step > 0)[:, None]
+    first, second = truth.poses[before], truth.poses[after]
     turn = so3_log(np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3])
-    R = first[:, :3, :3] @ so3_exp(share * turn)
-    return Trajectory(stamps, pose(R, (1 - share) * first[:, :3, 3] + share * second[:, :3, 3]))
-
-
-def _covered(own: Array, stamps: Array, tolerance: float) -> np.ndarray:
-    """Rows of `stamps` inside the span of `own`, but for rounding, and within `tolerance` of one of its stamps."""
-    if not len(own):
-        return np.zeros(0, int)
-    inside = np.flatnonzero((stamps >= own[0] - _ROUNDING) & (stamps <= own[-1] + _ROUNDING))
-    after = np.searchsorted(own, stamps[inside]).clip(0, max(len(own) - 1, 0))
-    before = (after - 1).clip(0)
-    nearest = np.minimum(np.abs(own[after] - stamps[inside]), np.abs(own[before] - stamps[inside]))
-    return inside[nearest <= tolerance]
+    t = (1 - share) * first[:, :3, 3] + share * second[:, :3, 3]
+    true = pose(first[:, :3, :3] @ so3_exp(share * turn), t)
+    return Trajectory(stamps[rows], estimate.poses[rows]), Trajectory(stamps[rows], true)
 
 
 def _span(name: str, stamps: Array) -> str:
@@ -140,30 +113,22 @@ def relative_errors(estimate: Trajectory, truth: Trajectory, delta: int = 1) -> 
     return _motion_errors(estimate, truth, first, first + delta)
 
 
-def segment_errors(estimate: Trajectory, truth: Trajectory, lengths: Sequence[float] | None = None) -> Array:
-    """Errors over stretches of the true path of given lengths, as KITTI's odometry benchmark has them.
+def segment_errors(estimate: Trajectory, truth: Trajectory) -> Array:
+    """Errors over stretches of the true path, as KITTI's odometry benchmark has them.
 
-    From every tenth frame a stretch reaches to the first frame that lies farther along the path than its length;
-    starts from which the path is too short give none.
-
-    Args:
-        estimate: the estimated path.
-        truth: the true path.
-        lengths: of the stretches [m]; by default KITTI's 100 to 800 m for a path of at least 1 km, else eight lengths
-            up to four fifths of the path.
+    The stretches are KITTI's of 100 to 800 m for a path of at least 1 km, else of eight lengths up to four fifths of
+    the path. From every tenth frame a stretch reaches to the first frame that lies farther along the path than its
+    length; starts from which the path is too short give none.
 
     Returns:
         rows (M, 3) of the length asked for [m], and of errors by length: translation [%] and rotation [deg/m].
 
     Raises:
-        TrajectoryError: the lengths of the two paths differ or there is no pose, or a length is not positive.
+        TrajectoryError: the lengths of the two paths differ, or there is no pose.
     """
     _require_pairs(estimate, truth, 1)
-    if lengths is None:
-        whole = truth.length if truth.length > 1e-6 else 0.0
-        lengths = KITTI_LENGTHS if whole >= 1000 else [whole * i / 10 for i in range(1, 9) if whole]
-    if any(not length > 0 for length in lengths):
-        raise TrajectoryError(f"segments: lengths must be positive, got {list(lengths)}")
+    whole = truth.length if truth.length > 1e-6 else 0.0
+    lengths = KITTI_LENGTHS if whole >= 1000 else [whole * i / 10 for i in range(1, 9) if whole]
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).cumsum()])
     starts = np.arange(0, len(truth), 10)
     rows = [np.zeros((0, 3))]
@@ -221,7 +186,4 @@ def chi_square_band(dof: int, count: int = 1) -> tuple[float, float]:
     holds in 95 % of cases where the estimator is consistent. Values of one run are not independent: take the mean
     over runs (Monte Carlo), or read the band as a guide.
     """
-    from scipy.special import gammaincinv  # scipy.stats would take a second to import
-
-    low, high = 2 * gammaincinv(dof * count / 2, [0.025, 0.975]) / count
-    return float(low), float(high)
+    return chi_square_limit(dof * count, 0.025) / count, chi_square_limit(dof * count, 0.975) / count

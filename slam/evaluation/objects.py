@@ -30,16 +30,6 @@ def motion_errors(estimated: Array, true: Array) -> PathErrors:
     return error_sizes(inverse(before) @ inverse(H) @ G @ before)
 
 
-def _summed(errors: PathErrors) -> dict[str, float]:
-    """Median and RMSE of rotation and translation; empty without errors."""
-    figures: dict[str, float] = {}
-    for name, unit, values in (("rotation", "deg", errors.rotation), ("translation", "m", errors.translation)):
-        if len(values):
-            figures[f"{name} median [{unit}]"] = float(np.median(values))
-            figures[f"{name} RMSE [{unit}]"] = float(np.sqrt(np.mean(values**2)))
-    return figures
-
-
 def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
     """NEES of a body's poses since the first row, which must be that of its first sight.
 
@@ -77,7 +67,7 @@ class _Life:
     @property
     def poses(self) -> Array:
         """Its poses T_world_object (N, 4, 4)."""
-        return np.array([thing.estimate.T_world_object for thing in self.things])
+        return np.array([thing.estimate.T_world_object for thing in self.things]).reshape(-1, 4, 4)
 
     @property
     def measured(self) -> NDArray[np.intp]:
@@ -132,12 +122,9 @@ class ObjectScore:
         count = self._count
         precision = count["right"] / max(count["right"] + count["wrong"], 1)
         recall = count["right"] / max(count["right"] + count["missed"], 1)
+        F1 = 2 * precision * recall / max(precision + recall, 1e-12)
         return {
-            "features": {
-                "precision": precision,
-                "recall": recall,
-                "F1": 2 * precision * recall / max(precision + recall, 1e-12),
-            },
+            "features": {"precision": precision, "recall": recall, "F1": F1},
             "counted right": count["counted right"] / max(count["frames"], 1),
             "bodies": {str(b): self.body(b) for b in range(1, len(self.bodies) + 1)},
             "false objects": [len(life.frames) for life in self.lives.values() if life.truth == 0],
@@ -149,38 +136,39 @@ class ObjectScore:
         covered = self._covered[body]
         coverage = float(np.mean(covered)) if covered else None
         figures: dict[str, Any] = {"frames in view": len(covered), "coverage": coverage, "ids": sorted(lives)}
-        life = self._longest(body)
-        if life is None:
+        if not lives:
             return figures
         figures["delay [frames]"] = min(min(one.frames) for one in lives.values()) - self.moves_from[body - 1]
-        rows, frames, own = life.measured, np.array(life.frames), life.poses
-        if len(rows) < 3:
+        frames, own, true = self.poses_of(body)
+        if len(frames) < 3:
             return figures
-        true = self._world @ self.bodies[body - 1][frames]
-        steps = rows[1:][(np.diff(rows) == 1) & (np.diff(frames[rows]) == 1)] - 1
-        errors, values = motion_errors(own, true), self._nees(body, life)
-        figures["ME"] = _summed(PathErrors(errors.translation[steps], errors.rotation[steps]))
+        errors, values = motion_errors(own, true), self._nees(body)
+        figures["ME"] = {}
+        for name, unit, sizes in (("rotation", "deg", errors.rotation), ("translation", "m", errors.translation)):
+            sizes = sizes[np.diff(frames) == 1]
+            if len(sizes):
+                figures["ME"][f"{name} median [{unit}]"] = float(np.median(sizes))
+                figures["ME"][f"{name} RMSE [{unit}]"] = float(np.sqrt(np.mean(sizes**2)))
         figures["mean NEES"], figures["dof"] = float(np.mean(values)) if len(values) else None, 6.0
         return figures
 
-    def poses_of(self, body: int) -> tuple[NDArray[np.intp], Array, Array] | None:
+    def poses_of(self, body: int) -> tuple[NDArray[np.intp], Array, Array]:
         """Frames (M,) in which a body's longest-lived object was measured, its poses and the true ones (M, 4, 4)."""
         life = self._longest(body)
-        if life is None:
-            return None
-        frames = np.array(life.frames)[life.measured]
+        frames = np.array(life.frames, np.intp)[life.measured]
         return frames, life.poses[life.measured], self._world @ self.bodies[body - 1][frames]
 
-    def _longest(self, body: int) -> _Life | None:
-        """The longest-lived object of a body."""
+    def _longest(self, body: int) -> _Life:
+        """The longest-lived object of a body; an empty one where there is none."""
         lives = [life for life in self.lives.values() if life.truth == body]
-        return max(lives, key=lambda one: len(one.frames), default=None)
+        return max(lives, key=lambda one: len(one.frames), default=_Life())
 
-    def _nees(self, body: int, life: _Life) -> Array:
+    def _nees(self, body: int) -> Array:
         """NEES of an object's motion since its estimate began, which may have been before it was first reported.
 
         Where an estimate restarted, it is that of the motion since.
         """
+        life = self._longest(body)
         rows, poses = life.measured, life.poses
         begun = np.array([thing.found_at for thing in life.things])
         P = np.array([thing.estimate.covariance for thing in life.things])

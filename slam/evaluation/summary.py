@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -17,8 +16,6 @@ from slam.geometry.se3 import Array, inverse, so3_log
 from slam.geometry.trajectory import Trajectory, TruthNoise
 
 logger = logging.getLogger("slam.evaluation")
-
-_TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
 
 
 class WithTruth(Protocol):
@@ -35,14 +32,11 @@ def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
 
     Figures that cannot be computed for this path, such as those of one that runs off to infinity, are left out.
     """
-    figures: dict[str, float] = {}
     pairs = with_truth(estimate, sequence)
-    if pairs is not None:
-        mounting = getattr(sequence, "truth_noise", TruthNoise()).mounting
-        for part in (_absolute, partial(_from_start, mounting=mounting), _relative, _segments):
-            figures.update(_where_possible(part, *pairs))
-        figures["poses with truth"] = float(len(pairs[0]))
-    return figures
+    if pairs is None:
+        return {}
+    mounting = getattr(sequence, "truth_noise", TruthNoise()).mounting
+    return _where_possible(_accuracy, *pairs, mounting) | {"poses with truth": float(len(pairs[0]))}
 
 
 def with_truth(estimate: Trajectory, sequence: WithTruth) -> tuple[Trajectory, Trajectory] | None:
@@ -51,7 +45,7 @@ def with_truth(estimate: Trajectory, sequence: WithTruth) -> tuple[Trajectory, T
     if truth is None or not len(estimate):
         return None
     try:
-        own, true = associate(estimate, truth, _TOLERANCE, interpolated=True)
+        own, true = associate(estimate, truth)
     except TrajectoryError:  # nothing overlaps: then there is no figure, which is no fault of the run
         return None
     return (own, true) if len(own) >= 3 else None
@@ -66,9 +60,22 @@ def _where_possible(part: Callable[..., dict[str, float]], *arguments: object) -
         return {}
 
 
-def _absolute(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    errors = absolute_errors(own, true)
-    return {"ATE RMSE [m]": errors.rmse, "ATE max [m]": float(errors.translation.max())}
+def _accuracy(own: Trajectory, true: Trajectory, mounting: float) -> dict[str, float]:
+    """ATE, RPE from frame to frame, and over as many frames as come nearest to a second if the path has so many."""
+    errors, turns = absolute_errors(own, true), rotation_errors(own, true, mounting)
+    figures = {
+        "ATE RMSE [m]": errors.rmse,
+        "ATE max [m]": float(errors.translation.max()),
+        "rotation RMSE from start [deg]": float(np.degrees(np.sqrt(np.mean(np.sum(turns**2, axis=1))))),
+    }
+    second = max(1, round(1.0 / float(np.median(np.diff(own.stamps)))))
+    for name, unit, frames in (("", "/frame", 1), (" over 1 s", "", second)):
+        if len(own) > frames:
+            errors = relative_errors(own, true, frames)
+            figures[f"RPE RMSE{name} [m{unit}]"] = errors.rmse
+            figures[f"RPE rotation RMSE{name} [deg{unit}]"] = errors.rotation_rmse
+    segments = segment_errors(own, true)[:, 1]
+    return figures | {"segment error [%]": float(segments.mean()) if len(segments) else float("nan")}
 
 
 def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array:
@@ -90,28 +97,6 @@ def rotation_errors(own: Trajectory, true: Trajectory, mounting: float) -> Array
     prior = np.mean(errors**2) / mounting**2
     turn = np.linalg.solve(J.T @ J + prior * np.eye(3), J.T @ errors.ravel())
     return np.asarray(errors - (J @ turn).reshape(-1, 3))
-
-
-def _from_start(own: Trajectory, true: Trajectory, mounting: float) -> dict[str, float]:
-    errors = rotation_errors(own, true, mounting)
-    return {"rotation RMSE from start [deg]": float(np.degrees(np.sqrt(np.mean(np.sum(errors**2, axis=1)))))}
-
-
-def _relative(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    """RPE from frame to frame, and over as many frames as come nearest to a second if the path has so many."""
-    second = max(1, round(1.0 / float(np.median(np.diff(own.stamps)))))
-    figures = {}
-    for name, unit, frames in (("", "/frame", 1), (" over 1 s", "", second)):
-        if len(own) > frames:
-            errors = relative_errors(own, true, frames)
-            figures[f"RPE RMSE{name} [m{unit}]"] = errors.rmse
-            figures[f"RPE rotation RMSE{name} [deg{unit}]"] = errors.rotation_rmse
-    return figures
-
-
-def _segments(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    errors = segment_errors(own, true)[:, 1]
-    return {"segment error [%]": float(errors.mean()) if len(errors) else float("nan")}
 
 
 def consistency(

@@ -66,8 +66,8 @@ def doubtful(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArra
         return bad
     slip, unknown = _slip(true, noise)
     variance = np.maximum(_drift(true, noise, first, last), 2 * noise.translation**2)
-    variance += np.square(_between(unknown, first, last)).sum(axis=1)
-    return np.asarray(bad | (np.abs(_between(slip, first, last)) > _SIGMAS * np.sqrt(variance)))
+    variance += np.square(unknown[last] - unknown[first]).sum(axis=1)
+    return np.asarray(bad | (np.abs(slip[last] - slip[first]) > _SIGMAS * np.sqrt(variance)))
 
 
 def _correlations(true: Trajectory, noise: TruthNoise, apart: Array) -> Array:
@@ -101,7 +101,7 @@ def _drift(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray)
     out = np.zeros(len(first))
     if not noise.wheels or not noise.translation or len(true) < 3:
         return out
-    total, unknown = (np.concatenate([x[:1] * 0, np.cumsum(x, axis=0)]) for x in _slip(true, noise))
+    total, unknown = _slip(true, noise)
     for frames in np.unique(last - first)[np.unique(last - first) > 0].tolist():
         slip = np.median(np.abs(total[frames:] - total[:-frames])) / _MEDIAN
         known = np.median(np.square(unknown[frames:] - unknown[:-frames]).sum(axis=1))
@@ -110,7 +110,7 @@ def _drift(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray)
 
 
 def _slip(true: Trajectory, noise: TruthNoise) -> tuple[Array, Array]:
-    """How far a vehicle slips sideways in each step (N − 1,) [m], and what may seem to be a slip (N − 1, 2), to add up.
+    """How far a vehicle has slipped sideways up to each pose (N,) [m], and what may seem to be a slip (N, 2).
 
     A camera ahead of the axle moves sideways by its lever times the turn. Its constant part is how the camera stands in
     the vehicle: the median. What may seem to be a slip: the unknown part of the lever, and an error of the attitude.
@@ -120,10 +120,11 @@ def _slip(true: Trajectory, noise: TruthNoise) -> tuple[Array, Array]:
     middle = (np.swapaxes(so3_exp(0.5 * turn), 1, 2) @ motion[:, :3, 3:])[:, :, 0]
     forward = np.where(middle[:, 2] > 0, middle[:, 2], np.nan)
     unknown = np.column_stack([_LEVER_SIGMA * turn[:, 1], noise.rotation * np.linalg.norm(middle, axis=1)])
-    if not np.isfinite(forward).any():
-        return np.zeros(len(motion)), unknown
     sideways = middle[:, 0] - _LEVER * turn[:, 1]
-    return sideways - np.nanmedian(sideways / forward) * middle[:, 2], unknown
+    known = np.isfinite(forward).any()
+    steps = sideways - np.nanmedian(sideways / forward) * middle[:, 2] if known else 0 * sideways
+    slip, unknown = (np.concatenate([x[:1] * 0, np.cumsum(x, axis=0)]) for x in (steps, unknown))
+    return slip, unknown
 
 
 def interpolated(true: Trajectory, noise: TruthNoise) -> BoolArray:
@@ -146,9 +147,3 @@ def interpolated(true: Trajectory, noise: TruthNoise) -> BoolArray:
     made_up[1:-1] = (ratio < _NEARLY) & np.isin(run, run[ratio < _EVEN])
     made_up[0], made_up[-1] = made_up[1], made_up[-2]
     return made_up
-
-
-def _between(steps: Array, first: RowArray, last: RowArray) -> Array:
-    """Sums (M, ...) of steps (N, ...) between rows."""
-    total = np.concatenate([steps[:1] * 0, np.cumsum(steps, axis=0)])
-    return np.asarray(total[last] - total[first])

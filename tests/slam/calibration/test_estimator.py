@@ -125,9 +125,10 @@ def test_a_good_calibration_is_left_as_it_is(seed):
     assert disparity_error(calibration, 0) < 0.03
 
 
-def test_what_motion_has_hardly_shown_is_not_applied():
+def test_what_motion_has_hardly_shown_is_not_applied(monkeypatch):
     """Steps of five centimetres and noisy pixels: most of what is believed of the disparities is the prior's."""
-    calibration = drive(TURNED, frames=8, step=0.05, noise=1.0, settings={"minimum_parallax": 0.01})
+    monkeypatch.setattr(SelfCalibrationConfig, "minimum_parallax", 0.01)
+    calibration = drive(TURNED, frames=8, step=0.05, noise=1.0)
     assert calibration.posterior.mean.any() and calibration.apply() is None
     assert disparity_error(calibration, TURNED) > 0.9 * disparity_error(drive(TURNED, frames=1), TURNED)
 
