@@ -23,8 +23,8 @@ sys.path.insert(0, str(ROOT))
 
 #: Where constants that shape an estimate are; worlds, readers, reports and commands have none.
 ROOMS = (
-    "slam/kernels", "slam/geometry", "slam/tracks", "slam/tracks", "slam/calibration", "slam/bodies", "slam/papers",
-    "backends", "frontends",
+    "slam/kernels", "slam/geometry", "slam/input", "slam/tracks", "slam/window", "slam/atlas", "slam/calibration",
+    "slam/bodies", "backends", "frontends",
 )  # fmt: skip
 
 INTRODUCTION = """# Parameters

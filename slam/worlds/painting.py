@@ -68,25 +68,6 @@ def _sheet(page: Page, box: Box) -> None:
     page.print(page.part(0.1, 0.57, 0.8, 0.36, box), 0.05 * height, ink)
 
 
-def _pinboard(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A cork board with papers pinned to it."""
-    page = Page(mottled(size, rng, density, (95.0, 135.0, 170.0), (0.12, 0.006, 2)), rng)
-    height, width = size
-    x = 0.04 * density
-    while x < width - 0.25 * density:
-        y = rng.uniform(0.03, 0.08) * density
-        wide = 0.0
-        while y < height - 0.2 * density:
-            w, h = (0.21, 0.297) if rng.random() < 0.5 else (rng.uniform(0.1, 0.2), rng.uniform(0.1, 0.2))
-            if y + h * density < height - 4:
-                _sheet(page, (x + rng.uniform(0, 0.02) * density, y, w * density, h * density))
-            wide = max(wide, w)
-            y += (h + rng.uniform(0.02, 0.05)) * density
-        x += (wide + rng.uniform(0.03, 0.05)) * density
-    _frame(page, 0.018 * density, (80.0, 110.0, 140.0))
-    return page.picture
-
-
 def _frame(page: Page, edge: float, colour: Colour) -> None:
     """A frame around the whole page, `edge` texels wide."""
     w, h = page.width, page.height
@@ -106,56 +87,6 @@ def _cover(size: Size, rng: Rng, density: float) -> np.ndarray:
         x, y = rng.uniform(0.2, 0.8) * page.width, rng.uniform(0.5, 0.75) * page.height
         page.dot(x, y, rng.uniform(0.02, 0.09) * min(size), rng.uniform(20, 240, 3))
     page.title(5, page.part(0.3, 0.86, 0.4, 0.06), ink)
-    return page.picture
-
-
-def _screen(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A monitor with windows full of text and a plot."""
-    page = Page(np.full((*size, 3), 25, np.uint8), rng)
-    edge = 0.012 * density
-    if min(size) < 4 * edge:
-        return page.picture
-    page.bar((edge, edge, page.width - 2 * edge, page.height - 2 * edge), (110.0, 70.0, 40.0))
-    for window, ground, ink in (
-        ((0.05, 0.08, 0.45, 0.8), (40.0, 40.0, 40.0), (200.0, 220.0, 200.0)),
-        ((0.53, 0.05, 0.42, 0.5), (245.0, 245.0, 245.0), (60.0, 50.0, 40.0)),
-        ((0.57, 0.6, 0.36, 0.32), (250.0, 250.0, 250.0), (150.0, 80.0, 40.0)),
-    ):
-        x, y, w, h = page.part(*window)
-        page.bar((x, y, w, h), ground)
-        page.bar((x, y, w, 0.03 * page.height), (160.0, 160.0, 165.0))
-        inner = (x + 0.02 * page.width, y + 0.06 * page.height, w - 0.05 * page.width, h - 0.1 * page.height)
-        page.print(inner, 0.035 * page.height, ink)
-    return page.picture
-
-
-def _keyboard(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A keyboard; the letters are a matter of luck."""
-    page = Page(np.full((*size, 3), 45, np.uint8), rng)
-    pitch, y = 0.019 * density, 0.012 * density
-    if page.height < 3 * pitch:
-        return page.picture
-    while y + pitch < page.height:
-        x = 0.01 * density + rng.uniform(0, 0.5) * pitch
-        while x + pitch < page.width - 0.01 * density:
-            w = pitch * (1.5 if rng.random() < 0.06 else 1.0)
-            page.bar((x + 0.1 * pitch, y + 0.1 * pitch, w - 0.2 * pitch, 0.8 * pitch),
-                     (205.0 if rng.random() < 0.9 else 130.0,) * 3)  # fmt: skip
-            page.write(words(rng, 3)[0], (x + 0.25 * pitch, y + 0.2 * pitch, 0.4 * pitch, 0.4 * pitch), (40.0,) * 3)
-            x += w
-        y += pitch
-    return page.picture
-
-
-def _paper(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A printed page."""
-    page = Page(np.full((*size, 3), 238, np.uint8), rng)
-    ink = (50.0, 45.0, 45.0)
-    page.title(12, page.part(0.1, 0.06, 0.8, 0.05), ink)
-    for column in (0.1, 0.53):
-        page.print(page.part(column, 0.16, 0.37, 0.76), 0.018 * page.height, ink)
-    page.bar(page.part(0.12, 0.3, 0.33, 0.14), (225.0, 225.0, 225.0))
-    page.dot(0.28 * page.width, 0.37 * page.height, 0.05 * page.height, (120.0, 80.0, 60.0))
     return page.picture
 
 
@@ -278,21 +209,10 @@ RECIPES = {
     "carton": Recipe(_carton, _print),
     "board": Recipe(_BOARD, _print),
     "wood": Recipe(wood, _fleck),
-    "pinboard": Recipe(_pinboard),
     "cover": Recipe(_cover, _print),
-    "screen": Recipe(_screen),
-    "keyboard": Recipe(_keyboard),
-    "paper": Recipe(_paper),
     "poster": Recipe(_poster, _print),
     "asphalt": Recipe(streetside.asphalt, _fleck, 0.5),
-    "road": Recipe(streetside.road, _fleck),
-    "road_across": Recipe(streetside.road_across, _fleck),
-    "car_side": Recipe(streetside.car_side),
-    "car_front": Recipe(partial(streetside.car_end, lamp=(235.0, 240.0, 240.0))),
-    "car_back": Recipe(partial(streetside.car_end, lamp=(45.0, 45.0, 200.0))),
-    "car_top": Recipe(streetside.paintwork),
-    "cabin_side": Recipe(partial(streetside.cabin, panes=streetside.SIDE_PANES)),
-    "cabin_end": Recipe(partial(streetside.cabin, panes=streetside.END_PANES)),
+    **{name: Recipe(partial(streetside.car_part, items=items)) for name, items in streetside.CAR_PARTS.items()},
     "field": Recipe(streetside.field, _fleck),
 }
 

@@ -68,86 +68,46 @@ def _window(page: Page, box: Box) -> None:
             page.bar((x, top, 0.42 * w, h), shutter)
 
 
-def road(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A street running down the picture: asphalt, kerbs, pavements, and a dashed line."""
-    page = Page(asphalt(size, rng, density), rng)
-    height, width = size
-    for left, right in ((0.0, 1.4), (width / density - 1.9, width / density)):
-        x0, x1 = round(left * density), round(right * density)
-        stones = 1 + 0.05 * clouds((height, x1 - x0), rng, 0.3 * density)
-        page.picture[:, x0:x1] = tinted(stones, (140.0, 143.0, 146.0))
-        for y in np.arange(0, height, 0.5 * density):
-            page.bar((x0, y, x1 - x0, 0.03 * density), (105.0, 108.0, 110.0))
-        kerb = right if left == 0 else left
-        page.bar(((kerb - 0.08) * density, 0, 0.16 * density, height), (170.0, 172.0, 174.0))
-    for y in np.arange(0, height, 6 * density):  # between the lanes
-        page.bar((7.4 * density - 0.07 * density, y, 0.14 * density, 3 * density), (215.0, 218.0, 220.0))
-    return page.picture
-
-
-def road_across(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """The same, running across the picture."""
-    return np.ascontiguousarray(np.rot90(road((size[1], size[0]), rng, density)))
-
-
 def asphalt(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """Asphalt with nothing on it."""
+    """Asphalt."""
     light = 1 + 0.05 * clouds(size, rng, 2.0 * density, 4) + 0.06 * clouds(size, rng, 2.0, 1)
     return tinted(light, (88.0, 86.0, 85.0))
 
 
-def paintwork(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """Car paint (roof, bonnet); its colour is drawn first, so that all sides of a car have the same."""
+_DARK, _GLASS, _GLARE = (25.0, 25.0, 28.0), (75.0, 65.0, 55.0), (125.0, 115.0, 105.0)
+_WHEEL = ((0.079, 25.0), (0.047, 165.0), (0.014, 60.0))  # half widths as shares of a car's length, and grey values
+_CAR_END = (
+    ((0.32, 0.5, 0.36, 0.16), (240.0, 240.0, 240.0)), ((0, 0.72, 1, 0.12), (55.0, 55.0, 58.0)),
+    ((0.05, 0.84, 0.17, 0.16), _DARK), ((0.78, 0.84, 0.17, 0.16), _DARK),
+)  # fmt: skip
+#: What is on the parts of a car: boxes by shares of the part, and their colours.
+CAR_PARTS: dict[str, tuple[tuple[Box, Colour], ...]] = {
+    "car_top": (),
+    "car_side": (
+        *(((x, 0, 0.005, 0.8), _DARK) for x in (0.36, 0.60, 0.82)),
+        *(((x, 0.22, 0.042, 0.067), (190.0, 190.0, 190.0)) for x in (0.40, 0.64)),
+        *(((x - r, 0.85 - 5.73 * r, 2 * r, 11.47 * r), (grey,) * 3) for x in (0.18, 0.80) for r, grey in _WHEEL),
+    ),
+    "car_front": (*(((x, 0.18, 0.18, 0.2), (235.0, 240.0, 240.0)) for x in (0.05, 0.77)), *_CAR_END),
+    "car_back": (*(((x, 0.18, 0.18, 0.2), (45.0, 45.0, 200.0)) for x in (0.05, 0.77)), *_CAR_END),
+    "cabin_side": (
+        ((0.04, 0.18, 0.42, 0.75), _GLASS), ((0.09, 0.25, 0.08, 0.6), _GLARE),
+        ((0.50, 0.18, 0.42, 0.75), _GLASS), ((0.55, 0.25, 0.08, 0.6), _GLARE),
+    ),
+    "cabin_end": (
+        ((0.07, 0.15, 0.86, 0.8), _GLASS), ((0.15, 0.25, 0.2, 0.3), _GLARE), ((0.62, 0.6, 0.12, 0.2), _DARK),
+    ),
+}  # fmt: skip
+
+
+def car_part(size: Size, rng: Rng, density: float, items: tuple[tuple[Box, Colour], ...]) -> np.ndarray:
+    """A part of a car: paint, whose colour is drawn first, so that all parts have the same, and boxes on it."""
     colour = _PAINTS[int(rng.integers(len(_PAINTS)))]
     light = 1.05 - 0.25 * np.linspace(0, 1, size[0], dtype=np.float32)[:, None]
-    return tinted(light + 0.02 * clouds(size, rng, 0.3 * density), colour)
-
-
-def car_side(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """The side of a car below its windows: doors, handles and wheels."""
-    page = Page(paintwork(size, rng, density), rng)
-    height, width = size
-    for x in (0.36, 0.60, 0.82):
-        page.bar((x * width, 0, 0.02 * density, 0.8 * height), (25.0, 25.0, 28.0))
-    for x in (0.40, 0.64):
-        page.bar((x * width, 0.22 * height, 0.18 * density, 0.05 * density), (190.0, 190.0, 190.0))
-    for x in (0.18, 0.80):
-        for radius, grey in ((0.34, 25.0), (0.2, 165.0), (0.06, 60.0)):
-            page.dot(x * width, 0.85 * height, radius * density, (grey, grey, grey))
+    page = Page(tinted(light + 0.02 * clouds(size, rng, 0.3 * density), colour), rng)
+    for box, shade in items:
+        page.bar(page.part(*box), shade)
     return page.picture
-
-
-def car_end(size: Size, rng: Rng, density: float, lamp: Colour) -> np.ndarray:
-    """The front or the back of a car below its windows: lamps, number plate, bumper."""
-    page = Page(paintwork(size, rng, density), rng)
-    for x in (0.05, 0.77):
-        page.bar(page.part(x, 0.18, 0.18, 0.2), lamp)
-    plate = page.part(0.32, 0.5, 0.36, 0.16)
-    page.bar(plate, (240.0, 240.0, 240.0))
-    page.title(6, (plate[0] + 2, plate[1] + 1, plate[2] - 4, plate[3] - 2), (20, 20, 20))
-    page.bar(page.part(0, 0.72, 1, 0.12), (55.0, 55.0, 58.0))
-    for x in (0.05, 0.78):
-        page.bar(page.part(x, 0.84, 0.17, 0.16), (20.0, 20.0, 20.0))
-    return page.picture
-
-
-def cabin(size: Size, rng: Rng, density: float, panes: tuple[tuple[Box, Colour], ...]) -> np.ndarray:
-    """The windows of a car, as shares of its side."""
-    page = Page(paintwork(size, rng, density), rng)
-    for box, colour in panes:
-        page.bar(page.part(*box), colour)
-    return page.picture
-
-
-_GLASS = (75.0, 65.0, 55.0)
-SIDE_PANES = (
-    ((0.04, 0.18, 0.46 - 0.04, 0.75), _GLASS), ((0.04 + 0.05, 0.25, 0.08, 0.6), (125.0, 115.0, 105.0)),
-    ((0.50, 0.18, 0.92 - 0.50, 0.75), _GLASS), ((0.50 + 0.05, 0.25, 0.08, 0.6), (125.0, 115.0, 105.0)),
-)  # fmt: skip
-END_PANES = (
-    ((0.07, 0.15, 0.86, 0.8), _GLASS), ((0.15, 0.25, 0.2, 0.3), (130.0, 120.0, 110.0)),
-    ((0.62, 0.6, 0.12, 0.2), (40.0, 35.0, 35.0)),
-)  # fmt: skip
 
 
 def field(size: Size, rng: Rng, density: float) -> np.ndarray:
