@@ -150,7 +150,7 @@ image = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
 for k in range(2):
     system.process(image, image[:, ::-1], 0.1 * k)
 """
-HEAVY = {"scipy", "cv2", "gtsam", "numba", "pydantic", "typer", "rich", "matplotlib", "backends", "frontends"}
+HEAVY = {"scipy", "cv2", "gtsam", "numba", "typer", "rich", "matplotlib", "backends", "frontends"}
 LOADS = {
     "import slam": HEAVY,
     "import backends, frontends; backends.names(); frontends.names()": {"gtsam", "numba", "scipy", "cv2"},

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN, require_positive
+from slam.models import require_positive
 
 _RANGES = {"systematic": (1e-4, 1e4), "minimum_parallax": (1e-4, 1e4)}  # [px]
 
@@ -35,8 +35,6 @@ class SelfCalibrationConfig:
     kept_share: ClassVar[float] = 0.3
     #: Factor on the variance of the evidence at first, until its scatter has been measured.
     inflation: ClassVar[float] = 4.0
-
-    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_positive(self, _RANGES, "self_calibration")
