@@ -47,12 +47,6 @@ from slam.papers.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother", "window")
 PARTS = ("table1", "moving", "boxes", "occlusion", "still", "people", "kitti", "cyclists")
-TITLES = {
-    "table1": "The box at four places (paper B, Table 1)", "moving": "The box under a moving camera",
-    "boxes": "Four boxes", "occlusion": "The box is hidden",
-    "still": "Nothing moves", "people": "People", "kitti": "Cars of KITTI raw 0013",
-    "cyclists": "Cyclists of KITTI raw 0001",
-}  # fmt: skip
 # The box moves in frames 60 to 105: from which frame it is watched, when it vanishes, and for how many frames.
 WATCHED_FROM, HIDDEN_AT, HIDDEN_FOR, WATCHED_AFTER = 50, 85, (15, 60), 15
 PLACES_AT = (1.0, 5.0, 8.5, 12.0)  # when the box has stood at B0 to B3 for a while [s]
@@ -83,7 +77,7 @@ def absolute_pose_errors(estimated: Array, true: Array) -> PathErrors:
 
 
 def table1(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Where the box is said to be while it rests at its four places, and the errors."""
+    """The box at four places (paper B, Table 1): the largest errors while it rests."""
     name = "box?density=300&camera=still"
     sequence = slam.open_sequence(f"synthetic:{name}")
     frames = 40 if quick else len(sequence)
@@ -135,7 +129,7 @@ def place_rows(sequence: Any, true: Any, poses: dict[int, Any], backend: str, mo
 
 
 def moving(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """The box under a moving camera, and the same run without the box's features."""
+    """The box under a moving camera: with, and without the box's features."""
     name, frames = "box?density=300&camera=moving&seed=0", 90 if quick else 10**6
     rows, scores = [], {}
     for backend in BACKENDS:
@@ -166,14 +160,14 @@ def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
 
 
 def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Three boxes and an articulated one, in three rooms: one run tells little of how they are counted."""
+    """Four boxes: three, and one with a lid on a hinge; three rooms."""
     frames, seeds = (20, 1) if quick else (300, 3)
     worlds = [f"boxes?density=300&seed={seed}&layout={seed}" for seed in range(seeds)]
     return [scored_run(world, backend, images, frames)[0] for world in worlds for backend in BACKENDS]
 
 
 def occlusion(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """The box is hidden for half a second or two while it moves and comes to rest: how often it keeps its id."""
+    """The box is hidden: how often it keeps its id, of ten runs."""
     found: dict[tuple[str, int], list[tuple[set[int], set[int], int]]] = {}
     for seed in range(1 if quick else 10):
         for backend, frames in [(b, h) for h in HIDDEN_FOR for b in BACKENDS][: 1 if quick else None]:
@@ -207,19 +201,19 @@ def ids_about(seed: int, backend: str, frames: int, images: bool) -> tuple[set[i
 
 
 def still(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Worlds of which no part moves: whatever is found in them is wrong. Medians over the seeds."""
+    """Nothing moves: whatever is found is wrong. Medians over ten seeds."""
     seeds, frames = (1, 15) if quick else (10, 100)
     worlds = ("aisle?speed=2&", "desk?density=200&", "field?", "street?cars=0&")
     return [scored_run(f"{w}seed={seed}", "ekf", images, frames)[0] for w in worlds for seed in range(seeds)]
 
 
 def people(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Cyclists and walkers beside parked cars; nothing in the detector was chosen on this world."""
+    """Cyclists and walkers: nothing in the detector was chosen on this world."""
     return [scored_run("people?", backend, images, 20 if quick else 10**6)[0] for backend in BACKENDS]
 
 
 def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Two cars overtake, a van comes; parked cars must not be made objects."""
+    """Cars of KITTI raw 0013: two overtake; parked ones must not be made objects."""
     folder = recording(KITTI)
     if folder is None:
         return []
@@ -234,13 +228,12 @@ def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
         results = drive(sequence, backend, features)
         rows += car_rows(backend, results, labels)
         paths = {
-            "as it is": results,
-            "detector off": drive(sequence, backend, features, "objects.mode=off"),
+            "ATE [m]": results,
+            "without the detector": drive(sequence, backend, features, "objects.mode=off"),
             "moving cars masked out": drive(sequence, backend, clear, "objects.mode=off"),
         }
-        for name, run in paths.items():
-            ate = evaluate(path_of(run), sequence)["ATE RMSE [m]"]
-            rows.append({"back end": backend, "object": f"camera, {name}", "ATE [m]": ate})
+        ates = {name: evaluate(path_of(run), sequence)["ATE RMSE [m]"] for name, run in paths.items()}
+        rows.append({"back end": backend, **ates})
     return rows
 
 
@@ -255,7 +248,7 @@ def recording(name: str) -> Path | None:
 
 
 def cyclists(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Of all labelled objects the cyclists and a far tram move; whatever else is reported is wrong. Runs by start."""
+    """Cyclists of KITTI raw 0001: what is reported besides is wrong. Four first frames."""
     folder = recording(CYCLISTS)
     if folder is None:
         return []
@@ -342,7 +335,7 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
         rows.append({
             "back end": backend, "object": id, "car": car, "frames": f"{history[0][0]}-{history[-1][0]}",
             "measured": len(history), "speed within 25 m [m/s]": float(own),
-            "error [%]": float(100 * abs(own / true - 1)), "ATE [m]": None,
+            "error [%]": float(100 * abs(own / true - 1)),
         })  # fmt: skip
     return rows
 
@@ -351,7 +344,7 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """A Markdown table of the rows' plain values; where they have bodies, these follow in a table of their own."""
+    """Markdown tables of the rows' plain values, one for each kind of rows; bodies follow."""
     if not rows:
         return "(nothing)"
     bodies = [
@@ -360,7 +353,10 @@ def table(rows: list[dict[str, Any]]) -> str:
         for number, body in row.get("bodies", {}).items()
         if body["frames in view"] and row["world"].startswith("box?")  # of many bodies a table is too long
     ]
-    return plain_table(rows) + ("\n\n" + plain_table(bodies) if bodies else "")
+    kinds: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for row in (*rows, *bodies):
+        kinds.setdefault(tuple(row), []).append(row)
+    return "\n\n".join(map(plain_table, kinds.values()))
 
 
 def main() -> int:
@@ -377,7 +373,8 @@ def main() -> int:
         else:
             rows = globals()[name](not arguments.observations, arguments.quick, arguments.out)
         shown = {"still": worlds_together, "table1": places_together}.get(name, list)(rows)
-        print(f"\n# {TITLES[name]}\n\n{globals()[name].__doc__}\n\n{table(shown)}", flush=True)
+        title, _, said = globals()[name].__doc__.partition(": ")
+        print(f"\n# {title}\n\n{said and said[0].upper() + said[1:]}\n\n{table(shown)}", flush=True)
         kept.write_text(json.dumps(rows, indent=2, default=str) + "\n")
     return 0
 
