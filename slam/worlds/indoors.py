@@ -75,7 +75,7 @@ def _aisle_walls(layout: int) -> list[Rectangle]:
     def shelves(wide: float, number: int) -> Shelves:
         return Shelves(wide, HEIGHT, 100 * layout + number)
 
-    end = Material(depth + 0.4, CEILING, "door_wall", layout + 1, 8)
+    end = Material(depth + 0.4, CEILING, "plaster", layout + 1, 8)
     wall = Material(BARE[1] - BARE[0] + 1.0, CEILING, "plaster", layout + 2, 0.6)
     side = Material(0.19, HEIGHT, "wood", layout)
     return [

@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.errors import UnknownNameError
 from slam.worlds import streetside
-from slam.worlds.brushes import Box, Colour, Page, Rng, Size, clouds, grain, mottled, tinted, wood, words
+from slam.worlds.brushes import Colour, Page, Rng, Size, clouds, grain, mottled, tinted, wood, words
 from slam.worlds.geometry import Texture
 from slam.worlds.shelves import paint_bay
 from slam.worlds.streetside import paint_facade
@@ -39,10 +38,8 @@ def paint(texture: Texture, density: float) -> np.ndarray:
     return picture
 
 
-def _paint_material(piece: Material, density: float) -> np.ndarray:
-    """A piece of a material; UnknownNameError where there is no such material."""
-    if piece.material not in RECIPES:
-        raise UnknownNameError(f"unknown material {piece.material!r}; known: {', '.join(RECIPES)}")
+def _paint_material(piece: Material | Signs, density: float) -> np.ndarray:
+    """A piece of a material, or a board of signs."""
     recipe = RECIPES[piece.material]
     rng = np.random.default_rng([piece.seed, 63])
     density *= recipe.detail
@@ -52,20 +49,6 @@ def _paint_material(piece: Material, density: float) -> np.ndarray:
         for x, y, diameter in piece.marks() * density:
             recipe.spot(page, x, y, diameter)
     return page.picture
-
-
-def _sheet(page: Page, box: Box) -> None:
-    """A sheet of paper with a heading, print and a picture, pinned up."""
-    rng, (left, top, width, height) = page.rng, box
-    page.bar((left + 0.02 * width, top + 0.02 * height, width, height), (90.0, 95.0, 100.0))
-    page.bar(box, rng.uniform(190, 250, 3) if rng.random() < 0.4 else (232.0, 238.0, 240.0))
-    ink = rng.choice([(40, 40, 40), (120, 60, 30), (40, 40, 150)]).astype(float)
-    page.title(8, page.part(0.1, 0.06, 0.8, 0.1, box), ink)
-    page.bar(page.part(0.1, 0.22, 0.8, 0.3, box), rng.uniform(40, 200, 3))
-    for _ in range(3):
-        x, y = left + rng.uniform(0.2, 0.8) * width, top + rng.uniform(0.27, 0.47) * height
-        page.dot(x, y, rng.uniform(0.03, 0.08) * height, rng.uniform(20, 235, 3))
-    page.print(page.part(0.1, 0.57, 0.8, 0.36, box), 0.05 * height, ink)
 
 
 def _frame(page: Page, edge: float, colour: Colour) -> None:
@@ -120,21 +103,6 @@ def _ceiling(size: Size, rng: Rng, density: float) -> np.ndarray:
     return page.picture
 
 
-def _door_wall(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A wall with a door and notices."""
-    page = Page(_PLASTER(size, rng, density), rng)
-    height, width = size
-    wide, high = 0.9 * density, 2.05 * density
-    left = (width - wide) / 2
-    page.bar((left - 0.06 * density, height - high - 0.06 * density, wide + 0.12 * density, high), (120, 130, 135))
-    door = wood((round(wide), round(high)), rng, density, (90.0, 120.0, 150.0)).transpose(1, 0, 2)
-    x, y = round(left), height - round(high)
-    page.picture[y : y + door.shape[0], x : x + door.shape[1]] = door[: height - y, : width - x]
-    page.dot(left + 0.86 * wide, height - 1.05 * density, 0.03 * density, (190.0, 195.0, 200.0))
-    _sheet(page, (left + 0.3 * wide, height - 1.7 * density, 0.3 * density, 0.4 * density))
-    return page.picture
-
-
 def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
     """A side of a carton: brown board, tape, print and a label."""
     ribs = grain(size, rng, (2.0, 0.2 * density))
@@ -151,26 +119,6 @@ def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
         x += w + rng.uniform(0.015, 0.05) * label[2]
     page.print(page.part(0.08, 0.58, 0.84, 0.36, label), 0.12 * label[3], ink)
     _frame(page, 1.5, (60.0, 90.0, 115.0))
-    return page.picture
-
-
-def _paint_signs(board: Signs, density: float) -> np.ndarray:
-    """A white board with signs: discs and squares with a pattern of their own around and on them."""
-    rng = np.random.default_rng([board.seed, 65])
-    size = round(board.height * density), round(board.width * density)
-    page = Page(_BOARD(size, rng, density), rng)
-    for x, y, diameter in board.marks() * density:
-        dark = rng.random() < 0.7
-        ground, ink = ((215.0,) * 3, (30.0,) * 3) if dark else ((45.0,) * 3, (225.0,) * 3)
-        field = 2.2 * diameter
-        page.bar((x - field / 2, y - field / 2, field, field), ground)
-        for _ in range(4):
-            angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(0.75, 0.95) * diameter
-            page.dot(x + far * np.cos(angle), y + far * np.sin(angle), rng.uniform(0.06, 0.14) * diameter, ink)
-        page.dot(x, y, diameter / 2, ink)
-        for _ in range(2):
-            spot = x + rng.uniform(-0.2, 0.2) * diameter, y + rng.uniform(-0.2, 0.2) * diameter
-            page.dot(*spot, rng.uniform(0.04, 0.08) * diameter, ground)
     return page.picture
 
 
@@ -205,7 +153,6 @@ RECIPES = {
     "plaster": Recipe(_PLASTER, _fleck, 0.25),
     "carpet": Recipe(_even((105.0, 85.0, 75.0), (0.10, 0.008, 2), (0.05, 0.15, 3)), _fleck, 0.5),
     "ceiling": Recipe(_ceiling, None, 0.5),
-    "door_wall": Recipe(_door_wall, _fleck),
     "carton": Recipe(_carton, _print),
     "board": Recipe(_BOARD, _print),
     "wood": Recipe(wood, _fleck),
@@ -217,5 +164,5 @@ RECIPES = {
 }
 
 PAINTERS: dict[type, Callable[..., np.ndarray]] = {
-    Material: _paint_material, Facade: paint_facade, Signs: _paint_signs, Bay: paint_bay,
+    Material: _paint_material, Facade: paint_facade, Signs: _paint_material, Bay: paint_bay,
 }  # fmt: skip
