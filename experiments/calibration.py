@@ -115,7 +115,7 @@ def main() -> int:
     show(out / "worlds.json", header, rows, 1)
     drives = recordings(DRIVES)
     if len(drives) == len(DRIVES):
-        print("\nThe same rig on two drives of one day (mean ± standard deviation):\n")
+        print("\nThe same rig on two drives of one day:\n")
         show_drives(drives, out, 12 if arguments.quick else None)
     return 0
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN, require_not_negative
+from slam.models import require_not_negative
 
 _RANGES = {
     "wide_hypotheses": (1, 100_000),
@@ -80,8 +80,6 @@ class AssociationConfig:
     #: Standard deviation [px] assumed in the second search, around the pose on which matches agreed.
     refined_window: ClassVar[float] = 3.0
 
-    __pydantic_config__ = FORBID_UNKNOWN
-
     def __post_init__(self) -> None:
         require_not_negative(self, _RANGES, "association")
         if self.windows not in ("covariance", "fixed"):
@@ -154,8 +152,6 @@ class MapConfig:
     same_distance: ClassVar[float] = 0.02
     #: Largest descriptor distance at which landmarks are merged.
     same_descriptor: ClassVar[float] = 0.4
-
-    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self)
