@@ -159,7 +159,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     SequenceError for every fault of it, also of what is read meanwhile, or where rosbags is missing.
     """
     if find_spec("rosbags") is None:
-        line = "ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
+        line = "ROS recordings are read by the package rosbags, which is not installed: pip install rosbags"
         raise SequenceError(f"{path}: {line}")
     with _one_line(path), ExitStack() as stack:
         from rosbags.highlevel import AnyReader

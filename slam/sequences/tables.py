@@ -14,7 +14,7 @@ from slam.errors import SequenceError, TrajectoryError
 from slam.files import read_text
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.sequences.faults import FaultLog
+from slam.sequences.base import FaultLog
 
 T = TypeVar("T")
 

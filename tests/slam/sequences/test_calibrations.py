@@ -202,10 +202,10 @@ def test_kalibr(two_folders: Path) -> None:
     ("old", "new", "text"),
     [
         ("-0.11]", "0.11]", "are the cameras swapped? The first one of a calibration is the left one"),
-        ("  T_cn_cnm1:", "  T_12:", "it looks like Kalibr's, which has cam0 and cam1, each with intrinsics"),
+        ("  T_cn_cnm1:", "  T_12:", "it looks like Kalibr's, but R, T are missing"),
         ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),
-        ("cam1:", "cam7:", "it looks like Kalibr's, which has cam0 and cam1, each with"),
+        ("cam1:", "cam7:", "it looks like Kalibr's, but K2, R, T are missing"),
         ("[0.0, 0.0, 1.0, 0.002]", "[0.0, 0.0, 2.0, 0.002]", "T_cn_cnm1 is not a rigid motion"),
         ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "cam0/intrinsics has 3 numbers; it has fx, fy, cx, cy, or"),
         ("2e-4, 1e-5]", "2e-4]", "takes 4 coefficients or more, got 3"),
@@ -379,16 +379,8 @@ def test_what_is_recognised_but_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="depthai's, but says nothing of how the pair stands"):
         slam.load_rig(file)
     file.write_text(VINS.replace("cam1.yaml", "elsewhere.yaml"))
-    with pytest.raises(
-        CalibrationError, match="looks like VINS-Fusion's, which has cam0_calib and cam1_calib, files that"
-    ):
+    with pytest.raises(CalibrationError, match=r"looks like VINS-Fusion's, but K1, K2 are missing; .*, cam1_calib"):
         slam.load_rig(file)
-    file.write_text('{"value0": {"intrinsics": [], "resolution": []}}')
-    with pytest.raises(CalibrationError, match="looks like Basalt's"):
-        slam.load_rig(file, size=(64, 48))
-    file.write_text('{"CameraParameters1": {"IntrinsicMatrix": [[1]]}, "TranslationOfCamera2": [-120, 0, 0]}')
-    with pytest.raises(CalibrationError, match="looks like MATLAB's, which has matrices that are transposed"):
-        slam.load_rig(file, size=(64, 48))
     for number, text in enumerate(("Image_Size: [64, 48]\nfoo_Bar: 1\n", "K1: [1]\n")):
         (tmp_path / f"{number}.yaml").write_text(text)
     with pytest.raises(CalibrationError, match=r"in it: Image_Size, K1, foo_Bar"):
