@@ -18,7 +18,7 @@ from slam.errors import ConfigurationError, SequenceError, SlamError, UnknownNam
 from slam.files import expanded, note_input, read_object, reason
 from slam.naming import nearest, unknown
 from slam.sequences import euroc, folders, kitti, ros
-from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, read_masks, turned
+from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, read_masks, say, turned
 from slam.sequences.folders import VIDEO_SUFFIXES
 from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.options import RECORDED, Options, read_options
@@ -45,7 +45,7 @@ _FORMATS = {
         ros.matches_folder, ros.open_folder, "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"
     ),
     "euroc": _Format(euroc.matches_folder, euroc.open_folder, "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
-    "kitti-raw": _Format(kitti.matches_drive, kitti.open_drive, "KITTI raw drives: image_00/data, image_01/data"),
+    "kitti-raw": _Format(kitti.matches_drive, kitti.open_folder, "KITTI raw drives: image_00/data, image_01/data"),
     "kitti": _Format(kitti.matches_folder, kitti.open_folder, "KITTI odometry sequences: image_0, image_1, calib.txt"),
     "folders": _Format(
         folders.matches_folder,
@@ -110,11 +110,13 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
     options = Options(query, name, RECORDED)
     note_input(folder)
     lines: list[str] = []
-    with FaultLog(lines, at_the_end=True) as faults:
+    with FaultLog(lines, quiet=True) as faults:  # above an error nothing is said
         found = _FORMATS[name].open(folder, options, faults)
         masks = read_masks(options.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
+    for line in lines:
+        say(line)
     truth = turned(found.ground_truth, found.rig)
     return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
@@ -156,10 +158,7 @@ def _format_of(folder: Path) -> str | None:
 
 
 def _format_asked(folder: Path, query: str, text: str) -> str | None:
-    """The first format that a folder looks like; told where left and right are, it needs not look.
-
-    What is neither a folder with something in it nor a recording is refused; `text` is what was asked for.
-    """
+    """The first format that a folder looks like; what is neither a recording nor a folder of something is refused."""
     named = read_options(query).keys()
     if ros.matches_folder(folder):
         return "ros"

@@ -9,7 +9,6 @@ from contextlib import closing, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -38,32 +37,26 @@ class Sequence(Protocol):
     @property
     def name(self) -> str:
         """Short name, for reports and file names."""
-        ...
 
     @property
     def format(self) -> str:
         """Name of the format, see `slam.sequences.formats`."""
-        ...
 
     @property
     def rig(self) -> StereoRig:
         """The two cameras that took the images."""
-        ...
 
     @property
     def kind(self) -> str:
         """Kind of motion, ``"driving"`` or ``"handheld"``: which `slam.models.KINDS` suits."""
-        ...
 
     @property
     def ground_truth(self) -> Trajectory | None:
         """The left camera's true path ``T_world_left`` at the stamps that the format has; None where it has none."""
-        ...
 
     @property
     def warnings(self) -> list[str]:
         """What was found wrong so far, one line each; what iterating finds is added."""
-        ...
 
     def __len__(self) -> int: ...
 
@@ -99,18 +92,22 @@ def said_before() -> Iterator[None]:
         _silent.reset(token)
 
 
+def say(line: str) -> None:
+    """Log a fault, unless it was said before."""
+    if not _silent.get():
+        logger.warning("%s", line)
+
+
 class FaultLog:
-    """Reports faults on the logger ``slam.sequences`` and keeps them in `lines`; a context manager.
+    """Keeps faults in `lines`, one each, and says them unless it is `quiet`; a context manager.
 
     The first few faults of a kind get a line each; the number of the others is reported when the log is closed. A line
-    that is known already (a second pass over the same sequence) is logged again, but kept once. `at_the_end` logs them
-    when the log is closed, and not at all above an error, which is said alone.
+    that is known already (a second pass over the same sequence) is said again, but kept once.
     """
 
-    def __init__(self, lines: list[str], at_the_end: bool = False) -> None:
-        self._lines, self._at_the_end = lines, at_the_end
+    def __init__(self, lines: list[str], quiet: bool = False) -> None:
+        self._lines, self._quiet = lines, quiet
         self._counts: Counter[str] = Counter()
-        self._waiting: list[str] = []
 
     def report(self, kind: str, line: str) -> None:
         """Report one fault; faults of the same `kind` are counted together."""
@@ -122,24 +119,16 @@ class FaultLog:
         line = one_line(line)
         if line not in self._lines:
             self._lines.append(line)
-        self._waiting.append(line)
-        if not self._at_the_end:
-            self._log()
-
-    def _log(self) -> None:
-        for line in self._waiting if not _silent.get() else ():
-            logger.warning("%s", line)
-        self._waiting.clear()
+        if not self._quiet:
+            say(line)
 
     def __enter__(self) -> FaultLog:
         return self
 
-    def __exit__(self, _: type[BaseException] | None, error: BaseException | None, __: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         for what, count in self._counts.items():
             if count > _LINES_PER_KIND:
                 self._keep(f"{what}: {count} in all, {count - _LINES_PER_KIND} not listed")
-        if error is None:
-            self._log()
 
 
 #: An image as it was read, or why it could not be; None where there is none.
@@ -206,10 +195,7 @@ class RecordedSequence:
     __getitem__ = frame
 
     def _read(self, start: int, stop: int) -> Iterator[StereoFrame]:
-        """Decode lazily and sum up repeated faults at the end, also where the caller stops early.
-
-        A left image that cannot be read costs the frame, a right one itself.
-        """
+        """Decode lazily; a left image that cannot be read costs the frame, a right one itself."""
         with FaultLog(self.warnings) as faults, closing(self.decode(start, stop, faults)) as images:
             for index, found in zip(range(start, stop), images):
                 left, right = both(found, self.name)
@@ -246,11 +232,7 @@ def as_used(
 
 
 def read_masks(text: str | None, folder: Path, rig: StereoRig) -> Masks:
-    """The masks by the option ``mask``: one image for both cameras, or two joined by a comma, one perhaps empty.
-
-    Masks are of the images as recorded, before they are turned; names are relative to `folder`. SequenceError where one
-    cannot be read, ConfigurationError where it is of another size than the images, or covers all of them.
-    """
+    """The masks by the option ``mask``: an image, as recorded, for both cameras, or two joined by a comma."""
     if text is None:
         return None, None
     names = text.split(",")

@@ -84,10 +84,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
-    """A finite array of the shape, flat where that is None; CalibrationError where it is missing, none, or too large.
-
-    Numbers may be texts. OpenCV's matrices are ``{rows, cols, data}``.
-    """
+    """A finite array of the shape, flat where that is None, of numbers, texts or OpenCV's ``{rows, cols, data}``."""
     if value is None:
         raise CalibrationError(f"{name} is missing")
     data = value.get("data") if isinstance(value, Mapping) else value
@@ -155,11 +152,7 @@ class Entries:
 
 
 def read_entries(paths: Sequence[Path], images: Size | None, cameras: tuple[str, str] = ("0", "1")) -> Entries:
-    """The entries of one file or two, read by the XML, INI and YAML libraries: OpenCV's reader can crash.
-
-    The size of the images, where it is known, chooses one of several resolutions, `cameras` two of KITTI's.
-    CalibrationError where a file is missing or unreadable.
-    """
+    """The entries of one file or two; the images' size chooses one of a ZED's resolutions, `cameras` two of KITTI's."""
     read = [_read(path, images, cameras) for path in paths]
     return Entries([dict(_flat(root, "", "")) for root, _ in read], read[0][1] if len(read) == 1 else "")
 
@@ -184,7 +177,7 @@ def _read(path: Path, images: Size | None, cameras: tuple[str, str]) -> tuple[Ma
     if path.suffix.lower() in _NO_TEXT:
         raise CalibrationError(f"{path}: no text: write K1, D1, K2, D2, R and T with cv2.FileStorage (docs/guide.md)")
     text = _text(path).strip()
-    if kitti := re.search(rf"^(P|P_rect_0){cameras[0]}[: ]+[^!\[\s]", text, re.MULTILINE):
+    if kitti := re.search(r"^(P|P_rect_0)\d[: ]+[^!\[\s]", text, re.MULTILINE):
         rows = read_kitti(path)
         P = {f"P{side}": rows.get(f"{kitti[1]}{camera}") for side, camera in enumerate(cameras)}
         return P | {"size": rows.get(f"S_rect_0{cameras[0]}")}, "KITTI's"
@@ -228,10 +221,7 @@ def read_kitti(path: Path) -> dict[str, Array]:
 
 
 def read_yaml(path: Path) -> Mapping[str, Any]:
-    """The mapping in a YAML (or JSON) file, all values as texts; CalibrationError where there is none, or too much.
-
-    OpenCV's dialect has ``%YAML:1.0`` in its first line, ``.Nan`` and ``.Inf``, and a mark on matrices.
-    """
+    """The mapping in a YAML (or JSON) file, all values as texts; also OpenCV's dialect: ``%YAML:1.0``, ``.Nan``."""
     import yaml
 
     text = _text(path)

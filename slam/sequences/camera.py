@@ -152,10 +152,7 @@ class CameraSequence:
         return devices
 
     def _read(self, devices: list[Any]) -> Pair | None:
-        """The next pair; None where a camera gives none. SequenceError where the two differ in size.
-
-        All are grabbed before any is decoded: so they lie as close together in time as they can.
-        """
+        """The next pair, both grabbed before any is decoded, to be close in time; None where a camera gives none."""
         if not devices or not all([device.grab() for device in devices]):
             return None
         stamp = self._origin + time.monotonic()

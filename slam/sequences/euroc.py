@@ -14,7 +14,7 @@ from slam.sequences.names import stem
 from slam.sequences.options import Options
 from slam.sequences.pairs import Listing, image_names, in_order, listed, open_images, told_times
 from slam.sequences.rigs import EUROC, body_pose, calibration_files, files_in, first_complete, read_rig
-from slam.sequences.tables import MOST_NANOSECONDS, read_rows, require_truth, shorten
+from slam.sequences.tables import MOST_NANOSECONDS, read_rows, require_truth
 
 #: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
 #: half a metre apart, which makes 2 mrad. The camera's orientation in the vehicle is calibrated to half a degree or so,
@@ -84,9 +84,9 @@ def _stamp_and_name(text: str) -> tuple[int, str]:
     try:
         value = int(stamp)
     except ValueError:
-        raise ValueError(f"{shorten(stamp)} is not a time in whole nanoseconds") from None
+        raise ValueError(f"{stamp!r:.40} is not a time in whole nanoseconds") from None
     if not 0 <= value <= MOST_NANOSECONDS:
-        raise ValueError(f"{shorten(stamp)} is no possible time in nanoseconds")
+        raise ValueError(f"{stamp!r:.40} is no possible time in nanoseconds")
     return value, name or f"{stamp}.png"
 
 

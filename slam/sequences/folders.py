@@ -137,11 +137,7 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> tuple[Array, Decoder, Size]:
-    """Times of the frames of two videos, or of one side by side, what decodes them, and the size of a camera's images.
-
-    `rate` [1/s] overrides what videos say of themselves. SequenceError where a file is no readable video, frame sizes
-    or rates differ, or the frame rate is not known.
-    """
+    """Times of the frames of two videos, or of one side by side, what decodes them, and an image's size."""
     counts, images, rates = zip(*(_beginning(path) for path in paths))
     size = require_same_size(*both(images, paths[0]), *paths)
     if rate is None and abs(rates[0] - rates[-1]) * min(counts) > 0.5 * rates[0]:  # more than half a frame in the end
@@ -157,10 +153,7 @@ def _open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> tup
 
 
 def _decode_videos(paths: list[Path], count: int, start: int, stop: int, faults: FaultLog) -> Images:
-    """The frames of videos; one that ends too early ends the sequence with a line.
-
-    A video cannot be entered in the middle without errors, so what is skipped is passed over, though not converted.
-    """
+    """The frames of videos, which cannot be entered in the middle; one that ends too early ends the sequence."""
     with ExitStack() as stack:
         videos = [stack.enter_context(_open_video(path)) for path in paths]
         with quiet_libraries():

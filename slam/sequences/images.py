@@ -8,7 +8,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -110,14 +110,11 @@ def grabbed_image(capture: Any) -> np.ndarray | None:
     """The image that a ``cv2.VideoCapture`` has grabbed, in grey (H, W), 8 or 16 bits as stored; None for none."""
     import cv2
 
-    try:
-        with quiet_libraries():
-            good, image = capture.retrieve()
-    except cv2.error:
-        return None
-    if not good or image is None or image.size == 0:
-        return None
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    with quiet_libraries(), suppress(cv2.error):
+        good, image = capture.retrieve()
+        if good and image is not None and image.size:
+            return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    return None
 
 
 def require_image_size(found: Size, expected: Size | None, what: str) -> None:
@@ -134,10 +131,7 @@ def recorded_size(rig: StereoRig) -> Size:
 
 
 def both(images: Sequence[Any], what: object) -> tuple[Any, Any]:
-    """The left and the right image of two, or of one (H, 2W) that holds them side by side; what is no image stands.
-
-    SequenceError where the width of one for both is odd.
-    """
+    """The left and the right image of two, or of one (H, 2W) that holds them side by side; what is no image stands."""
     if len(images) == 2:
         return images[0], images[1]
     (image,) = images

@@ -21,7 +21,7 @@ from slam.sequences.names import stem
 from slam.sequences.options import Options
 from slam.sequences.pairs import Times, image_names, listed, open_images, told_times
 from slam.sequences.rigs import calibration_files, projection_offset, read_rig, rigid
-from slam.sequences.tables import date_time, numbers, read_rows, require_truth, shorten
+from slam.sequences.tables import date_time, numbers, read_rows, require_truth
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 2 cm, 0.03° in roll and pitch, and 0.1°
 #: in heading, which changes slowly. That, and how the camera stands to the unit, is left to be found.
@@ -65,16 +65,11 @@ def matches_drive(folder: Path) -> bool:
 
 
 def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
-    """Open one sequence of KITTI odometry, or of KITTI tracking."""
-    return _open(folder, _tracking(folder) if _is_tracking(folder) else _odometry(folder), options, faults)
-
-
-def open_drive(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
-    """Open one drive of KITTI raw or KITTI-360; stamps count from its first row of times."""
-    return _open(folder, _drive(folder), options, faults)
-
-
-def _open(folder: Path, where: Layout, options: Options, faults: FaultLog) -> RecordedSequence:
+    """Open one sequence of KITTI odometry, KITTI tracking, KITTI raw or KITTI-360."""
+    if matches_drive(folder):
+        where = _drive(folder)
+    else:
+        where = _tracking(folder) if _is_tracking(folder) else _odometry(folder)
     sides = listed(where.folders, [image_names(images) for images in where.folders], faults)
     origin = None
     if where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options):
@@ -153,12 +148,7 @@ def _reference(where: Layout) -> Array:
 
 
 def _truth(where: Layout, origin: int | None, by_number: dict[int, float], faults: FaultLog) -> Trajectory | None:
-    """The left camera's path at the stamps of the frames `by_number`.
-
-    Of drives by the OXTS records, where the world is the left camera's first frame; KITTI-360 has poses of the
-    rectified left camera. Else by rows of 12, one for each frame number, of the reference camera, of a drive of the
-    rectified left one. `origin` is the time of stamp zero [ns since 1970], None where it is not known.
-    """
+    """The left camera's path at the frames' stamps `by_number`; `origin` is stamp zero [ns since 1970], if known."""
     grey = where.cameras[0] == "0"
     if where.drive is not None:
         drive = where.drive
@@ -187,11 +177,7 @@ def _truth(where: Layout, origin: int | None, by_number: dict[int, float], fault
 
 
 def read_oxts(folder: Path, origin: int | None, frame_stamps: dict[int, float], faults: FaultLog) -> Trajectory:
-    """Poses ``T_world_imu`` of the records ``data/NUMBER.txt``; the world's origin is the first record's position.
-
-    Stamps come from ``timestamps.txt`` [s since `origin`, ns since 1970]; where it or `origin` is missing, a record
-    has the stamp of the frame of its number. SequenceError where no record is readable and has a stamp.
-    """
+    """Poses ``T_world_imu`` of the records ``data/NUMBER.txt``, timed by ``timestamps.txt`` or the frames."""
     stamps, rows = frame_stamps, []
     if origin is not None and (folder / "timestamps.txt").exists():
         dates = read_rows(folder / "timestamps.txt", date_time, faults)
@@ -234,7 +220,7 @@ def _record(text: str) -> list[float]:
     """The first six numbers of an OXTS record."""
     row = numbers(text, 6, _OXTS)
     if abs(row[0]) >= 90 or max(map(abs, (row[1], *row[3:]))) > 360:
-        raise ValueError(f"{shorten(text)} is not {_OXTS}")
+        raise ValueError(f"{text!r:.40} is not {_OXTS}")
     return row
 
 

@@ -63,10 +63,7 @@ class Times(NamedTuple):
 def open_images(
     sides: list[Listing], options: Options, faults: FaultLog, times: Times | None = None, by_number: bool = False
 ) -> tuple[Pairs, Decoder, Size]:
-    """Pair image files, see `pair_up`: which make a frame, what decodes them, and the size of a camera's images.
-
-    SequenceError where no pair can be read, or the two images of the first one that can differ in size.
-    """
+    """Pair image files, see `pair_up`: which make a frame, what decodes them, and the size of a camera's images."""
     pairs = pair_up(sides, options, faults, times, by_number)
     frames = [
         [None if row < 0 else side.folder / side.names[row] for side, row in zip(sides, rows)]
@@ -103,10 +100,7 @@ def image_names(folder: Path) -> list[str]:
 
 
 def listed(folders: list[Path], names: list[list[str]], faults: FaultLog) -> list[Listing]:
-    """The images of one camera or two by what their names say: stamps, else numbers, else their order.
-
-    SequenceError where a camera has no images, or where only their order is left and the cameras have unequally many.
-    """
+    """The images of one camera or two by what their names say: stamps, else numbers, else their order."""
     names = [_alike(folder, own, faults) for folder, own in zip(folders, names)]
     found = keys_of(names)
     if found is None:
@@ -198,10 +192,7 @@ def pair_up(
 
 
 def _partners(left: Listing, right: Listing, options: Options, told: bool, faults: FaultLog) -> IntArray:
-    """Rows (N, 2) of the images that make a frame, see `pair_up`; `told` where a file or a rate tells the time.
-
-    Numbers must be the same. Stamps may be `_TOLERANCE` and half a frame apart, if time is told half a frame.
-    """
+    """Rows (N, 2) of the images that make a frame, see `pair_up`; `told` where a file or a rate tells the time."""
     tolerance = 0
     if left.stamped:
         half = float(np.median(np.diff(left.keys))) / 2 if len(left) > 1 else _TOLERANCE

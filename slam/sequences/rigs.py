@@ -175,7 +175,7 @@ def _rig(entries: Entries, images: Size | None, unit: float, rectified: bool, fi
     return StereoRig.side_by_side(left, right, R, b)
 
 
-def _rectified(projections: list[Array], size: Size) -> StereoRig:
+def _rectified(projections: Sequence[Array], size: Size) -> StereoRig:
     """The rig of two rectified projections ``P = K [I | t]`` (3, 4) [m] from one frame of reference."""
     offsets = [projection_offset(P) for P in projections]
     b = offsets[1] - offsets[0]
@@ -232,7 +232,7 @@ def _extrinsics(entries: Entries, unit: float) -> Array | None:
     return None if P is None else pose(right.T @ left, right.T @ (projection_offset(P[1]) - projection_offset(P[0])))
 
 
-def _projections(entries: Entries, unit: float) -> list[Array] | None:
+def _projections(entries: Entries, unit: float) -> Sequence[Array] | None:
     """Both projections (3, 4) [m], perhaps by five numbers of a rectified pair of equal cameras; None for neither."""
     P = [entries.numbers("P", side, (3, 4)) for side in (0, 1)]
     found = [own * [1, 1, 1, unit] for own in P if own is not None]

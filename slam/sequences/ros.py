@@ -28,8 +28,6 @@ from slam.sequences.ros_bag import COMPRESSED, DEPTH, INFO, RAW, Bag, open_bag
 #: Endings of files, in lower case.
 SUFFIXES = (".bag", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 
-_METADATA, _ROS_2, _BEGINNING = "metadata.yaml", b"rosbag2_bagfile_information", 4096
-
 _LATEST = 10**9  # [ns] that a message is late; more is a wrong stamp, or the clock
 _AROUND = 5  # messages whose median says how far the recording's clock is ahead of the camera's
 _SAME_PLACE = 1e-6  # [m] from a pair's left camera
@@ -40,10 +38,7 @@ def matches_folder(path: Path) -> bool:
     """Whether a path is a ROS recording by its ending or, for a folder, by its ``metadata.yaml``."""
     if not path.is_dir():
         return path.name.lower().endswith(SUFFIXES) and path.is_file()
-    metadata = path / _METADATA
-    return metadata.is_file() and (
-        any(file.name.endswith(SUFFIXES) for file in path.iterdir()) or _ROS_2 in metadata.read_bytes()[:_BEGINNING]
-    )
+    return (path / "metadata.yaml").is_file() and any(file.name.endswith(SUFFIXES) for file in path.iterdir())
 
 
 def open_folder(path: Path, options: Options, faults: FaultLog) -> RecordedSequence:
@@ -152,11 +147,7 @@ def _usual(ahead: IntArray, start: int) -> float:
 
 
 def _image_topics(bag: Bag, options: Mapping[str, Any]) -> list[str]:
-    """The topics of the left and the right images by options, or those of the only pair; one of both side by side.
-
-    Depth images do not count. SequenceError where a topic is not there, or there is not exactly one pair;
-    ConfigurationError where one of the two is named and the other is not, or both are the same.
-    """
+    """The topics of left and right images, or the one of both side by side, by options or those of the only pair."""
     sides = ("left",) if options.get("layout") is not None else ("left", "right")
     there = bag.topics(RAW, COMPRESSED)
     if any(side in options for side in sides):
@@ -192,11 +183,7 @@ def _image_topics(bag: Bag, options: Mapping[str, Any]) -> list[str]:
 
 
 def _rig_of_topics(bag: Bag, images: list[str], size: Size, options: Mapping[str, Any]) -> StereoRig:
-    """The rig by the CameraInfo messages of the images, of a size: of the rectified images, or of the raw ones.
-
-    CalibrationError where there are none, a camera is not calibrated, or not as one of a pair, or the rig is
-    impossible; SequenceError where it is for images of another size.
-    """
+    """The rig by the CameraInfo messages of the images, of a size: of the rectified images, or of the raw ones."""
     topics = [f"{_split(topic)[0]}/camera_info" for topic in images]
     for topic, image in zip(topics, images):
         if bag.kinds.get(topic) != INFO:
@@ -206,7 +193,7 @@ def _rig_of_topics(bag: Bag, images: list[str], size: Size, options: Mapping[str
     rectified = options.get("rectified", all("rect" in _split(topic)[1] for topic in images))
     with naming(where):
         for side, info in zip(("left", "right"), infos):
-            if not (info["projectionmatrix"][1][0, 0] > 0 and info["cameramatrix"][1][0, 0] > 0):
+            if not (info["p"][1][0] > 0 and info["k"][1][0] > 0):
                 raise CalibrationError(f"the {side} camera is not calibrated: K or P is zero")
         if infos[0]["size"][1] != infos[1]["size"][1]:
             raise CalibrationError("the images of the two cameras differ in size")
@@ -214,19 +201,16 @@ def _rig_of_topics(bag: Bag, images: list[str], size: Size, options: Mapping[str
 
 
 def _pairs_by_messages(bag: Bag, images: list[str]) -> list[tuple[str, str]]:
-    """All pairs of cameras whose CameraInfo says that they are one.
-
-    They have the same size and focal length of the rectified images, and a baseline in the right one's projection.
-    """
+    """Cameras of one size and focal length whose CameraInfo has a baseline in the right one's projection."""
     cameras: dict[str, tuple[str, object, float]] = {}  # by name space: topic, what is equal in a pair, place [m]
     for topic in images:
         space = _split(topic)[0]
         name = f"{space}/camera_info"
         if space not in cameras and bag.kinds.get(name) == INFO and bag.first(name) is not None:
             info = bag.camera_info(name)
-            P = info["projectionmatrix"][1]
-            if P[0, 0] > 0:
-                cameras[space] = topic, (info["size"][1], P[0, 0]), -P[0, 3] / P[0, 0]
+            P = info["p"][1]  # fx, 0, cx, -fx times its place, …
+            if P[0] > 0:
+                cameras[space] = topic, (info["size"][1], P[0]), -P[3] / P[0]
     return [
         (left, right)
         for left, a, at_left in cameras.values()
