@@ -25,9 +25,14 @@ from slam.sequences.options import RECORDED, Options, read_options
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
-_PACKED = (".zip", ".7z", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4")  # files of one or more others
+#: What to do with files that are no sequence, by their endings.
+_HINTS = {
+    **dict.fromkeys((".zip", ".7z", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4"), "unpack it first"),
+    **dict.fromkeys((".svo", ".svo2"), "export it as a video of both images side by side"),
+    **dict.fromkeys(IMAGE_SUFFIXES, "give the folder that holds both cameras' images"),
+}
 _LOOKED_AT = 500  # entries below a folder that is no sequence, at each of so many levels
-_LEVELS = 3
+_LEVELS = 4
 _LISTED = 6  # sequences below a folder
 
 
@@ -166,8 +171,9 @@ def _format_asked(folder: Path, query: str, text: str) -> str | None:
         what = "file or folder" if folder.suffix else "folder"
         raise SequenceError(f"{folder}: there is no such {what}{_hint_name(folder, text)}")
     if not folder.is_dir() and "layout" not in named:
-        hint = "; unpack it first" if folder.suffix.lower() in _PACKED else _hint_run(folder.parent)
-        if folder.suffix.lower() in VIDEO_SUFFIXES:
+        ending = folder.suffix.lower()
+        hint = f"; {_HINTS[ending]}" if ending in _HINTS else _hint_run(folder.parent)
+        if ending in VIDEO_SUFFIXES:
             two = f"two are {folder.parent}?left=…&right=…"
             hint = f"; a video with both images side by side is {folder}?layout=sbs, {two}"
         raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}")

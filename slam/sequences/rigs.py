@@ -19,9 +19,10 @@ from slam.sequences.calibration import Entries, array, naming, plain_name, read_
 from slam.sequences.images import Size, recorded_size, size_text
 from slam.sequences.options import value_of
 
+_ENDINGS = (".yaml", ".yml", ".xml", ".json", ".conf")
 _USUAL = (
     *((stem + end,) for stem, end in product(
-        ("calibration", "calib", "stereo", "camchain"), (".yaml", ".yml", ".xml", ".json", ".conf"))),
+        ("calibration", "calib", "stereo", "camchain"), _ENDINGS)),
     *((a + end, b + end) for (a, b), end in product(
         (("intrinsics", "extrinsics"), ("left", "right")), (".yaml", ".yml"))),
     ("calib.txt",), ("calib_cam_to_cam.txt",),
@@ -101,6 +102,11 @@ def rig_of(entries: Entries, source: Path, size: Size | None, options: Mapping[s
         if given and entries.form:
             raise ConfigurationError(f"option {name!r} does nothing with {source}, which is {entries.form}")
     with naming(source):
+        if "unit" not in options and not entries.form and (named := entries.find("unit")):
+            try:
+                unit = value_of("unit", str(named[1]).strip())
+            except ConfigurationError as error:
+                raise CalibrationError(str(error)) from None
         rig = _rig(entries, size, unit, rectified, fisheye)
     expected = recorded_size(rig)
     if size not in (None, expected):
@@ -124,7 +130,7 @@ def calibration_files(folder: Path, options: Mapping[str, Any], own: Sequence[Se
     files = first_complete([*own, *files_in(folder, _USUAL)])
     if not files:
         first = next(path for path in (own[0] if own else [folder / "calibration.yaml"]) if not path.is_file())
-        others = sorted(path.name for path in folder.iterdir() if path.suffix in (".yaml", ".yml", ".xml", ".json"))
+        others = sorted(path.name for path in folder.iterdir() if path.suffix in _ENDINGS)
         hint = f"; is it {', '.join(others[:3])}?" if others else ""
         raise CalibrationError(f"{first}: the calibration is missing: add calibration=FILE{hint}")
     return files
@@ -245,12 +251,14 @@ def _projections(entries: Entries, unit: float) -> Sequence[Array] | None:
     if not any(entries.find(role, side) for role in _FOUR) and not entries.find(last):
         return None
     try:
-        fx, fy, cx, cy, length = (*(entries.number(role, side) for role in _FOUR), entries.number(last))
+        (fx, _, cx), (_, fy, cy) = _matrix(entries, side)[:2].tolist()
+        length = entries.number(last)
         if min(fx, fy, length) <= 0:
             raise CalibrationError(f"fx, fy and {last} must be positive")
     except CalibrationError as error:
         raise CalibrationError(f"{error} (a rectified pair needs fx, fy, cx, cy in pixels and baseline)") from None
-    if any(entries.number(role, side, 0.0) for role in _COEFFICIENTS):
+    D = entries.numbers("D", side, None)
+    if any(entries.number(role, side, 0.0) for role in _COEFFICIENTS) or (D is not None and D.any()):
         raise CalibrationError("names distortion, but only one camera: images of five numbers are rectified")
     left: Array = np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]])
     right = left.copy()
@@ -283,7 +291,7 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
     return PinholeCamera.from_matrix(K, D if D.any() or fisheye else None, size, fisheye)
 
 
-def _matrix(entries: Entries, side: int) -> Array:
+def _matrix(entries: Entries, side: int | None) -> Array:
     """A camera matrix (3, 3), by its own entry or by four numbers."""
     name, _ = entries.find("K", side) or ("K", None)
     values = entries.numbers("K", side, None)

@@ -133,6 +133,8 @@ def test_a_rectified_pair_by_five_numbers_and_what_is_wrong_with_them(tmp_path: 
     with pytest.raises(CalibrationError, match="names distortion, but only one camera"):
         slam.load_rig(file, size=SIZE)
     for text, words in (
+        ("K: [50, 0, 31, 0, 50, 23, 0, 0, 1]\nD: [0.1, 0, 0, 0]\nbaseline: 0.2\n", "names distortion, but only one"),
+        ("fx: 50\nfy: 50\ncx: 31\ncy: 23\nbaseline: 7.9\nunit: inch\n", "unit must be m or cm or mm, got 'inch'"),
         ("fx: true\ncx: wide\n", r"fx is no number \(a rectified pair needs fx, fy, cx, cy in pixels and baseline\)"),
         ("fx: 50\nfy: 50\ncx: .inf\n", "cx is not finite"),
         ("fx: 50\nfy: 50\ncx: 1\ncy: 1\n", "baseline is missing"),
@@ -156,6 +158,7 @@ SIDES = ("left", "right")
         {"mtxL": M, "distL": [[0] * 5], "mtxR": M, "rot": EYE, "trans": [[-0.2], [0], [0]]},
         {key: {**FLAT, "coeffs": [0] * 5, "model": "distortion.none"} for key in SIDES} | {"baseline": 0.2},
         {"f": 50, "cu": 31.5, "cv": 23.5, "base": 0.2},
+        {"K": M, "D": [0] * 5, "b": 20, "unit": "cm"},
         {"FX_px": 50, "FY_px": 51, "CX_px": 31.5, "CY_px": 23.5, "Baseline_m": 0.2},
     ],
 )

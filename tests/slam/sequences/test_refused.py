@@ -172,7 +172,11 @@ def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
     lines = (kitti / "calib.txt").read_text().splitlines()
     for row in ("P1: 0 0 0 0 0 0 0 0 0 0 0 0", "P1: 50 1 31.5 -25 0 50 23.5 0 0 0 1 0", "P1: 1 2 3"):
         (kitti / "calib.txt").write_text("\n".join([lines[0], row]))
-        refused(kitti, CalibrationError, r"calib\.txt: (not a rectified projection|P1 is no matrix of shape)|holds no baseline")
+        refused(
+            kitti,
+            CalibrationError,
+            r"calib\.txt: (not a rectified projection|P1 is no matrix of shape)|holds no baseline",
+        )
 
 
 def test_lists_that_are_none_are_named_with_the_row(euroc, kitti, raw, two_folders):
