@@ -102,7 +102,7 @@ def rig_of(entries: Entries, source: Path, size: Size | None, options: Mapping[s
         if given and entries.form:
             raise ConfigurationError(f"option {name!r} does nothing with {source}, which is {entries.form}")
     with naming(source):
-        if "unit" not in options and not entries.form and (named := entries.find("unit")):
+        if unit == 1 and not entries.form and (named := entries.find("unit")):
             try:
                 unit = value_of("unit", str(named[1]).strip())
             except ConfigurationError as error:
