@@ -150,9 +150,10 @@ class InputWarnings:
                 f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
             )
             self._warn(_swapped(own) if own.swapped else same)
-        elif not self._pair_is_right and len(self._before) == _SHIFTS and own.shown < 1:
-            self._pair_warned = True  # hardly a feature fits then, and of another moment's some may by chance
-            self._warn(_rows_differ(own, self._rig))
+        elif not self._pair_is_right and self._before and own.shown < 1:
+            if len(self._before) == _SHIFTS:  # hardly a feature fits then, and of another moment's some may by chance
+                self._pair_warned = True
+                self._warn(_rows_differ(own, self._rig))
         elif self._before and (not self._moment_is_right or own.as_given < _FITS * own.matches):
             self._check_moment(images, own)
         self._partners_explained |= self._pair_warned  # the reason is known then

@@ -73,8 +73,10 @@ def _decode(
         for frame in rows[start:stop].tolist()
     ]
     wanted = {place for frame in frames for place in frame if place}
-    since = min(int(recorded[topic][row]) for topic, row in wanted)
-    counts = {topic: int(np.searchsorted(times, since)) for topic, times in recorded.items()}
+    since, counts = None, dict.fromkeys(recorded, 0)  # where to begin, and each topic's first row there
+    if all((np.diff(times) >= 0).all() for times in recorded.values()):
+        since = min(int(recorded[topic][row]) for topic, row in wanted)
+        counts = {topic: int(np.searchsorted(times, since)) for topic, times in recorded.items()}
     ahead: dict[tuple[str, int], bytes] = {}  # read before their turn, where messages are out of order
     with open_bag(path) as bag:
         messages = bag.messages(counts, since)
@@ -87,10 +89,7 @@ def _decode(
                     ahead[topic, counts[topic]] = data
                 counts[topic] += 1
             yield tuple(
-                attempt(bag.image, place[0], ahead.pop(place), f"{place[0]}, message {place[1]}", size)
-                if place
-                else None
-                for place in frame
+                None if place is None else attempt(bag.image, *place, ahead.pop(place), size) for place in frame
             )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from slam.errors import CalibrationError, SequenceError, SlamError, one_line, text_of
+from slam.sequences.base import attempt
 from slam.sequences.calibration import Entry, array, naming
 from slam.sequences.images import Size, decode_image, require_image_size, size_text
 
@@ -104,20 +105,19 @@ class Bag:
         """A message as an object."""
         return self._reader.deserialize(data, self.kinds[topic])
 
-    def image(self, topic: str, data: bytes, what: str, size: Size | None = None) -> np.ndarray:
-        """The image (H, W) of a message, see `grey_image`."""
+    def image(self, topic: str, row: int, data: bytes, size: Size | None = None) -> np.ndarray:
+        """The image (H, W) of a topic's message by its number, see `grey_image`."""
         with _one_line(self.path):
-            return grey_image(self.read(topic, data), self.kinds[topic], what, size)
+            return grey_image(self.read(topic, data), self.kinds[topic], f"{topic}, message {row}", size)
 
     def first_image(self, topic: str) -> np.ndarray:
         """The first image (H, W) of a topic that can be read; SequenceError where none can."""
-        reason = "no messages"
-        for _, _, data in self.messages([topic]):
-            try:
-                return self.image(topic, data, topic)
-            except SequenceError as error:
-                reason = str(error)
-        raise SequenceError(f"{self.path}: no image of {topic} can be read: {reason}")
+        image = None
+        for row, (_, _, data) in enumerate(self.messages([topic])):
+            image = attempt(self.image, topic, row, data)
+            if isinstance(image, np.ndarray):
+                return image
+        raise SequenceError(f"{self.path}: no image of {topic} can be read: {image}")
 
     def first(self, topic: str) -> Any:
         """The first message of a topic as an object; None where there is none."""
