@@ -176,7 +176,8 @@ def run_command(
             watches.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
-            print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
+            what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
+            print(f"slam: loading; then frames {what} Ctrl-C ends the run", file=sys.stderr)
         end_of_frame = stack.enter_context(whole_frames(tell, folder, until))
         summary = run(opened, options, end_of_frame, watches=watches, until=until, record=gathered)
     finish(summary, written, picture, quiet)

@@ -19,7 +19,7 @@ from slam.errors import ConfigurationError, UnknownNameError
 from slam.files import read_object
 from slam.naming import unknown
 from slam.runtime.threads import available_cores
-from slam.sequences.faults import said_before
+from slam.sequences.base import said_before
 from slam.settings import require_settable
 
 _MOST_WORKERS = 1024

@@ -29,7 +29,7 @@ from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder, write_json
 from slam.run.repeat import changed_versions, running_code
 from slam.sequences import open_sequence
-from slam.sequences.faults import said_before
+from slam.sequences.base import said_before
 
 RUNS, SWEEP = "runs", "sweep.json"
 

@@ -28,7 +28,7 @@ from slam.run.results import figures
 from slam.run.runner import run, run_recording
 from slam.run.summary import RunRecord
 from slam.sequences import Sequence, open_sequence
-from slam.sequences.faults import said_before
+from slam.sequences.base import said_before
 from slam.worlds import WorldSequence
 
 RESULT, RECORDING = "result.json", "recording.npz"
