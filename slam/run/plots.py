@@ -325,7 +325,7 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
-    title = "Error of the online pose (solid), claimed σ (dashed)"
+    title = "Online error since the start (solid), claimed σ (dashed)"
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
     axes[-1].set_xlabel("time [s]")
     if len(runs) > 1:  # in the room above all lines

@@ -31,6 +31,7 @@ class RunData:
     name: str  # shown in the pictures
     online: Trajectory
     final: Trajectory
+    ids: np.ndarray  # of landmarks (N,)
     positions: Array  # of landmarks (N, 3) [m]
     covariances: Array  # of these (N, 3, 3) [m²]
     seen_last: np.ndarray  # which landmarks were measured in the last frame (N,)
@@ -84,6 +85,7 @@ class RunData:
             name=printable(name),
             online=Trajectory.read_tum(folder / "trajectory.txt"),
             final=final,
+            ids=_numbers(landmarks, ("id",))[:, 0].astype(np.int64),
             positions=_numbers(landmarks, ("x", "y", "z")),
             covariances=upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
             seen_last=last_seen == int(frames[-1]["frame"]),

@@ -261,10 +261,8 @@ class _Run:
                 if (pairs := with_truth(record.trajectory, sequence)) is not None:
                     write_trajectory(out / "truth.txt", pairs[1])
             with self._each():
-                files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
-            with self._each():
-                if isinstance(system, StereoSlam) and system.landmarks is not None:
-                    files.write_old_landmarks(system.atlas, system.landmarks.ids)
+                atlas = system.atlas if isinstance(system, StereoSlam) else None
+                files.write_landmarks(system.estimate(), record.seen, record.last_seen, atlas)
             with self._each():
                 summary |= results_of(sequence, system, record, final, score)
         summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # nothing else is random

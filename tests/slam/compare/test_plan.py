@@ -71,13 +71,14 @@ def test_the_time_of_a_comparison_is_told_by_its_first_frames(monkeypatch):
     """It was told by a time of a frame from another machine."""
     tried = []
 
-    def run_alone(trial, folder):
+    def run_jobs(jobs, workers, told):
+        ((trial, folder, _),) = jobs
         tried.append(trial)
         times = {"outcome": outcome, "milliseconds": {"total": 100.0, "read": 60.0, "extract": 20.0}}
         (folder / "result.json").write_text(json.dumps(times))
 
     outcome = "completed"
-    monkeypatch.setattr(command, "run_alone", run_alone)
+    monkeypatch.setattr(command, "run_jobs", run_jobs)
     plan = Plan(("synthetic:aisle", "/data"), ("ekf", "window"), trials=3)
     frames = {"synthetic:aisle": 50, "/data": 40}
     whole = 2 * (3 * 50 + 40) * (0.1 + 0.02)  # replay: without images

@@ -21,7 +21,7 @@ from slam.compare.sweep import KILLED, RUNS, SWEEP, sweep
 from slam.compare.tables import groups, write_tables
 from slam.compare.trial import keep_result, run_trial
 from slam.errors import SlamError
-from slam.run.results import BY_KEY, COMPARED
+from slam.run.results import COMPARED
 
 pytestmark = pytest.mark.slow  # all share one sweep
 
@@ -169,7 +169,7 @@ def test_a_failed_run_is_counted_never_dropped(again):
     runs = swept(again, 1)
     group = groups(PLAN, runs)[0]
     assert (group.failures("ekf"), group.failures("smoother")) == (0, 1)
-    d = group.differences(BY_KEY["ate_online_m"])["smoother"]
+    d = group.compared["ate_online_m"]["smoother"]
     assert (d.pairs, d.missing) == (1, 1)
     text = write_report(PLAN, groups(PLAN, runs), runs, again, "here").read_text()
     assert "1 of 8 runs failed" in text
@@ -182,7 +182,7 @@ def test_bad_input_of_a_trial_is_an_outcome(tmp_path):
     run_trial(trial, tmp_path / "one")
     result = json.loads((tmp_path / "one" / "result.json").read_text())
     assert result["outcome"].startswith("failed: SlamError")
-    assert result["metrics"] == {}
+    assert result["metrics"] == {"completed": 0.0}
 
 
 def test_a_folder_with_other_runs_is_left_alone(again):
