@@ -52,12 +52,14 @@ class Metric:
 
 
 def number(value: float, like: float | None = None) -> str:
-    """A number with the digits that show three of `like`, or of itself, six behind the point at most; else a dash."""
+    """Three digits, or as many behind the point as show three of `like`, six at most; a dash where there is no number."""
     if not np.isfinite(value):
         return "–"
-    like = abs(value if like is None else like)
-    digits = min(6, max(0, 2 - int(np.floor(np.log10(like))))) if like else 0
-    return f"{value:.{digits}f}".replace("-", "−")
+    if not like:
+        text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    else:
+        text = f"{value:.{min(6, max(0, 2 - int(np.floor(np.log10(abs(like))))))}f}"
+    return text.replace("-", "−")
 
 
 #: In the order of all tables. Times are not compared: they differ from run to run.

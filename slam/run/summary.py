@@ -97,7 +97,6 @@ class Replayed:
 
     recording: Recording
     backend: Backend
-    record: RunRecord
 
     def trajectory(self) -> Trajectory:
         """The back end's final estimate of every frame's pose."""

@@ -87,17 +87,6 @@ def test_a_prior_map_is_found_again(here):
     assert (here / "second/trajectory.txt").read_bytes() == (here / "third/trajectory.txt").read_bytes()
 
 
-def test_all_that_a_run_writes_is_named(here):
-    words = ["--record", "a.npz", "--save-map", "a.map", "--draw", "drawn", "--out", "first", "--no-picture"]
-    assert "Files: first, a.npz, a.map, drawn" in slam("run", WORLD, "--frames", "0:2", *words)
-    assert all((here / name).exists() for name in ("first", "a.npz", "a.map", "drawn"))
-
-
-def test_the_list_says_what_each_back_end_is():
-    printed = " ".join(slam("list").split())
-    assert "ekf Extended Kalman filter" in printed and "batch Levenberg-Marquardt" in printed
-
-
 GOOD = {"frames": [0, None], "settings": {}, "frontend": "surf", "backend": "ekf"}
 
 

@@ -11,7 +11,7 @@ from slam.compare.statistics import fewest
 from slam.compare.sweep import check
 from slam.compare.tables import most_tests
 from slam.compare.wording import caution
-from slam.errors import ConfigurationError, UnknownNameError
+from slam.errors import ConfigurationError
 
 WORLDS = ("synthetic:aisle?frames=30", "synthetic:box")
 
@@ -44,16 +44,6 @@ def test_trials_are_paired_and_have_folders_of_their_own():
 def test_bad_plans(arguments, word):
     with pytest.raises(ConfigurationError, match=word):
         Plan(*arguments)
-
-
-def test_a_mistyped_front_end_is_answered_with_all_of_them():
-    with pytest.raises(UnknownNameError, match=r"'simulatd' \(did you mean 'simulated'\?\); known: surf, simulated"):
-        variants_of(["simulatd"], [], [])
-
-
-def test_no_more_workers_than_anybody_has(tmp_path):
-    with pytest.raises(ConfigurationError, match="at most 1024 workers"):
-        compare(Plan(("synthetic:desk",), ("ekf",)), tmp_path, workers=10**9)
 
 
 def test_back_ends_without_commas_are_told_how_they_are_given(tmp_path):

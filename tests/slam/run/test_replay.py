@@ -8,11 +8,10 @@ import pytest
 
 import slam
 from experiments.simulated_recording import true_recording
-from slam.atlas.map_io import load_map
 from slam.calibration.posterior import RigPosterior
 from slam.config import SystemConfig
 from slam.data import FrameStatus
-from slam.errors import MeasurementError, SequenceError, SlamError
+from slam.errors import MeasurementError, SequenceError
 from slam.run.recording import load_recording, record, save_recording
 from slam.run.replay import replay
 from slam.system import StereoSlam
@@ -152,12 +151,6 @@ def test_a_saved_map_is_told_from_a_recording(tmp_path):
     (tmp_path / "desk.map").write_bytes(b"surf-stereo-slam map 5\n")
     with pytest.raises(SequenceError, match="a saved map, which a run starts in with --map"):
         load_recording(tmp_path / "desk.map")
-
-
-def test_a_folder_for_a_file_is_answered_with_the_file_that_is_expected(tmp_path):
-    for load, words in ((load_recording, "--record FILE.npz"), (load_map, "--save-map FILE")):
-        with pytest.raises(SlamError, match=words):
-            load(tmp_path)
 
 
 def test_recordings_are_checked_when_made(recording):
