@@ -20,7 +20,6 @@ from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
 from slam.run.options import RunOptions, parse_frames
-from slam.run.outcome import nothing_tracked
 from slam.run.plots import leave_picture
 from slam.run.recording import Recording
 from slam.run.repeat import changed_versions, load, versions
@@ -114,7 +113,7 @@ def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, qu
     if summary["tracking"]:
         no_picture = "; no picture: no frame has a pose" if picture and not drawn else ""
         print(f"slam: {summary['tracking']}{no_picture}", file=sys.stderr)
-    if nothing_tracked(summary):
+    if summary["frames"] > 1 and not summary["status"].get("tracked"):
         raise typer.Exit(1)
 
 

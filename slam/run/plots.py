@@ -126,13 +126,16 @@ def drawn(runs: Sequence[RunData], kind: str) -> Figure:
     maps = [f"map {k}" for k in range(len(runs[:_MOST_MAPS] if kind == "summary" else runs))]
     wide = max(10.0, 4.4 * (1 + len(maps))) if kind == "summary" else 5.0 * len(maps) if kind == "map" else 5.2
     below: list[Any] = [["position", "time"], ["rotation", "time"]]
-    rows, heights = {  # names of panels, nested ones with margins of their own, and heights of the rows [in]
+    layouts: dict[
+        str, tuple[list[Any], list[float]]
+    ] = {  # names of panels, nested ones with margins of their own, and heights of the rows [in]
         "summary": ([[[["path", *maps]]], ["key"], [below]], [wide / (1 + len(maps)), 0.5, 4.2]),
         "map": ([maps, ["key"] * len(maps)], [5.0, 0.5]),
         "path": ([["path"]], [4.8]),
         "errors": ([["position"], ["rotation"]], [1.8, 1.8]),
         "time": ([["time"]], [2.6]),
-    }[kind]
+    }
+    rows, heights = layouts[kind]
     lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
     head = "\n".join(textwrap.fill(line, int(_LETTERS * wide)) for line in lines) if kind == "summary" else ""
     with rc_context(_STYLE):

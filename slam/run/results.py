@@ -25,9 +25,7 @@ class Metric:
     key: str  # column of the tables; its end says the unit of the values, if that is another one than `unit`
     label: str  # for people
     unit: str = ""  # in which people see it
-    place: str = (
-        ""  # keys of a summary one below the other; "*": the mean over bodies in view; empty: computed
-    )
+    place: str = ""  # keys of a summary one below the other; "*": the mean over bodies in view; empty: computed
     better: str = ""  # "lower", "higher", "one" (1 is honest; both ways off is worse), or "" (neither)
     shown: str = "compared"  # where: some of "compared", "main" (in a comparison's conclusions), "run", "picture"
 
@@ -52,7 +50,7 @@ class Metric:
 
 
 def number(value: float, like: float | None = None) -> str:
-    """Three digits, or as many behind the point as show three of `like`, six at most; a dash where there is no number."""
+    """Three digits, or as many behind the point as show three of `like`, six at most; a dash for no number."""
     if not np.isfinite(value):
         return "–"
     if not like:

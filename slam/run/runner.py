@@ -129,14 +129,12 @@ class _Run:
     tape: list[RecordedFrame] = field(default_factory=list)
     failures: list[Exception] = field(default_factory=list)  # of the last files
 
-    def processed(
-        self, frames: Iterator[StereoFrame], watches: tuple[Watch, ...]
-    ) -> Iterator[tuple[int, FrameResult]]:
+    def processed(self, frames: Iterator[StereoFrame], watches: tuple[Watch, ...]) -> Iterator[tuple[int, FrameResult]]:
         """Each frame's number and what the system did with it.
 
         A live run's time of reading is one of waiting, and 0.
         """
-        system, record, reading = self.system, self.record, dict[int | None, float]()  # [ms] by number of the frame
+        system, record, reading = self.system, self.record, dict[int, float]()  # [ms] by number of the frame
         assert isinstance(system, StereoSlam)
 
         def timed() -> Iterator[StereoFrame]:
@@ -149,13 +147,13 @@ class _Run:
                 yield frame
 
         for frame, result in system.run(timed()):
-            result.milliseconds["read"] = reading.pop(frame.index)
+            result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
             if self.live is not None:
                 record.ages.append(self.live.age(frame))
             if frame.right is None:
                 record.without_right.append(len(record.statuses))
             record.depths.append(median_depth(result.features, system.rig))
-            yield frame.index, result  # type: ignore[misc]
+            yield frame.index, result
             for watch in watches:
                 watch(frame, result, system)
 
