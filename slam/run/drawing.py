@@ -240,24 +240,25 @@ class FramePictures(ExitStack):
             with naming_folder(file):
                 write_png(file, picture)
         elif self._first is None:
-            self._first = (frame.stamp, picture)
+            self._first = frame.stamp, picture
         else:
             if self._video is None:
-                self._open(1.0 / (frame.stamp - self._first[0]), self._first[1])
+                self._open(1.0 / (frame.stamp - self._first[0]))
             self._video.write(picture)
 
-    def _open(self, rate: float, picture: np.ndarray) -> None:
+    def _open(self, rate: float) -> None:
         """Begin the video with the first picture."""
         import cv2
 
-        size = (picture.shape[1], picture.shape[0])
-        self._video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        assert self._first is not None
+        height, width = self._first[1].shape[:2]
+        self._video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
         if not self._video.isOpened():
             raise SlamError(f"{self.path}: cannot be written")
-        self._video.write(picture)
+        self._video.write(self._first[1])
 
     def _end(self) -> None:
         if self._video is None and self._first is not None:
-            self._open(1.0, self._first[1])
+            self._open(1.0)
         if self._video is not None:
             self._video.release()

@@ -21,18 +21,14 @@ from slam.files import RowFile, lock_folder, reason, remove_file, write_text
 from slam.geometry.se3 import Array, angles, transform
 from slam.geometry.trajectory import Trajectory, tum_line
 from slam.object_data import MovingObject
-from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
+from slam.run.schema import FILES, FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
 
 FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
 
 _ROWS = ("trajectory.txt", "frames.csv", "objects.csv")  # grow frame by frame
-_WHOLE = (
-    "config.json", "schema.json", "trajectory_final.txt", "truth.txt", "landmarks.csv", OLD_LANDMARKS,
-    "summary.json", "summary.png",
-)  # fmt: skip
 
 #: All files that a run leaves in its folder.
-NAMES = (*_ROWS, *_WHOLE)
+NAMES = tuple(FILES)
 
 _NUMBER = r"\s+(?:-?\d[-+.\deE]*|null)"
 _NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\s+\]")  # as json indents them; no text holds a line break
@@ -56,7 +52,7 @@ class RunFiles(ExitStack):
             lock = lock_folder(folder)
             if lock is not None:
                 opened.callback(os.close, lock)
-            for name in _WHOLE:
+            for name in set(NAMES).difference(_ROWS):
                 remove_file(folder / name)
             self._trajectory, self._frames, self._objects = (
                 opened.enter_context(closing(RowFile(folder / name))) for name in _ROWS
