@@ -72,17 +72,6 @@ def test_every_run_is_there_with_its_figures(done):
     assert not any(column.startswith("ms_") for column in rows[0])
 
 
-def test_a_replay_gives_all_back_ends_what_the_first_was_given(done):
-    _, runs = done
-    for seed in range(2):
-        own = [run for run in runs if run.trial.seed == seed]
-        given = next(run for run in own if run.trial.mode == CLOSED_LOOP and run.trial.backend == "ekf")
-        replayed = [run for run in own if run.trial.mode == REPLAY]
-        assert len(replayed) == 2
-        for run in replayed:
-            assert run.metrics["map_size"] == given.metrics["map_size"]
-
-
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_what_a_killed_worker_had_is_run_again_and_leaves_the_same_tables(done, tmp_path):
     ended = []
