@@ -24,9 +24,9 @@ from slam.sequences import open_sequence
 from slam.settings import require_settable
 
 _SIGN = (
-    "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the\n"
-    "calibration's principal point and focal length are too large. Usual: how far good calibrations are off in that\n"
-    "parameter alone; several together may cancel, so that the pixels below say whether it is much."
+    "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the "
+    "calibration's are too large. Usual is how far good calibrations are off in that parameter alone; several together "
+    "may cancel, so the pixels below say whether it is much."
 )
 _NARROW, _COLUMN = 50, 17  # characters of the table, and of each recording's column in it
 _SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}  # what a parameter is multiplied by, and its unit then
@@ -88,7 +88,7 @@ def _print(found: dict[str, Any]) -> None:
             cells.append(f"{apart[k]:.1f} σ" if np.isfinite(apart[k]) else "–")
         table.add_row(row["name"], unit, *cells, f"± {factor * SIGMAS[lens]:.2g}")
     console.print(table)
-    print(_SIGN)
+    console.print(_SIGN, highlight=False)
     for number, one in enumerate(recordings, 1):
         pairs, unsolved = one["pairs"], one["unsolved_pairs"]
         tells = f"{pairs} pairs of views" if pairs else "no pair of views that shows motion: left out"
