@@ -111,8 +111,13 @@ def _killed(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) ->
         idle = [new_pool() for _ in range(min(workers, len(jobs)))]
         while left or running:
             while left and idle:
-                pool, job = idle.pop(), left.popleft()
-                running[pool.submit(run_trial, *job)] = pool, job
+                pool = idle.pop()
+                try:
+                    future = pool.submit(run_trial, *left[0])
+                except BrokenProcessPool:  # its process died when it had no work
+                    idle.append(new_pool())
+                    continue
+                running[future] = pool, left.popleft()
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 pool, job = running.pop(future)
                 error = future.exception()
