@@ -73,40 +73,18 @@ def match_everywhere(
     allowed: BoolArray | None = None,
 ) -> Matches:  # fmt: skip
     """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image, or in pairs `allowed` (M, N)."""
-    best = np.empty(len(descriptors), np.intp)
     allowed = np.ones((0, 0), bool) if allowed is None else np.ascontiguousarray(allowed)
-    mutual_best(
-        descriptors @ features.descriptors.T, allowed, laplacian, features.laplacian, np.float32(d_match),
-        np.float32(ratio), best,
-    )  # fmt: skip
+    products, limits = descriptors @ features.descriptors.T, (np.float32(d_match), np.float32(ratio))
+    best = mutual_best(products, allowed, laplacian, features.laplacian, *limits)
     rows = np.flatnonzero(best >= 0)
     return Matches(rows, best[rows])
 
 
-def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pairs of rows of centres (M, 2) and of pixels (N, 2) within `reach` (M, 2) of them, by ascending centre.
-
-    Pixels are sorted by column, so that few pairs have to be tested.
-    """
-    order = np.argsort(uv[:, 0], kind="stable")
-    boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach), np.ascontiguousarray(uv), order
-    rows, inside = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
-    count = _pairs_in_boxes(*boxes, rows, inside)
-    if count > len(rows):
-        rows, inside = np.empty((2, count), np.intp)
-        _pairs_in_boxes(*boxes, rows, inside)
-    return rows[:count], inside[:count]
-
-
-def crowded(uv: Array, neighbours: Array, radius: float) -> BoolArray:
-    """Which pixels (N, 2) lie within `radius` [px] of any of the `neighbours` (M, 2)."""
-    if not len(neighbours):
-        return np.zeros(len(uv), bool)
-    rows, columns = pairs_in_boxes(uv, np.full((len(uv), 2), radius), neighbours)
-    gap = (uv[rows] - neighbours[columns]).astype(np.float32)
-    out = np.zeros(len(uv), bool)
-    out[rows[np.square(gap).sum(axis=1) < radius * radius]] = True
-    return out
+def pairs_near(centres: Array, reach: float, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pairs of rows of centres (M, 2) and of pixels (N, 2) within `reach` of them either way, by ascending centre."""
+    order = np.argsort(uv[:, 0], kind="stable")  # so that few pairs have to be tested
+    rows, found, count = _pairs_near(np.ascontiguousarray(centres), reach, np.ascontiguousarray(uv), order)
+    return rows[:count], found[:count]
 
 
 @helper
@@ -122,23 +100,31 @@ def first_column(uv, order, low):
     return place
 
 
-@kernel
-def _pairs_in_boxes(centres, reach, uv, order, rows, found):
-    """Pairs of boxes and of pixels inside them, by ascending box; returns how many there are.
+@helper
+def grown(array, room):
+    """A copy with more room."""
+    new = np.empty(room, array.dtype)
+    for k in range(len(array)):
+        new[k] = array[k]
+    return new
 
-    Boxes have centres and half sizes `reach` (M, 2); `order` is that of the columns of the pixels `uv` (N, 2). Pairs
-    are written into `rows` of boxes and those `found` as far as there is room.
-    """
-    count = 0
+
+@kernel
+def _pairs_near(centres, reach, uv, order):
+    """Rows of `pairs_near`, with room for more, and their number; `order` is that of the pixels' columns."""
+    count, room = 0, 8 * len(centres)
+    rows, found = np.empty(room, np.intp), np.empty(room, np.intp)
     for row in range(len(centres)):
-        place, high = first_column(uv, order, centres[row, 0] - reach[row, 0]), centres[row, 0] + reach[row, 0]
+        place, high = first_column(uv, order, centres[row, 0] - reach), centres[row, 0] + reach
         while place < len(order) and uv[order[place], 0] <= high:
-            if abs(uv[order[place], 1] - centres[row, 1]) <= reach[row, 1]:
-                if count < len(rows):
-                    rows[count], found[count] = row, order[place]
+            if abs(uv[order[place], 1] - centres[row, 1]) <= reach:
+                if count == room:
+                    room *= 2
+                    rows, found = grown(rows, room), grown(found, room)
+                rows[count], found[count] = row, order[place]
                 count += 1
             place += 1
-    return count
+    return rows, found, count
 
 
 @helper
@@ -171,18 +157,17 @@ def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, go
 
 
 @kernel
-def mutual_best(products, allowed, signs, feature_signs, d_match, ratio, best):
-    """Features (N,) into `best` that belong to tracks by `best_pairs`, −1 for none, wherever they lie.
+def mutual_best(products, allowed, signs, feature_signs, d_match, ratio):
+    """The features (N,) that belong to tracks by `best_pairs`, −1 for none, wherever they lie.
 
     Given are the inner products of descriptors, tracks by features (N, M), which pairs are `allowed` (N, M; all where
     that is empty), and both signs of the Laplacian.
     """
     limit = d_match / ratio  # farther features affect neither best nor ratio
     least = np.float32(1.0) - np.float32(0.5) * limit * limit
-    count, room = 0, 4 * len(products) + 64
+    best, count, room = np.full(len(products), -1, np.intp), 0, 4 * len(products) + 64
     rows, columns, distance = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.float32)
     for n in range(products.shape[0]):
-        best[n] = -1
         for m in range(products.shape[1]):
             if products[n, m] <= least or signs[n] != feature_signs[m] or (allowed.size > 0 and not allowed[n, m]):
                 continue
@@ -197,6 +182,7 @@ def mutual_best(products, allowed, signs, feature_signs, d_match, ratio, best):
     for p in range(count):
         if good[p] and best[rows[p]] < 0:
             best[rows[p]] = columns[p]
+    return best
 
 
 @helper
@@ -320,12 +306,3 @@ def nearest(points, order, places, radius, looks, place_looks, alike):
             if off < alike * alike:
                 matched[best], gaps[best] = n, least
     return matched
-
-
-@helper
-def grown(array, room):
-    """A copy with more room."""
-    new = np.empty(room, array.dtype)
-    for k in range(len(array)):
-        new[k] = array[k]
-    return new

@@ -7,9 +7,8 @@ from slam.data import StereoFeatures
 from slam.tracks.config import MapConfig
 from slam.tracks.mapper import (
     MapView,
-    doubled_landmarks,
+    duplicates,
     expected_landmarks,
-    features_of_landmarks,
     new_landmarks,
     redundant_landmarks,
     surplus_landmarks,
@@ -132,35 +131,25 @@ def test_out_of_view_the_map_is_thinned_to_the_best_seen():
     assert not redundant_landmarks(unknown, positions, config).any()
 
 
-def seen_from_the_origin(positions, features):
-    return MapView.of(RIG, np.eye(4), np.asarray(positions, float), features, 1.0)
-
-
 def like(features, rows, seen):
     """Landmarks that look like some of the features."""
-    n, none = len(rows), np.zeros(len(rows), np.int64)
+    none = np.zeros(len(rows), np.int64)
     looks, signs = features.descriptors[rows], features.laplacian[rows]
-    return LandmarkTable(np.arange(n), looks, signs, np.asarray(seen), none, none, none)
+    return LandmarkTable(np.arange(len(rows)), looks, signs, np.asarray(seen), none, none, none)
 
 
-def test_a_feature_that_is_a_landmark_already_is_known():
+def test_features_and_landmarks_that_are_a_landmark_already_are_known():
     features = features_at([(100, 100), (200, 100), (250, 50)], depth=3.0)
-    points = RIG.triangulate(features.uv_left, features.uv_right)
-    landmarks = like(features, [0, 1, 1], [1, 1, 1])
+    a, b, c = RIG.triangulate(features.uv_left, features.uv_right)
     # The first: 0.2 m deeper, within the uncertainty of 12 %. The second: as deep, but 20 px away. The third looks
     # like another feature.
-    positions = [points[0] * 1.07, points[1] + [0.2, 0, 0], points[2]]
-    view = seen_from_the_origin(positions, features)
-    assert features_of_landmarks(view, landmarks, features, CONFIG).tolist() == [True, False, False]
-
-
-def test_of_doubled_landmarks_the_one_seen_less_goes():
-    features = features_at([(100, 100), (200, 100)], depth=3.0)
-    points = RIG.triangulate(features.uv_left, features.uv_right)
-    landmarks = like(features, [0, 0, 1, 1, 0], [5, 9, 4, 4, 3])
-    positions = [points[0], points[0] + 0.01, points[1], points[1] - 0.005, points[0] + [0, 0, 0.1]]
-    view = seen_from_the_origin(positions, features)
-    assert doubled_landmarks(view, landmarks, CONFIG).tolist() == [True, False, False, True, False]
+    landmarks, positions = like(features, [0, 1, 1], [1, 1, 1]), np.array([a * 1.07, b + [0.2, 0, 0], c])
+    view = MapView.of(RIG, np.eye(4), positions, features, 1.0)
+    assert duplicates(view, landmarks, features, CONFIG)[1].tolist() == [True, False, False]
+    # Of those at one place the one seen less goes, else the younger; the last one lies deeper by 10 cm.
+    landmarks, positions = like(features, [0, 0, 1, 1, 0], [5, 9, 4, 4, 3]), [a, a + 0.01, b, b - 0.005, a + [0, 0, 0.1]]
+    view = MapView.of(RIG, np.eye(4), np.array(positions), features, 1.0)
+    assert duplicates(view, landmarks, features, CONFIG)[0].tolist() == [True, False, False, True, False]
 
 
 def test_hidden_landmarks_are_not_expected():
