@@ -31,7 +31,7 @@ from slam.runtime.compilation import Stages
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.threads import OneThread, one_blas_thread, prefetch
 from slam.session import Session
-from slam.third_party import named_failures
+from slam.third_party import checked, named_failures
 from slam.tracker import Elsewhere, State, Tracker, frame_result
 from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
@@ -318,9 +318,9 @@ class StereoSlam:
         self._roll_back()
         if self._state.prior_map is not None:
             return self._session.map_estimate(self._state, float("nan"))
-        estimate = self._tracker.whole_estimate(self._state)
-        common = self._tracker.rig_error.common(self.backend, as_reported=False)
-        return self.atlas.estimate(estimate, common, not of_map)
+        estimate, error = checked(self.backend, "estimate", self.backend.estimate()), self._tracker.rig_error
+        common = error.common(self.backend, as_reported=False)
+        return self.atlas.estimate(error.added_to(self.backend, estimate), common, not of_map)
 
     @one_blas_thread
     def snapshot(self) -> SavedMap:

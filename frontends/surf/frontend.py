@@ -81,17 +81,22 @@ class SurfFrontend:
         keypoints, threshold = self._detect(left)
         keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
         keypoints = self._spread(self._surf.localise(left, keypoints), self.config.features)
-        keypoints, descriptors = self._surf.describe(left, keypoints)
         images = ImagePair(views[0].pixels, None if frame.right is None else views[1].pixels)
         uv, size = keypoints.uv, keypoints.size
-        right = np.full_like(uv, np.nan)
-        if frame.right is not None:
-            (right,) = self._surf.workers.over(len(uv), lambda a, b: (self._match(views, uv[a:b], size[a:b]),))
-        angle = np.zeros(len(uv)) if self.config.upright else keypoints.angle
-        return StereoFeatures(
-            frame.stamp, uv, right, size, angle, keypoints.response, keypoints.laplacian, descriptors, threshold,
-            images, rectified=True,
+
+        def describe_and_match(first: int, last: int) -> tuple[NDArray, ...]:
+            """Angles, descriptors and right pixels of some of the features."""
+            found = self._surf.described(left.integral, keypoints, first, last)
+            if frame.right is None:
+                return *found, np.full((last - first, 2), np.nan)
+            return *found, self._match(views, uv[first:last], size[first:last])
+
+        angle, descriptors, right = self._surf.workers.over(len(uv), describe_and_match)
+        features = StereoFeatures(
+            frame.stamp, uv, right, size, np.zeros(len(uv)) if self.config.upright else angle, keypoints.response,
+            keypoints.laplacian, descriptors, threshold, images, rectified=True,
         )  # fmt: skip
+        return features if np.isfinite(angle).all() else features.select(np.isfinite(angle))
 
     def patches(self, images: ImagePair, uv_left: NDArray, size: NDArray) -> Patches:
         """The left image around pixels, see `slam.interfaces.AligningFrontend`."""

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from slam.bounds import FORBID_UNKNOWN, LEAST, MOST, require_not_negative
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN, require_not_negative
 
-_RANGES = {
-    "wide_hypotheses": (1, 100_000),
-    "window_sigmas": (0.0, 1e3),
-    "window_min": (0.0, 1e4),
-    "window_max": (0.0, 1e4),
-    "window_sizes": (0.0, 1e4),
-}
+_COUNT, _SHARE = (1, 10**6), (0.0, 1.0)
+_ASSOCIATION = {  # least and largest values
+    "wide_hypotheses": (1, 100_000), "window_sigmas": (LEAST, 1e3), "window_sizes": (LEAST, 1e4),
+    "window_min": (LEAST, 1e4), "window_max": (LEAST, 1e4), "ratio": (LEAST, 1.0), "view_ratio": (1.0, MOST),
+    "kidnapped_after": _COUNT,
+}  # fmt: skip
+_MAP = {
+    "target_in_view": (3, 10**6), "max_depth_error": (LEAST, 1.0), "erase_share": _SHARE, "erase_missed": _COUNT,
+    "lost_after": _COUNT, "restart_after": _COUNT, "descriptor_update": _SHARE,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,23 +86,15 @@ class AssociationConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        require_not_negative(self, _RANGES, "association")
+        require_not_negative(self, _ASSOCIATION, "association")
         if self.windows not in ("covariance", "fixed"):
             raise ConfigurationError(f"association: windows must be 'covariance' or 'fixed', got {self.windows!r}")
         name = "window_sizes" if self.windows == "fixed" else "window_sigmas"
         sizes = getattr(self, name)
-        if len(sizes) != len(self.d_match) or not sizes:
-            raise ConfigurationError(f"association: {name} and d_match must have the same number of values")
-        if list(sizes) != sorted(sizes) or sizes[0] <= 0:
-            raise ConfigurationError(f"association: {name} must be positive and ascending")
-        if not 0 < self.window_min <= self.window_max:
-            raise ConfigurationError("association: 0 < window_min <= window_max is required")
-        if not 0 < self.ratio <= 1:
-            raise ConfigurationError("association: ratio must lie in (0, 1]")
-        if self.view_ratio < 1:
-            raise ConfigurationError("association: view_ratio must be at least 1")
-        if self.kidnapped_after < 1:
-            raise ConfigurationError("association: kidnapped_after must be at least 1")
+        if len(sizes) != len(self.d_match) or list(sizes) != sorted(sizes):
+            raise ConfigurationError(f"association: {name} must be ascending, one for each value of d_match")
+        if self.window_min > self.window_max:
+            raise ConfigurationError("association: window_min must not lie above window_max")
 
 
 @dataclass(frozen=True)
@@ -158,14 +153,6 @@ class MapConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        require_not_negative(self)
-        if self.target_in_view < 3 or self.max_landmarks < self.target_in_view:
-            raise ConfigurationError("map: 3 <= target_in_view <= max_landmarks is required")
-        if min(self.grid) < 1 or self.separation < 0:
-            raise ConfigurationError("map: grid cells must be at least 1 and separation not negative")
-        if not (0 < self.max_depth_error < 1 and 0 <= self.erase_share < 1):
-            raise ConfigurationError("map: max_depth_error or erase_share is out of range")
-        if min(self.erase_missed, self.lost_after, self.restart_after) < 1 or self.descriptor_update > 1:
-            raise ConfigurationError(
-                "map: erase_missed, lost_after and restart_after >= 1 and descriptor_update <= 1 are required"
-            )
+        require_not_negative(self, _MAP, "map")
+        if self.max_landmarks < self.target_in_view:
+            raise ConfigurationError("map: target_in_view must not lie above max_landmarks")

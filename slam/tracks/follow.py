@@ -127,6 +127,23 @@ def _pairs_near(centres, reach, uv, order):
     return rows, found, count
 
 
+@kernel
+def apart(uv, queue, wanted, separation):
+    """The first `wanted` rows of a queue (Q,) whose pixels are not closer together than the separation [px]."""
+    chosen, count = np.empty(min(wanted, len(queue)), np.intp), 0
+    for row in queue:
+        if count == len(chosen):
+            break
+        free = True
+        for k in range(count):
+            dx, dy = uv[row, 0] - uv[chosen[k], 0], uv[row, 1] - uv[chosen[k], 1]
+            free = free and dx * dx + dy * dy >= separation * separation
+        if free:
+            chosen[count] = row
+            count += 1
+    return chosen[:count]
+
+
 @helper
 def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, good):
     """Mark in `good` which of the first `count` pairs of rows and columns belong together.

@@ -19,10 +19,9 @@ from slam.geometry.arrays import Array, among, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse, transform
 from slam.interfaces import Backend, MapBackend
-from slam.runtime.compilation import kernel
 from slam.third_party import checked
 from slam.tracks.config import MapConfig
-from slam.tracks.follow import pairs_near
+from slam.tracks.follow import apart, pairs_near
 from slam.tracks.localizer import Localizer
 from slam.tracks.monocular import depths_by_motion, frame_covariance, unclaimed
 from slam.tracks.step import LandmarkMatches, Step
@@ -125,7 +124,8 @@ class Mapper:
         """The map as the camera sees it."""
         ids = step.tracks.ids[step.tracks.mapped]
         positions = checked(backend, "positions", backend.positions(ids), n=len(ids))
-        return MapView.of(self.rig, step.estimate.T_world_left, positions, step.features, self._localizer.pixel_sigma)
+        T, sigma = step.estimate.T_world_left, self._localizer.models.pixel_sigma
+        return MapView.of(self.rig, T, positions, step.features, sigma)
 
     def _count(self, view: MapView, step: Step) -> None:
         """Count landmarks as seen or missed, in place, unless the frame's pose was not measured."""
@@ -146,7 +146,7 @@ class Mapper:
         """Turn `free` features (F,) into landmarks, so far as landmarks are wanted."""
         features, occupied = step.features, step.features.uv_left[step.matches.rows]
         step = self._entered(
-            step, new_landmarks(features, free, occupied, self.rig, self._localizer.pixel_sigma, self.config)
+            step, new_landmarks(features, free, occupied, self.rig, self._localizer.models.pixel_sigma, self.config)
         )
         if len(step.added):
             backend.add(step.added.observations(features))
@@ -158,7 +158,7 @@ class Mapper:
     def _add_monocular(self, backend: MapBackend, step: Step, rows: IndexArray) -> Step:
         """Turn features `rows` without a stereo match into landmarks once two views give depth (paper B, 2.2)."""
         landmarks, features, matches = step.tracks.landmarks(), step.features, step.matches
-        T, sigma = step.estimate.T_world_left, self._localizer.pixel_sigma
+        T, sigma = step.estimate.T_world_left, self._localizer.models.pixel_sigma
         view = self._view(backend, step)  # type: ignore[arg-type]
         shown = np.flatnonzero(view.in_image)
         rows = unclaimed(view.uv_left[shown], landmarks.descriptors[shown], features, rows)
@@ -220,24 +220,7 @@ def new_landmarks(
     starts = np.searchsorted(cells[order], np.arange(columns * lines))
     rank = np.empty(len(rows), int)
     rank[order] = np.arange(len(rows)) - starts[cells[order]]
-    return _apart(uv, rows[np.argsort(rank + load[cells], kind="stable")], wanted, separation)
-
-
-@kernel
-def _apart(uv, queue, wanted, separation):
-    """The first `wanted` rows of a queue (Q,) whose pixels are not closer together than the separation [px]."""
-    chosen, count = np.empty(min(wanted, len(queue)), np.intp), 0
-    for row in queue:
-        if count == len(chosen):
-            break
-        free = True
-        for k in range(count):
-            dx, dy = uv[row, 0] - uv[chosen[k], 0], uv[row, 1] - uv[chosen[k], 1]
-            free = free and dx * dx + dy * dy >= separation * separation
-        if free:
-            chosen[count] = row
-            count += 1
-    return chosen[:count]
+    return apart(uv, rows[np.argsort(rank + load[cells], kind="stable")], wanted, separation)
 
 
 def depth_is_known(

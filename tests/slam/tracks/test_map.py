@@ -143,12 +143,13 @@ def test_features_and_landmarks_that_are_a_landmark_already_are_known():
     a, b, c = RIG.triangulate(features.uv_left, features.uv_right)
     # The first: 0.2 m deeper, within the uncertainty of 12 %. The second: as deep, but 20 px away. The third looks
     # like another feature.
-    landmarks, positions = like(features, [0, 1, 1], [1, 1, 1]), np.array([a * 1.07, b + [0.2, 0, 0], c])
+    landmarks, positions = like(features, [0, 1, 1], [1, 1, 1]), np.array([a * 1.07, b + np.array([0.2, 0, 0]), c])
     view = MapView.of(RIG, np.eye(4), positions, features, 1.0)
     assert duplicates(view, landmarks, features, CONFIG)[1].tolist() == [True, False, False]
     # Of those at one place the one seen less goes, else the younger; the last one lies deeper by 10 cm.
-    landmarks, positions = like(features, [0, 0, 1, 1, 0], [5, 9, 4, 4, 3]), [a, a + 0.01, b, b - 0.005, a + [0, 0, 0.1]]
-    view = MapView.of(RIG, np.eye(4), np.array(positions), features, 1.0)
+    landmarks, positions = like(features, [0, 0, 1, 1, 0], [5, 9, 4, 4, 3]), np.array([a, a + 0.01, b, b - 0.005, a])
+    positions[4, 2] += 0.1
+    view = MapView.of(RIG, np.eye(4), positions, features, 1.0)
     assert duplicates(view, landmarks, features, CONFIG)[0].tolist() == [True, False, False, True, False]
 
 
