@@ -147,7 +147,7 @@ class Tracker:
         tracks = state.tracks
         if tracks is None or (tracks.descriptors.shape[1] != features.descriptors.shape[1] and not len(tracks.mapped)):
             tracks = Tracks.empty(features.descriptors.shape[1])
-        tracks = tracks.begun(len(features), self.objects.window)
+        tracks = tracks.begun(len(features.scale), self.objects.window)
         landmarks, backend = tracks.landmarks(), state.backend
         positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks.ids))
 
@@ -197,7 +197,7 @@ class Tracker:
         answer = state.backend.update(matches.observations(step.features), matches.T_world_left)
         report: UpdateReport = checked(state.backend, "update", answer)
         least = c.association.minimum_consistent if before.lost else MINIMAL_POINTS
-        measured = len(report.used) >= least and 2 * len(report.used) >= len(matches)
+        measured = len(report.used) >= least and 2 * len(report.used) >= len(matches.ids)
         uncertain = median_deviation(step.prediction) > c.association.tight_window
         # A pose that agrees with the last frame's, but awaits a third one, does not show an unknown place.
         stereo = 0 if before.doubted.count > 1 else int(step.features.has_stereo.sum())

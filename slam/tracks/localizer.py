@@ -116,7 +116,7 @@ class Search:
             majority = 0.5 * min(expected, len(self.features))
             allowed = len(around) >= max(majority, 2 * c.minimum_consistent)
             matches = around if allowed else matches
-        if allowed and len(matches):
+        if allowed and len(matches.ids):
             return matches, tracking.believing(T, stamp, hidden_at)
         doubted = tracking.doubted.after(T, stamp, models)
         if doubted.count < c.kidnapped_after:
@@ -134,7 +134,7 @@ class Search:
         `doubtful` says that nothing was matched in the last frame, so that a pose from the whole map needs more
         matches, see `AssociationConfig.wide_share`.
         """
-        if not len(self.landmarks) or not len(self.features):
+        if not len(self.landmarks.ids) or not len(self.features.scale):
             return LandmarkMatches.nothing()
         c, p = self.localizer.config, self.prediction
         rows = self.landmarks.rows(p.ids)

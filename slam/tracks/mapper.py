@@ -15,7 +15,7 @@ from slam.checks import in_front
 from slam.chi_square import SIGMAS
 from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
 from slam.errors import ConfigurationError
-from slam.geometry.arrays import Array, among, isin
+from slam.geometry.arrays import Array, isin
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse, transform
 from slam.interfaces import Backend, MapBackend
@@ -143,36 +143,33 @@ class Mapper:
         )  # fmt: skip
 
     def _add(self, backend: Backend, step: Step, free: BoolArray) -> Step:
-        """Turn `free` features (F,) into landmarks, so far as landmarks are wanted."""
-        features, occupied = step.features, step.features.uv_left[step.matches.rows]
-        step = self._entered(
-            step, new_landmarks(features, free, occupied, self.rig, self._localizer.models.pixel_sigma, self.config)
-        )
-        if len(step.added):
-            backend.add(step.added.observations(features))
-        wanted = self.config.monocular or (self.config.monocular is None and not features.has_stereo.any())
-        if wanted and isinstance(backend, MapBackend) and len(step.matches) >= MINIMAL_POINTS:
-            return self._add_monocular(backend, step, np.flatnonzero(free & ~features.has_stereo))
-        return step
+        """Turn `free` features (F,) into landmarks, so far as landmarks are wanted.
 
-    def _add_monocular(self, backend: MapBackend, step: Step, rows: IndexArray) -> Step:
-        """Turn features `rows` without a stereo match into landmarks once two views give depth (paper B, 2.2)."""
-        landmarks, features, matches = step.tracks.landmarks(), step.features, step.matches
-        T, sigma = step.estimate.T_world_left, self._localizer.models.pixel_sigma
-        view = self._view(backend, step)  # type: ignore[arg-type]
+        Those without a stereo match become landmarks once two views give depth (paper B, 2.2).
+        """
+        features, matches, c, sigma = step.features, step.matches, self.config, self._localizer.models.pixel_sigma
+        occupied, stereo = features.uv_left[matches.rows], features.has_stereo
+        step = self._entered(step, new_landmarks(features, free, occupied, self.rig, sigma, c))
+        if len(step.added.ids):
+            backend.add(step.added.observations(features))
+        wanted = c.monocular or (c.monocular is None and not stereo.any())
+        if not (wanted and isinstance(backend, MapBackend) and len(matches.ids) >= MINIMAL_POINTS):
+            return step
+        landmarks, view = step.tracks.landmarks(), self._view(backend, step)
         shown = np.flatnonzero(view.in_image)
+        rows = np.flatnonzero(free & ~stereo)
         rows = unclaimed(view.uv_left[shown], landmarks.descriptors[shown], features, rows)
         in_map = isin(matches.ids, landmarks.ids)
-        local, stereo = view.local[landmarks.rows(matches.ids[in_map])], features.has_stereo[matches.rows[in_map]]
-        P = frame_covariance(self.rig, local, stereo, sigma)
-        with_depth, depths = depths_by_motion(
-            self.rig, step.tracks, features, rows, T, P, step.index, sigma, self.config.max_depth_error
-        )
-        front = np.flatnonzero(in_front(depths.local))
-        wanted = max(self.config.target_in_view - len(matches) - len(step.added), 0)
-        best = front[np.sort(np.argsort(-features.response[with_depth[front]], kind="stable")[:wanted])]
-        before = len(step.added)
-        step = self._entered(step, with_depth[best])
+        local = view.local[landmarks.rows(matches.ids[in_map])]
+        P = frame_covariance(self.rig, local, stereo[matches.rows[in_map]], sigma)
+        T = step.estimate.T_world_left
+        rows, depths = depths_by_motion(
+            self.rig, step.tracks, features, rows, T, P, step.index, sigma, c.max_depth_error
+        )  # fmt: skip
+        front, before = np.flatnonzero(in_front(depths.local)), len(step.added.ids)
+        most = max(c.target_in_view - len(matches.ids) - before, 0)
+        best = front[np.sort(np.argsort(-features.response[rows[front]], kind="stable")[:most])]
+        step = self._entered(step, rows[best])
         if len(best):
             backend.place(step.added.ids[before:], depths.local[best], depths.covariances[best])
         return step
@@ -323,7 +320,8 @@ def duplicates(
     same = (np.abs(offset[:, 2]) < slack[row]) | (np.linalg.norm(offset, axis=1) < config.same_distance)
     same &= (np.linalg.norm(looks[row] - looks[which], axis=1) < config.same_descriptor) & (signs[row] == signs[which])
     row, which = row[same], which[same]
+    doubled, known = np.zeros(view.in_image.shape, bool), np.zeros(features.laplacian.shape, bool)
     seen, mark, rival = landmarks.seen[shown], row[row < len(shown)], which[row < len(shown)]
     less = (seen[mark] < seen[rival]) | ((seen[mark] == seen[rival]) & (mark > rival))
-    known = among(len(features), row[row >= len(shown)] - len(shown))
-    return among(len(view.in_image), shown[mark[less]]), known
+    doubled[shown[mark[less]]] = known[row[row >= len(shown)] - len(shown)] = True
+    return doubled, known

@@ -88,7 +88,7 @@ class Standing:
         if places is None or places.descriptors.shape[1] != descriptors.shape[1]:
             return begun
         at, rows = np.zeros((2, 0), np.intp)
-        if len(places) and len(z):
+        if len(places.z) and len(z):
             from slam.tracks.follow import nearest
 
             # 0.5: largest distance of descriptors of one feature in unchanged light

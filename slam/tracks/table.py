@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
-from slam.geometry.arrays import Table, among
+from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
 from slam.naming import count
 
@@ -106,11 +106,12 @@ class LandmarkTable(Table):
         `rematch_after` frames outside the image count as first seen now, from there. For landmarks `withheld` from the
         update, the frame counts as neither missed nor seen.
         """
-        counts = np.ones(len(self), bool)
+        counts, shown = np.ones(len(self.ids), bool), np.zeros(len(self.ids), bool)
         counts[withheld] = False
         view = in_view[counts[in_view]]
         again = self.long_out_of_view(rematch_after)[measured]
-        self.in_view[among(len(self), view) | among(len(self), measured)] += 1
+        shown[view] = shown[measured] = True
+        self.in_view[shown] += 1
         self.missed[view] += 1
         self.seen[measured] += 1
         self.last_seen[measured] = frame

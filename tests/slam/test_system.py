@@ -157,7 +157,7 @@ def test_two_arrays_and_a_time_are_a_frame():
 def test_another_detector_takes_the_place_of_the_first_one():
     cloud, system = Cloud(150), StereoSlam(RIG, None, "ekf", config=CONFIG)
     system.process_features(cloud.features(np.eye(4), 0.0, 0.3)[0])
-    system.objects = ObjectDetector()
+    system._tracker.objects = ObjectDetector()
     suspects = system.objects.suspects = system.landmarks.ids[:6].copy()
     result = system.process_features(cloud.features(np.eye(4), 0.1, 0.3)[0])
     assert len(result.matched) > 20 and not np.isin(suspects, result.matched).any()
