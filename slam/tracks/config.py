@@ -10,9 +10,8 @@ from slam.errors import ConfigurationError
 
 _COUNT, _SHARE = (1, 10**6), (0.0, 1.0)
 _ASSOCIATION = {  # least and largest values
-    "wide_hypotheses": (1, 100_000), "window_sigmas": (LEAST, 1e3), "window_sizes": (LEAST, 1e4),
-    "window_min": (LEAST, 1e4), "window_max": (LEAST, 1e4), "ratio": (LEAST, 1.0), "view_ratio": (1.0, MOST),
-    "kidnapped_after": _COUNT,
+    "wide_hypotheses": (1, 100_000), "window_sigmas": (LEAST, 1e3), "window_min": (LEAST, 1e4),
+    "window_max": (LEAST, 1e4), "ratio": (LEAST, 1.0), "view_ratio": (1.0, MOST), "kidnapped_after": _COUNT,
 }  # fmt: skip
 _MAP = {
     "target_in_view": (3, 10**6), "max_depth_error": (LEAST, 1.0), "erase_share": _SHARE, "erase_missed": _COUNT,
@@ -25,11 +24,8 @@ class AssociationConfig:
     """Settings of the association.
 
     Attributes:
-        windows: kind of the search windows: ``"covariance"``, ellipses by the innovation's covariance, or ``"fixed"``,
-            squares of fixed sizes as in paper A, Fig. 4.
-        window_sigmas: half sizes of covariance windows, smallest first, in standard deviations of the innovation.
-        window_min, window_max: bounds of the half axes of the smallest covariance window [px].
-        window_sizes: half sizes of fixed windows, smallest first [px].
+        window_sigmas: half sizes of the search windows, smallest first, in standard deviations of the innovation.
+        window_min, window_max: bounds of the half axes of the smallest window [px].
         d_match: largest descriptor distance in each window (paper A, Eq. 12); falls as the window grows.
         ratio: largest ratio of the best to the second best distance in a window (paper B, 2.2).
         consistency_sigmas: largest reprojection error of a match that agrees with a pose, in units of the pixel noise.
@@ -44,11 +40,9 @@ class AssociationConfig:
             `slam.tracks.alignment`), if the front end can do that.
     """
 
-    windows: str = "covariance"
     window_sigmas: tuple[float, ...] = (2.5, 5.0)
     window_min: float = 4.0
     window_max: float = 400.0
-    window_sizes: tuple[float, ...] = (10.0, 30.0)
     d_match: tuple[float, ...] = (0.55, 0.4)
     ratio: float = 0.8
     consistency_sigmas: float = 5.0
@@ -87,12 +81,9 @@ class AssociationConfig:
 
     def __post_init__(self) -> None:
         require_not_negative(self, _ASSOCIATION, "association")
-        if self.windows not in ("covariance", "fixed"):
-            raise ConfigurationError(f"association: windows must be 'covariance' or 'fixed', got {self.windows!r}")
-        name = "window_sizes" if self.windows == "fixed" else "window_sigmas"
-        sizes = getattr(self, name)
+        sizes = self.window_sigmas
         if len(sizes) != len(self.d_match) or list(sizes) != sorted(sizes):
-            raise ConfigurationError(f"association: {name} must be ascending, one for each value of d_match")
+            raise ConfigurationError("association: window_sigmas must be ascending, one for each value of d_match")
         if self.window_min > self.window_max:
             raise ConfigurationError("association: window_min must not lie above window_max")
 

@@ -16,7 +16,6 @@ from slam.data import BoolArray, StereoFeatures
 from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
 from slam.runtime.compilation import helper, kernel, vector_helper
-from slam.tracks.config import AssociationConfig
 
 Descriptors = NDArray[np.float32]
 
@@ -31,20 +30,13 @@ class Matches(Table):
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Search windows about expected pixels, the smallest first, and how alike descriptors must be in each."""
+    """Search ellipses about expected pixels, the smallest first, and how alike descriptors must be in each."""
 
-    sizes: tuple[float, ...]  # half sizes (L,): standard deviations of the innovation; of squares [px]
+    sizes: tuple[float, ...]  # half sizes (L,), in standard deviations of the innovation
     d_match: tuple[float, ...]  # largest descriptor distance in each (L,)
     ratio: float  # largest ratio of the best to the second best distance
-    most: float = 0.0  # half axes of the smallest ellipse are bounded by this [px]; 0 for squares
-    least: float | Array = 0.0  # and from below by this, or by one number for each track (M,)
-
-    @classmethod
-    def of(cls, c: AssociationConfig) -> Windows:
-        """The windows of landmarks."""
-        if c.windows == "fixed":
-            return cls(c.window_sizes, c.d_match, c.ratio)
-        return cls(c.window_sigmas, c.d_match, c.ratio, c.window_max, c.window_min)
+    most: float  # half axes of the smallest are bounded by this [px]
+    least: float | Array  # and from below by this, or by one number for each track (M,)
 
 
 def follow(
@@ -237,26 +229,18 @@ def in_windows(pixels, innovation, least, most, sizes, signs, uv, feature_signs,
         x, y = pixels[row, 0], pixels[row, 1]
         if not (np.isfinite(x) and np.isfinite(y)):
             continue
-        if most > 0:
-            shape = ellipse(innovation[row], least[row] ** 2, most**2)
-            uu, cross, vv = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
-            reach_u, reach_v = last * shape[3], last * shape[4]
-        else:
-            uu = cross = vv = np.float32(0.0)
-            reach_u = reach_v = last
+        uu, cross, vv, reach_u, reach_v = ellipse(innovation[row], least[row] ** 2, most**2)
+        reach_u, reach_v = last * reach_u, last * reach_v
         place = first_column(uv, order, x - reach_u)
         while place < len(order) and uv[order[place], 0] <= x + reach_u:
             feature = order[place]
             place += 1
             if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[row]:
                 continue
-            du, dv = np.float32(uv[feature, 0] - x), np.float32(uv[feature, 1] - y)
-            if most > 0:
-                off, power = np.float64(uu * du * du + np.float32(2.0) * cross * du * dv + vv * dv * dv), 2
-            else:
-                off, power = np.float64(max(abs(du), abs(dv))), 1
+            du, dv = uv[feature, 0] - x, uv[feature, 1] - y
+            off = uu * du * du + 2.0 * cross * du * dv + vv * dv * dv
             smallest = 0
-            while smallest < levels and off > sizes[smallest] ** power:
+            while smallest < levels and off > sizes[smallest] ** 2:
                 smallest += 1
             if smallest == levels:
                 continue
@@ -275,8 +259,8 @@ def _follow(
     """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
 
     Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows: their half axes
-    are `sizes` (L,) times standard deviations from `least` (M,) to `most`, or [px] of squares if `most` is zero. In
-    each window, descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs`; the features are at
+    are `sizes` (L,) times standard deviations from `least` (M,) to `most`. In each window, descriptors must be nearer
+    than its limit (L,). Tracks have `looks` and `signs`; the features are at
     `uv`, in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
     """
     a, b, level, count = in_windows(pixels, innovation, least, most, sizes, signs, uv, feature_signs, order)
@@ -296,30 +280,4 @@ def _follow(
                 done[a[p]] = taken[b[p]] = True
                 pairs[0, matched], pairs[1, matched] = a[p], b[p]
                 matched += 1
-    return matched
-
-
-@kernel
-def nearest(points, order, places, radius, looks, place_looks, alike):
-    """Of each place (M, 2 or more) the nearest point (N, 2 or more) that has it as its own nearest place; −1 for none.
-
-    Both are less than `radius` apart, and their descriptors (N, D), (M, D) less than `alike`; `order` is that of the
-    places' columns.
-    """
-    matched, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
-    for n in range(len(points)):
-        x, y, best, least = points[n, 0], points[n, 1], -1, radius * radius
-        place = first_column(places, order, x - radius)
-        while place < len(order) and places[order[place], 0] <= x + radius:
-            m = order[place]
-            gap = (places[m, 0] - x) ** 2 + (places[m, 1] - y) ** 2
-            if gap < least:
-                best, least = m, gap
-            place += 1
-        if best >= 0 and least < gaps[best]:
-            off = np.float32(0.0)
-            for k in range(looks.shape[1]):
-                off += (looks[n, k] - place_looks[best, k]) ** 2
-            if off < alike * alike:
-                matched[best], gaps[best] = n, least
     return matched

@@ -176,7 +176,9 @@ class Search:
     def _in_windows(self, uv: Array, innovation: Array, rows: NDArray[np.intp]) -> Matches:
         """Matches of the landmarks at `rows` (M,), in windows around their pixels (M, 2)."""
         looks = self.landmarks.descriptors[rows], self.landmarks.laplacian[rows]
-        pairs = follow(uv, innovation, *looks, self.features, Windows.of(self.localizer.config))
+        c = self.localizer.config
+        windows = Windows(c.window_sigmas, c.d_match, c.ratio, c.window_max, c.window_min)
+        pairs = follow(uv, innovation, *looks, self.features, windows)
         return Matches(rows[pairs.tracks], pairs.features)
 
     def _around(self, T_world_left: Array) -> tuple[Matches, int]:

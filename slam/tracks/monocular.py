@@ -166,7 +166,7 @@ def _followed(
     """Features that continue the tracks `waiting` (M,) for a depth, where the camera's rotation takes them."""
     expected = rig.left.project(tracks.direction[waiting] @ T_world_left[:3, :3])
     # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
-    windows, square = Windows((2 * _RADIUS,), (_D_MATCH,), _RATIO), np.zeros((len(expected), 2, 2))
-    pairs = follow(expected, square, tracks.look[waiting], tracks.laplacian[waiting], features, windows)
+    windows, none = Windows((1.0,), (_D_MATCH,), _RATIO, 2 * _RADIUS, 2 * _RADIUS), np.zeros((len(expected), 2, 2))
+    pairs = follow(expected, none, tracks.look[waiting], tracks.laplacian[waiting], features, windows)
     gap = np.abs(features.uv_left[pairs.features] - expected[pairs.tracks])
     return pairs.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))
