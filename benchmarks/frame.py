@@ -24,7 +24,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -71,14 +71,9 @@ class Size:
 class Times:
     """Wall and CPU time of each frame [ms], its pose (None where it was lost)."""
 
-    wall: list[float]
-    cpu: list[float]
-    poses: list[Array | None]
-
-    @classmethod
-    def none(cls) -> Times:
-        """Of no frame yet."""
-        return cls([], [], [])
+    wall: list[float] = field(default_factory=list)
+    cpu: list[float] = field(default_factory=list)
+    poses: list[Array | None] = field(default_factory=list)
 
     def take(self, call: Callable[[], Array | None]) -> None:
         """Time one frame."""
@@ -107,7 +102,7 @@ def measure(size: Size, orbslam3: str | None) -> dict[str, Times]:
     sequence = open_sequence(size.sequence)
     frames = list(sequence.frames(0, size.skipped + size.counted))
     systems = {name: StereoSlam(sequence.rig, backend=name, kind=sequence.kind) for name in ONLINE}
-    sift, times = cv2.SIFT_create(800), {name: Times.none() for name in (*ONLINE, SIFT)}
+    sift, times = cv2.SIFT_create(800), {name: Times() for name in (*ONLINE, SIFT)}
 
     for frame in frames:
         for name, system in systems.items():
@@ -122,7 +117,7 @@ def measure(size: Size, orbslam3: str | None) -> dict[str, Times]:
 
 def overlapped(sequence: Sequence, backend: str, frames: list[StereoFrame]) -> Times:
     """A back end's times from result to result, the next frame's features being extracted beside its estimation."""
-    results, times = StereoSlam(sequence.rig, backend=backend, kind=sequence.kind).run(frames), Times.none()
+    results, times = StereoSlam(sequence.rig, backend=backend, kind=sequence.kind).run(frames), Times()
     for _ in frames:
         times.take(lambda: tracked(next(results)[1]))
     return times
