@@ -53,11 +53,6 @@ class SurfFrontend:
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
         self._masks: tuple[NDArray | None, NDArray | None] = None, None  # of the last frame: as given, and rectified
 
-    @property
-    def threshold(self) -> float:
-        """D_threshold for the next frame."""
-        return self._threshold
-
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         """Features of one stereo frame, see `slam.interfaces.Frontend`."""
         if not isinstance(frame, StereoFrame):
