@@ -1,4 +1,4 @@
-"""Checks that two images are a stereo pair of their rig: not swapped, rows aligned, and disparities not all zero.
+"""Checks that two images are a stereo pair of their rig: not swapped, and rows aligned.
 
 The front end cannot tell, as it looks for a feature's match in the same row and to the left only. Here features are
 matched anywhere in the image; those that agree on a fundamental matrix (RANSAC) are compared with the rig.
@@ -22,9 +22,6 @@ _ROWS_AGREE = 1.0  # guard: [px] to which most rows of a rectified pair agree, a
 _SHOWN = 0.5  # guard: share of what rectification does to rows that images show at least, which are not rectified yet
 _SHOWN_PLAIN = 0.9  # guard: the same of cameras that are rectified but for lenses, as no two real ones are
 
-#: Disparities below this count as zero [px].
-NO_DISPARITY = _TOLERANCE
-
 _SAMPLE = 8  # fixed: matches that any fundamental matrix can be made to fit
 _SIGMAS = 5.0  # guard: a chance of 3e-7 to be wrong
 
@@ -37,7 +34,6 @@ class PairGeometry:
     conclusive: bool = False  # there are more than wrong ones would give by chance; else the other numbers are zero
     as_given: int = 0  # in the same row and with positive disparity, as they must be
     as_swapped: int = 0  # likewise with left and right image exchanged
-    at_same_place: int = 0  # at one and the same pixel of both images, as they are, not rectified
     off_rows: int = 0  # whose rows differ, by more than the front end finds reliably
     row_offset: float = 0.0  # median difference of their rows [px]
     shown: float = 1.0  # share of what rectification does to rows that the images show; 1 where that may be all
@@ -47,11 +43,6 @@ class PairGeometry:
         """Most matches fit the rig with the images exchanged, and far fewer as they are."""
         others = max(self.as_given, self.matches - self.as_swapped)
         return self.conclusive and most(self.as_swapped, others)
-
-    @property
-    def same(self) -> bool:
-        """Most matches are at the same place in both images."""
-        return self.conclusive and most(self.at_same_place, self.matches - self.at_same_place)
 
     @property
     def rows_differ(self) -> bool:
@@ -96,7 +87,6 @@ def pair_geometry(rig: StereoRig, left: Points, right: Points, rows: float) -> P
         True,
         int(((shift > _TOLERANCE) & (np.abs(offset) <= band)).sum()),
         int(((shift_swapped > _TOLERANCE) & (np.abs(offset_swapped) <= band)).sum()),
-        int((np.abs(b - a).max(axis=1) <= _TOLERANCE).sum()),
         int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
         1.0 if rig.is_rectified else _shown(rig, a, b, left.image, right.image),

@@ -12,7 +12,7 @@ from slam.errors import CalibrationError, SequenceError
 from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
-from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of
+from slam.input.pair import PairGeometry, Points, most, pair_geometry, points_of
 from slam.models import EstimatorModels
 from slam.tracks.step import ENOUGH_FEATURES
 
@@ -139,15 +139,10 @@ class InputWarnings:
         )
 
     def _check_pair(self, images: _Images, own: PairGeometry) -> None:
-        """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
-        if not self._pair_is_right and (own.swapped or own.same):
+        """Warn if left and right image look swapped, are of different moments, or rows do not match."""
+        if not self._pair_is_right and own.swapped:
             self._pair_warned = True
-            horizon = self._rig.rectified.rig.left.fu * self._rig.baseline / NO_DISPARITY
-            same = (
-                f"left and right image show the same: {own.at_same_place} of {own.matches} features have no "
-                f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
-            )
-            self._warn(_swapped(own) if own.swapped else same)
+            self._warn(_swapped(own))
         elif not self._pair_is_right and self._before is not None and own.shown < 1:
             self._pair_warned = True  # hardly a feature fits then, and of another moment's some may by chance
             self._warn(_rows_differ(own, self._rig))

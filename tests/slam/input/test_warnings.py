@@ -72,10 +72,6 @@ def never_rectified(left, right):
     return left, cv2.warpPerspective(right, H, (320, 240))
 
 
-def blurred_copy(left, right):
-    return left, cv2.GaussianBlur(left, (3, 3), 0.5)
-
-
 def unlike_cameras(turn, *lenses):
     """A rig of two cameras, the right one turned; each with the two first numbers of its lens."""
     left = PinholeCamera(250.0, 251.0, 170.0, 110.0, 320, 240, "radtan", (*lenses[0], 0.001, 0.0))
@@ -104,11 +100,6 @@ SAID = {
     "rows down": (every(8, rolled(4)), {}, r"rows of left and right image do not agree.*off by 4\.0 px"),
     "different things": (every(70, noise), {}, ""),
     "one camera": ([replace(FRAME, right=None)], {}, ""),
-    "one image twice": (
-        every(8, lambda a, b: (a, a)), {},
-        f"left and right image show the same.*nearer than {RIG.left.fu * RIG.baseline / 2:.0f} m",
-    ),
-    "one blurred": (every(8, blurred_copy), {"rig": DISTORTED}, "left and right image show the same"),
     # one lens as two cameras: the halves of an image show different things
     "no partners": (
         every(12, noise), {"stereo": 3}, "^only 3 of 200 features of frame 4 are found in the right image"
