@@ -198,9 +198,11 @@ class Tracker:
         report: UpdateReport = checked(state.backend, "update", answer)
         least = c.association.minimum_consistent if before.lost else MINIMAL_POINTS
         measured = len(report.used) >= least and 2 * len(report.used) >= len(matches.ids)
-        uncertain = median_deviation(step.prediction) > c.association.tight_window
-        # A pose that agrees with the last frame's, but awaits a third one, does not show an unknown place.
-        stereo = 0 if before.doubted.count > 1 else int(step.features.has_stereo.sum())
+        uncertain, stereo = False, 0  # asked where the pose was not measured
+        if not measured:
+            uncertain = median_deviation(step.prediction) > c.association.tight_window
+            # A pose that agrees with the last frame's, but awaits a third one, does not show an unknown place.
+            stereo = 0 if before.doubted.count > 1 else int(step.features.has_stereo.sum())
         tracking = before.after(measured, standing.stands, uncertain, stereo, c.map.lost_after)
         if state.begins_at(step.index):
             report = replace(report, reason=report.reason if len(step.tracks.mapped) else NEW_MAP)

@@ -82,7 +82,7 @@ class Mapper:
         if len(tracks.mapped) < MINIMAL_POINTS or step.tracking.may_add(self.config.restart_after):
             for taken in (step.matches.rows, step.labels.moving, step.labels.undecided):
                 known[taken] = True
-            step = self._add(backend, step, ~known)
+            step = self._add(backend, step, view, ~known)
         if len(tracks.mapped) > self.config.max_landmarks:
             surplus = tracks.mapped[surplus_landmarks(tracks.landmarks(), self.config)]
             erased = np.concatenate([erased, tracks.ids[surplus]])
@@ -142,14 +142,15 @@ class Mapper:
             rows[~view.in_image], self._localizer.config.rematch_after, rows[isin(tracks.ids[rows], step.suspects)],
         )  # fmt: skip
 
-    def _add(self, backend: Backend, step: Step, free: BoolArray) -> Step:
+    def _add(self, backend: Backend, step: Step, view: MapView, free: BoolArray) -> Step:
         """Turn `free` features (F,) into landmarks, so far as landmarks are wanted.
 
         Those without a stereo match become landmarks once two views give depth (paper B, 2.2).
         """
         features, matches, c, sigma = step.features, step.matches, self.config, self._localizer.models.pixel_sigma
         occupied, stereo = features.uv_left[matches.rows], features.has_stereo
-        step = self._entered(step, new_landmarks(features, free, occupied, self.rig, sigma, c))
+        deep = free & (view.depth_sigma < c.max_depth_error * view.points[:, 2])
+        step = self._entered(step, new_landmarks(features, deep, occupied, self.rig, c))
         if len(step.added.ids):
             backend.add(step.added.observations(features))
         wanted = c.monocular or (c.monocular is None and not stereo.any())
@@ -188,21 +189,20 @@ class Mapper:
 
 
 def new_landmarks(
-    features: StereoFeatures, free: BoolArray, occupied: Array, rig: StereoRig, pixel_sigma: float, config: MapConfig
+    features: StereoFeatures, free: BoolArray, occupied: Array, rig: StereoRig, config: MapConfig
 ) -> IndexArray:
     """Rows of the features that become landmarks: the grid fills evenly, and no two lie closer than the separation.
 
-    `free` (N,) says which features belong to no landmark; `occupied` (M, 2) are pixels of the landmarks in view, the
-    measured ones first.
+    `free` (N,) says which features have a known depth and belong to no landmark; `occupied` (M, 2) are pixels of the
+    landmarks in view, the measured ones first.
     """
     wanted, uv, separation = config.target_in_view - len(occupied), features.uv_left, config.separation
-    rows = np.flatnonzero(free & features.has_stereo)
+    rows = np.flatnonzero(free)
     if wanted <= 0 or not len(rows):
         return rows[:0]
     at, which = pairs_near(uv[rows], separation, occupied)
     gap = uv[rows[at]] - occupied[which]
     rows = np.delete(rows, at[np.einsum("ij,ij->i", gap, gap) < separation**2])
-    rows = rows[depth_is_known(rig, features, rows, pixel_sigma, config.max_depth_error)]
     rows = rows[np.argsort(-features.response[rows], kind="stable")]
     columns, lines = config.grid
     size = np.array([rig.left.width / columns, rig.left.height / lines])

@@ -23,8 +23,8 @@ from slam.naming import count
 
 _ROOM = 1000  # cost: rows that a table begins with
 
-#: Columns of `Tracks` that say, besides the Laplacian, what waits for a depth.
-_WAITING = ("look", "waiting_since", "first_pixel", "first_pose", "first_covariance", "direction")
+#: Columns of `Tracks` that say what waits for a depth; all but the first one mean nothing where nothing does.
+_WAITING = ("waiting_since", "look", "first_pixel", "first_pose", "first_covariance", "direction")
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,8 @@ class Tracks(LandmarkTable):
         The columns of landmarks and of what waits for a depth are copied; those of what is followed are shared with the
         copy, unless it has windows of another number of frames.
         """
-        kept = {name: getattr(self, name).copy() for name in (*LandmarkTable.__dataclass_fields__, *_WAITING)}
+        waiting = _WAITING if (self.waiting_since >= 0).any() else _WAITING[:1]
+        kept = {name: getattr(self, name).copy() for name in (*LandmarkTable.__dataclass_fields__, *waiting)}
         same = self.dof.shape[1] == window
         tracks = copy(self) if same else Tracks.empty(self.descriptors.shape[1], window, len(self))
         vars(tracks).update(kept)

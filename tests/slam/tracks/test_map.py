@@ -7,6 +7,7 @@ from slam.data import StereoFeatures
 from slam.tracks.config import MapConfig
 from slam.tracks.mapper import (
     MapView,
+    depth_is_known,
     duplicates,
     expected_landmarks,
     new_landmarks,
@@ -31,7 +32,8 @@ def features_at(uv, depth=3.0, response=None):
 
 def chosen(features, occupied=(), config=CONFIG, free=None):
     free = np.ones(len(features), bool) if free is None else free
-    return new_landmarks(features, free, np.asarray(occupied, float).reshape(-1, 2), RIG, 1.0, config)
+    deep = depth_is_known(RIG, features, np.arange(len(features)), 1.0, config.max_depth_error)
+    return new_landmarks(features, free & deep, np.asarray(occupied, float).reshape(-1, 2), RIG, config)
 
 
 def rows_with(**columns):
