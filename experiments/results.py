@@ -174,7 +174,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "growth", "cost", "How it grows", folder="benchmarks", pictures={"growth": "Floors are dashed."},
-        says="CPU time over the number of landmarks, features, moving cars and frames, and of what cannot be done "
+        says="CPU time over the number of landmarks, features and moving cars, and of what cannot be done "
         "without (floor, dashed): the filter's bare `dsyrk`, gtsam's own calls, SURF alone, no detector.",
         left_out=("by",),
     ),
