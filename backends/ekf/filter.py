@@ -55,8 +55,9 @@ class LandmarkFilter:
 
     def __init__(
         self, rig: StereoRig, models: EstimatorModels, camera: Any, P: Array, coordinates: Coordinates, iterations: int,
-        stereo: bool = True,
+        stereo: bool = True, /,
     ) -> None:  # fmt: skip
+        # by position alone: they are no options of a back end
         self.rig, self.models = rig, models
         self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
         self._measure = RectifiedMeasurement(rig, models)
