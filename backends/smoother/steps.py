@@ -85,7 +85,11 @@ class Steps(RectifiedMeasurement):
             return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         try:
             one = self._problem(s, rows, z)
-            found = self._agreement(s, one, rows, z, guess)
+            R, start = s.poses[-1][:3, :3], one.predicted if guess is None else guess
+            lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[-1][:3, :3] @ R.T - s.turned)
+            found = agreement(
+                one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
+            )
             s = replace(s, contradicted=found.contradicted)
             if not found.used.any():
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
@@ -104,18 +108,6 @@ class Steps(RectifiedMeasurement):
         P = s.covariance if s.inside or marks.world[rows].any() else s.own
         probability = self.models.gate_probability
         return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
-
-    def _agreement(
-        self, s: SmootherState, one: pose_only.PoseProblem, rows: IndexArray, z: Array, guess: Array | None
-    ) -> Agreement:
-        """Initial value of the newest pose, and which measurements agree with it."""
-
-        def search() -> Array | None:
-            return landmarks_pose(self, one.points, z, one.predicted, s.number)
-
-        R = s.poses[-1][:3, :3]
-        lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[-1][:3, :3] @ R.T - s.turned)
-        return agreement(one, one.predicted if guess is None else guess, search, s.contradicted, lost)
 
     def _corrected(
         self, s: SmootherState, graph: Graph, one: pose_only.PoseProblem, found: Agreement, rows: IndexArray, z: Array
