@@ -12,7 +12,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam.calibration.posterior import SIGMAS
 from slam.commands.display import progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
@@ -86,7 +85,7 @@ def _print(found: dict[str, Any]) -> None:
         cells = [f"{factor * one['mean']:.2f} ± {factor * one['sigma']:.2f}" for one in own]
         if apart:
             cells.append(f"{apart[k]:.1f} σ" if np.isfinite(apart[k]) else "–")
-        table.add_row(row["name"], unit, *cells, f"± {factor * SIGMAS[lens]:.2g}")
+        table.add_row(row["name"], unit, *cells, f"± {factor * found['usual'][k]:.2g}")
     console.print(table)
     console.print(_SIGN, highlight=False)
     for number, one in enumerate(recordings, 1):
