@@ -52,10 +52,11 @@ def calibrate(
     """Run a range of frames of recordings of one rig; returns what they say of it, which is also written to `out`.
 
     Besides the keys of `slam.calibration.SavedCalibration` it has ``recordings``, what each says alone; ``apart``, by
-    how many standard deviations two differ at most in each parameter (null for a single recording); ``agreement`` and
-    ``judgement``, the same and how good the calibration was, in words; ``worth_correcting``, whether correcting is
-    expected to help; ``usual``, how far good calibrations are off in each parameter; and ``warnings``. `opencv` is a file for the corrected calibration in that form, which is off by
-    ``opencv_off_px`` (RMS). `inputs` are never replaced. Raises SlamError on bad input, before anything is run.
+    how many standard deviations two differ at most in each parameter (null for a single recording); ``usual``, how far
+    good calibrations are off in each; ``agreement`` and ``judgement``, how good the calibration was, in words;
+    ``worth_correcting``, whether correcting is expected to help; and ``warnings``. `opencv` is a file for the corrected
+    calibration in that form, which is off by ``opencv_off_px`` (RMS). `inputs` are never replaced. Raises SlamError on
+    bad input, before anything is run.
     """
     rig = sequences[0].rig
     for sequence in sequences:
