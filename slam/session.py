@@ -77,13 +77,9 @@ class Session:
         return State(first, tracks, atlas, dimensions=dimensions, ever_mapped=mapped, prior_map=prior_map)
 
     def found_in_prior_map(self, state: State, features: StereoFeatures) -> State | None:
-        """The state with a back end at the pose at which the camera is found in the prior map; None if it is not.
-
-        Raises SlamError where the descriptors have another length than the map's.
-        """
+        """The state with a back end at the pose at which the camera is found in the prior map; None if it is not."""
         saved = state.prior_map
         assert saved is not None
-        saved.require_fits("", features.descriptors.shape[1])
         prediction, place = nowhere(features.stamp, self._config.models.initial_pose), None
         matches = self._tracker.localizer.match(prediction, saved.rows, saved.positions, features, state.index + 1)
         T = matches.T_world_left if len(matches) >= self._tracker.localizer.config.minimum_consistent else None

@@ -125,7 +125,7 @@ class StereoSlam:
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
         if prior_map is not None:
-            prior_map.require_fits(self.frontend_name, rig=rig)
+            prior_map.require_fits(self.frontend_name, rig)
         self._state = self._session.begin(first, prior_map)
 
     @property

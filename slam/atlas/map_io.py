@@ -226,29 +226,19 @@ class SavedMap:
             rig=np.array([numbers[name] for name in _RIG]),
         )  # fmt: skip
 
-    def require_fits(self, frontend: str = "", dimensions: int | None = None, rig: StereoRig | None = None) -> None:
-        """Check that a front end's descriptors can be compared with the map's, and that the cameras are the same.
+    def require_fits(self, frontend: str, rig: StereoRig) -> None:
+        """Check that the cameras and the front end, which may be empty where it is not known, are those of the map.
 
         Another calibration of the same cameras is accepted: what it changes is small.
 
-        Args:
-            frontend: its name; empty where it is not known.
-            dimensions: length of its descriptors, where it is known.
-            rig: the cameras, where they are known.
-
         Raises:
-            SlamError: they cannot, or are not.
+            SlamError: they are not.
         """
-        if rig is not None:
-            here, numbers = rig_numbers(rig), list(zip(_RIG, self.rig.tolist()))  # first the size of the images
-            if other := rig_difference(dict(numbers[:2]), here) or rig_difference(dict(numbers[2:]), here, _REFINED):
-                raise SlamError(f"{self.source}: the map is of another rig: {other}")
+        here, numbers = rig_numbers(rig), list(zip(_RIG, self.rig.tolist()))  # first the size of the images
+        if other := rig_difference(dict(numbers[:2]), here) or rig_difference(dict(numbers[2:]), here, _REFINED):
+            raise SlamError(f"{self.source}: the map is of another rig: {other}")
         if self.frontend and frontend and self.frontend != frontend:
             raise SlamError(f"{self.source}: its descriptors are of front end {self.frontend!r}, not {frontend!r}")
-        if dimensions is not None and dimensions != self.dimensions and len(self):
-            raise SlamError(
-                f"{self.source}: its descriptors have {self.dimensions} numbers, those of the front end {dimensions}"
-            )
 
 
 def save_map(path: str | Path, what: Any) -> None:
