@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.kernels.linear import assign, squared_distance, trace, turn, whitener
 from slam.kernels.se3 import between, transform_back
-from slam.kernels.stereo import by_pose, offsets, residual
+from slam.kernels.stereo import offsets, residual
 from slam.runtime.compilation import helper, kernel
 
 
@@ -96,19 +96,6 @@ def _distorted(coefficients, a, b, D):
 
 
 # --- one pose and known points ---
-
-
-@kernel
-def residuals(camera, points, z, T):
-    """Measured less predicted (M, 3), NaN where missing or behind, and the prediction's Jacobians (M, 3, 6) by T."""
-    r, J = np.empty((len(points), 3)), np.empty((len(points), 3, 6))
-    local, by_local = np.empty(3), np.empty((3, 3))
-    for m in range(len(points)):
-        transform_back(T, points[m], local)
-        residual(camera, local, z[m], r[m], by_local)
-        for i in range(3):
-            by_pose(by_local[i], local, J[m, i])
-    return r, J
 
 
 @kernel
