@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.linear import assign, squared_distance, trace, turn, whitener
-from slam.kernels.se3 import between, transform_back
+from slam.kernels.se3 import between, point_by_motion, transform_back
 from slam.kernels.stereo import offsets, residual
 from slam.runtime.compilation import helper, kernel
 
@@ -154,10 +154,7 @@ def seen(T, before, points, covariances, motion):
     for m in range(len(points)):
         transform_back(T, points[m], local[m])
         turn(R, covariances[m], out[m])
-        x, y, z = local[m]
-        G[0, 1], G[0, 2], G[1, 2] = -z, y, -x
-        G[1, 0], G[2, 0], G[2, 1] = z, -y, x
-        G[0, 3] = G[1, 4] = G[2, 5] = -1.0
+        point_by_motion(local[m], -1.0, G)
         for i in range(3):
             for j in range(6):
                 GM[i, j] = 0.0

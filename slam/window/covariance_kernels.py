@@ -8,18 +8,17 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.linear import assign, row_times, subtract, turn
-from slam.kernels.se3 import transform_back
-from slam.kernels.stereo import by_pose
+from slam.kernels.se3 import point_by_motion, transform_back
 from slam.runtime.compilation import helper, kernel
-from slam.window.terms import ELIMINATED, KNOWN, whitened_residual
+from slam.window.terms import ELIMINATED, KNOWN, row_jacobians, whitened_residual
 
 
 @kernel
-def point_relations(T, points, layout, E, cross, inverse, X, P_poses, newest, skipped):
-    """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each.
+def point_relations(T, points, asked, layout, E, cross, inverse, X, P_poses, newest, skipped):
+    """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each, of those `asked`.
 
     T's unknowns begin at `newest`, negative where it is fixed. `X` (x, x) is the last part of ``L⁻¹`` of the normal
-    equations' Cholesky factor, without the first `skipped` unknown points, whose covariances are left at zero.
+    equations' Cholesky factor, without the first `skipped` unknown points, which are not asked for.
     `P_poses` (6 F, 6 F) is the joint covariance of the free poses, `inverse` that of `slam.window.kernels`.
     """
     column, place, basis, _, pose_of, first, order = layout
@@ -31,7 +30,9 @@ def point_relations(T, points, layout, E, cross, inverse, X, P_poses, newest, sk
     A, AP = np.zeros((3, size)), np.zeros((3, size))
     q, D, G, M = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6))
     for p in range(len(points)):
-        if place[p] >= skipped:
+        if not asked[p]:
+            continue
+        if place[p] >= 0:
             assign(blocks[place[p] - skipped, :, :3], own)
             assign(blocks[place[p] - skipped, :, 3:], by)
         elif place[p] == ELIMINATED and inverse[p, 0, 0] > 0.0:
@@ -69,9 +70,7 @@ def point_relations(T, points, layout, E, cross, inverse, X, P_poses, newest, sk
         turn(D, own, camera[p])
         if newest < 0:
             continue
-        G[0, 1], G[0, 2], G[1, 2] = -q[2], q[1], -q[0]
-        G[1, 0], G[2, 0], G[2, 1] = q[2], -q[1], q[0]
-        G[0, 3] = G[1, 4] = G[2, 5] = -1.0
+        point_by_motion(q, -1.0, G)
         for i in range(3):
             for j in range(6):
                 M[i, j] = row_times(D, i, by[:, j])
@@ -115,15 +114,12 @@ def rig_columns(camera, poses, points, layout, E, rows, field, cross, inverse, B
         transform_back(T, points[p], q)
         if root[row, 0, 0] == 0.0 or not whitened_residual(camera, q, z[row], root[row], r, D):
             continue
+        row_jacobians(T, E[p], q, D, J, Jp)
         for i in range(3):
             for k in range(m):
                 F[i, k] = 0.0
                 for j in range(i + 1 if D[i, i % 2] != 0.0 else 0):  # none of what is not measured
                     F[i, k] += root[row, i, j] * field[row, j, k]
-            by_pose(D[i], q, J[i])
-            x, y, h = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
-            for a in range(3):
-                Jp[i, a] = x * E[p, 0, a] + y * E[p, 1, a] + h * E[p, 2, a]
         for k in range(m):
             for i in range(3):
                 for a in range(6 if at >= 0 else 0):

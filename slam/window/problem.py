@@ -10,6 +10,7 @@ import numpy as np
 
 from slam.geometry.arrays import Array, BoolArray, IndexArray, Table
 from slam.window import chart_kernels, terms
+from slam.window.kernels import by_point
 from slam.window.stereo import RectifiedStereo
 
 KNOWN, ELIMINATED = terms.KNOWN, terms.ELIMINATED
@@ -170,7 +171,7 @@ class Window:
         motion: constant velocity between successive poses, or of what the points belong to.
         prior: what is known of the first poses and of some points together.
         joining: points that are unknowns beside those of the prior (J,), instead of being eliminated.
-        asked: of which points that are unknowns covariances will be asked (N,); None for all. Each costs time.
+        asked: of which points covariances will be asked for (N,); None for all. Each costs time.
     """
 
     stereo: RectifiedStereo
@@ -204,16 +205,18 @@ class Window:
         if self.known is not None:
             place[self.known] = KNOWN
         place[members] = np.arange(len(members))
-        free = np.ones(len(self.poses), bool) if self.free is None else self.free
-        column = np.where(free, 3 * len(members) + 6 * (np.cumsum(free) - 1), -1)
+        at, free = 3 * len(members), len(self.poses)
+        column = at + 6 * np.arange(free)
+        if self.free is not None:
+            free = int(np.count_nonzero(self.free))
+            column = np.where(self.free, at + 6 * np.cumsum(self.free) - 6, -1)
         of_points = 3 * place[prior.points][:, None] + np.arange(3)
-        of_poses = column[: len(prior.relative), None] + np.arange(6)
-        point = np.concatenate([self.rows.point, self.places.point])
+        of_poses = at + np.arange(6 * len(prior.relative))
+        rows, places = self.rows, self.places
+        first, order = by_point(np.concatenate([rows.point, places.point]), len(place))
         return Layout(
-            column, place, basis, np.concatenate([of_points.ravel(), of_poses.ravel()]),
-            np.concatenate([self.rows.pose, self.places.pose]),
-            np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(place)))]),
-            np.argsort(point, kind="stable"), 3 * len(members), 3 * skipped, int(np.count_nonzero(free)),
+            column, place, basis, np.concatenate([of_points.ravel(), of_poses]),
+            np.concatenate([rows.pose, places.pose]), first, order, at, 3 * skipped, free,
         )  # fmt: skip
 
     @property

@@ -95,13 +95,13 @@ class Solution:
     def point_covariances(self, pose: int) -> tuple[Array, Array]:
         """Covariances (N, 3, 3) of the points in the coordinates of a pose, and in the world.
 
-        They are zero for points that are known, that nothing measures, or that are unknowns and not asked for.
+        They are zero for points that are known, that nothing measures, or that are not asked for.
         """
-        e = self.equations
-        w = e.window
+        e, w = self.equations, self.equations.window
+        asked = np.ones(len(w.points), bool) if w.asked is None else w.asked
         return covariance_kernels.point_relations(
-            w.poses[pose], w.points, w.layout[:7], e.E, e.cross, e.inverse, self.inverse_factor, self.pose_covariance,
-            int(w.layout.column[pose]), w.layout.asked // 3,
+            w.poses[pose], w.points, asked, w.layout[:7], e.E, e.cross, e.inverse, self.inverse_factor,
+            self.pose_covariance, int(w.layout.column[pose]), w.layout.asked // 3,
         )  # fmt: skip
 
     def left_out_distances(

@@ -162,31 +162,33 @@ def whitened_residual(camera, q, z, root, r, D):
 
 
 @helper
-def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, whole, H, b, information, gradient, cross):
-    """Add one row: residual r (3,), predicted numbers that change by D (3, 3) with the point q in the camera."""
-    T = poses[k]
-    free = place[p] != KNOWN
-    if free:
-        for i in range(3):
-            x, y, z = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
-            for j in range(3):
-                Jp[i, j] = x * E[p, 0, j] + y * E[p, 1, j] + z * E[p, 2, j]
-        for a in range(3):
-            gradient[p, a] += Jp[0, a] * r[0] + Jp[1, a] * r[1] + Jp[2, a] * r[2]
-            for c in range(3):
-                information[p, a, c] += Jp[0, a] * Jp[0, c] + Jp[1, a] * Jp[1, c] + Jp[2, a] * Jp[2, c]
-    at = column[k]
-    if at < 0:
-        return
+def row_jacobians(T, E, q, D, J, Jp):
+    """Derivatives of numbers that change by D (3, 3) with a point q in the camera: J (3, 6) by the camera's pose T.
+
+    And Jp (3, 3) by the coordinates of the chart in which the point has the derivatives E (3, 3).
+    """
     for i in range(3):
         by_pose(D[i], q, J[i])
-    for a in range(6):
+        x, y, z = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
+        for j in range(3):
+            Jp[i, j] = x * E[0, j] + y * E[1, j] + z * E[2, j]
+
+
+@helper
+def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, whole, H, b, information, gradient, cross):
+    """Add one row: residual r (3,), predicted numbers that change by D (3, 3) with the point q in the camera."""
+    row_jacobians(poses[k], E[p], q, D, J, Jp)
+    at, free = column[k], place[p] != KNOWN
+    for a in range(3 if free else 0):
+        gradient[p, a] += Jp[0, a] * r[0] + Jp[1, a] * r[1] + Jp[2, a] * r[2]
+        for c in range(3):
+            information[p, a, c] += Jp[0, a] * Jp[0, c] + Jp[1, a] * Jp[1, c] + Jp[2, a] * Jp[2, c]
+    for a in range(6 if at >= 0 else 0):
         b[at + a] += J[0, a] * r[0] + J[1, a] * r[1] + J[2, a] * r[2]
         for c in range(a + 1 if whole else 0):
             H[at + a, at + c] += J[0, a] * J[0, c] + J[1, a] * J[1, c] + J[2, a] * J[2, c]
-        if free:
-            for c in range(3):
-                cross[a, c] = J[0, a] * Jp[0, c] + J[1, a] * Jp[1, c] + J[2, a] * Jp[2, c]
+        for c in range(3 if free else 0):
+            cross[a, c] = J[0, a] * Jp[0, c] + J[1, a] * Jp[1, c] + J[2, a] * Jp[2, c]
 
 
 @helper
