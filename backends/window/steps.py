@@ -58,7 +58,8 @@ class Steps(RectifiedMeasurement):
         J[:, -12:] = by_last[:, -6 * K :]
         cross = J @ s.covariance
         own = cross @ J.T + noise
-        P = np.block([[s.covariance, cross.T], [cross, 0.5 * (own + own.T)]])
+        P = np.empty((6 * K + 6, 6 * K + 6))
+        P[:-6, :-6], P[-6:, :-6], P[:-6, -6:], P[-6:, -6:] = s.covariance, cross, cross.T, 0.5 * (own + own.T)
         moves = s.motion
         if begins or rests or s.frames[-1] == s.frames[-2] + 1:  # else the velocity before has left the window
             one = np.array([[-1 if unknown else K - 2, K - 1, K]])
