@@ -292,10 +292,10 @@ def _by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field:
 
     The errors move the landmarks in the world by `by_rig` (M, 3, m), and measurements by `field` (M, 3, m).
     """
-    H = one.stereo.project((one.points - T[:3, 3]) @ T[:3, :3])[1] @ T[:3, :3].T
-    W = one.whiteners
-    F = W @ np.nan_to_num(field - H @ by_rig)
-    return (W @ one.derivatives(T)).reshape(-1, 6), F.reshape(3 * len(F), F.shape[2])
+    local = (one.points - T[:3, 3]) @ T[:3, :3]
+    D = one.whiteners @ one.stereo.project(local)[1]
+    F = one.whiteners @ np.nan_to_num(field) - D @ T[:3, :3].T @ by_rig
+    return (D @ points_by_pose(local)).reshape(-1, 6), F.reshape(3 * len(F), F.shape[2])
 
 
 def _landmarks_by_rig(
