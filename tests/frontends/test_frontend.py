@@ -57,7 +57,7 @@ def test_same_bytes_whatever_the_threads(options):
         frontend = SurfFrontend(RIG, threads=threads, **options)
         runs.append([bytes_of(frontend.extract(StereoFrame(k, float(k), LEFT, RIGHT))) for k in range(3)])
     frontend, frames = SurfFrontend(RIG, **options), [StereoFrame(k, float(k), LEFT, RIGHT) for k in range(3)]
-    with ThreadPoolExecutor(1) as ahead:  # leaves one core for what is done beside
+    with ThreadPoolExecutor(1) as ahead:  # as in a run with overlap
         runs.append([bytes_of(ahead.submit(frontend.extract, frame).result()) for frame in frames])
     assert runs[0] == runs[1] == runs[2] == runs[3]
 
