@@ -41,7 +41,15 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
     for name in ("empty", "corridor", "text", "pair/port", "pair/starboard", "pair/run"):
         (here / name).mkdir(parents=True)
     images = [f"pair/{side}/{k}.png" for side in ("port", "starboard") for k in "01"]
-    for name in ("text/a.txt", "text/a.bag.gz", "text/a.svo", "both.mp4", "pair/run/summary.png", "sides/0.png", *images):
+    for name in (
+        "text/a.txt",
+        "text/a.bag.gz",
+        "text/a.svo",
+        "both.mp4",
+        "pair/run/summary.png",
+        "sides/0.png",
+        *images,
+    ):
         (here / name).parent.mkdir(exist_ok=True)
         (here / name).write_text("x")
     (here / "run").mkdir()
