@@ -165,20 +165,19 @@ def _image_topics(bag: Bag, options: Mapping[str, Any]) -> list[str]:
         raise SequenceError(f"{bag.path}: no images; its topics are {_listed(sorted(bag.kinds))}")
     cameras = _cameras(bag)
     if sides == ("left",):
-        if len(cameras) != 1:
-            line = f"{len(cameras)} topics of images, where layout=sbs needs one: add left=/… of {_listed(cameras)}"
-            raise SequenceError(f"{bag.path}: {line}")
-        return cameras
-    pairs = _pairs_by_name(cameras) if "calibration" in options else _pairs_by_messages(bag, cameras)
-    if len(pairs) > 1:
-        found = "; ".join("left={}&right={}".format(*pair) for pair in pairs[:3])
-        raise SequenceError(f"{bag.path}: several stereo pairs, choose one: {found}")
-    if not pairs:
+        found: list[tuple[str, ...]] = [(topic,) for topic in cameras]
+    else:
+        found = _pairs_by_name(cameras) if "calibration" in options else _pairs_by_messages(bag, cameras)
+    if len(found) > 1:
+        ways = ("&".join(f"{side}={topic}" for side, topic in zip(sides, topics)) for topics in found[:3])
+        what = "stereo pairs" if len(sides) == 2 else "topics of images"
+        raise SequenceError(f"{bag.path}: several {what}, choose one: {'; '.join(ways)}")
+    if not found:
         raise SequenceError(
             f"{bag.path}: its camera messages name no stereo pair: add left=/…&right=/… of {_listed(there)}, "
             "and calibration=FILE where the cameras are not calibrated"
         )
-    return list(pairs[0])
+    return list(found[0])
 
 
 def _rig_of_topics(bag: Bag, images: list[str], size: Size, options: Mapping[str, Any]) -> StereoRig:
@@ -194,12 +193,10 @@ def _rig_of_topics(bag: Bag, images: list[str], size: Size, options: Mapping[str
         for side, info in zip(("left", "right"), infos):
             if not (info["p"][1][0] > 0 and info["k"][1][0] > 0):
                 raise CalibrationError(f"the {side} camera is not calibrated: K or P is zero")
-        if infos[0]["size"][1] != infos[1]["size"][1]:
-            raise CalibrationError("the images of the two cameras differ in size")
     return rig_of(Entries(infos), where, size, {**options, "rectified": rectified})
 
 
-def _pairs_by_messages(bag: Bag, images: list[str]) -> list[tuple[str, str]]:
+def _pairs_by_messages(bag: Bag, images: list[str]) -> list[tuple[str, ...]]:
     """Cameras of one size and focal length whose CameraInfo has a baseline in the right one's projection."""
     cameras: dict[str, tuple[str, object, float]] = {}  # by name space: topic, what is equal in a pair, place [m]
     for topic in images:
@@ -218,9 +215,9 @@ def _pairs_by_messages(bag: Bag, images: list[str]) -> list[tuple[str, str]]:
     ]
 
 
-def _pairs_by_name(images: list[str]) -> list[tuple[str, str]]:
+def _pairs_by_name(images: list[str]) -> list[tuple[str, ...]]:
     """Pairs of topics of images that differ in one of the usual names for left and right, one of each two cameras."""
-    found: dict[tuple[str, str], tuple[str, str]] = {}
+    found: dict[tuple[str, str], tuple[str, ...]] = {}
     for topic in images:
         for names in SIDES:
             other = topic.replace(*names)

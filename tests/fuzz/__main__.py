@@ -8,12 +8,12 @@ import sys
 import time
 from collections import Counter
 
-from tests.fuzz import agreement, bags, bookkeeping, commands, library, readers, runs, saved, settings
+from tests.fuzz import agreement, bookkeeping, commands, library, readers, runs, saved, settings
 from tests.fuzz.harness import Failure, run_case, warm_up
 
 SUBJECTS = tuple(
     subject
-    for module in (readers, bags, settings, saved, commands, runs, library, agreement, bookkeeping)
+    for module in (readers, settings, saved, commands, runs, library, agreement, bookkeeping)
     for subject in module.SUBJECTS
 )
 

@@ -1,4 +1,4 @@
-"""Folders of every format with hostile files in them."""
+"""Folders of every format, and ROS recordings, with hostile files in them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 import slam
 from slam.sequences.images import quiet_libraries
-from tests import recordings
+from tests import bags, recordings
 from tests.fuzz.files import Files, mutate
 from tests.fuzz.harness import Broken, Subject
 from tests.fuzz.hostile import NUMBERS, PATHS, choose
@@ -142,4 +142,27 @@ def write(files: Files, root: Path) -> None:
             continue
 
 
-SUBJECTS = (Subject("folders", read_folder), Subject("paths", read_path))
+KINDS = ("walk.bag", "walk.bag CHUNKS", *(f"walk{e}{p}" for e in (".mcap", "") for p in ("", " FILE", " MESSAGE")))
+
+
+@cache
+def _recorded(kind: str) -> Files:
+    """The files of a small recording of a kind."""
+    with tempfile.TemporaryDirectory() as folder:
+        name, _, packed = kind.partition(" ")
+        version = 1 if name.endswith(".bag") else 2
+        bags.write(Path(folder) / name, bags.stereo(bags.STORES[version], 5), version, packed)
+        return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file()}
+
+
+def read_bag(rng: np.random.Generator, folder: Path) -> None:
+    """Write a damaged recording and read it to its end."""
+    files = dict(_recorded(choose(rng, KINDS)))
+    whole = folder / Path(min(files)).parts[0]
+    mutate(rng, files)
+    write(files, folder)
+    alone = sorted(path for path in whole.glob("*") if path.suffix != ".yaml") or [whole]
+    consume(str(whole if rng.random() < 0.6 else alone[0]))
+
+
+SUBJECTS = (Subject("folders", read_folder), Subject("paths", read_path), Subject("bags", read_bag, quiet=False))

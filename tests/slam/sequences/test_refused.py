@@ -41,20 +41,31 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
     for name in ("empty", "corridor", "text", "pair/port", "pair/starboard", "pair/run"):
         (here / name).mkdir(parents=True)
     images = [f"pair/{side}/{k}.png" for side in ("port", "starboard") for k in "01"]
-    for name in ("text/a.txt", "text/a.bag.gz", "both.mp4", "pair/run/summary.png", "sides/0.png", *images):
+    for name in (
+        "text/a.txt",
+        "text/a.bag.gz",
+        "text/a.svo",
+        "both.mp4",
+        "pair/run/summary.png",
+        "sides/0.png",
+        *images,
+    ):
         (here / name).parent.mkdir(exist_ok=True)
         (here / name).write_text("x")
     (here / "run").mkdir()
     (here / "run/config.json").write_text('{"source": "synthetic:desk"}')
     (here / "run/frames.csv").write_text("x")
-    for name in ("left", "right", "other/a"):
-        (here / "two" / name).mkdir(parents=True)
+    for name in ("two/left", "two/right", "two/other/a", "deep/a/b/c/left", "deep/a/b/c/right"):
+        (here / name).mkdir(parents=True)
     for path, words in {
         "nowhere": "nowhere: there is no such folder",
         "nowhere.bag": r"nowhere\.bag: there is no such file or folder",
         "empty": "the folder is empty",
         "text": "no sequence of a known format",
         "text/a.bag.gz": "; unpack it first$",
+        "text/a.svo": "; export it as a video of both images side by side$",
+        "sides/0.png": "; give the folder that holds both cameras' images$",
+        "deep": "below it is a.b.c: give that$",
         "sides": r"where each image holds both cameras: 'sides\?layout=sbs'",
         "text/a.txt": r"a\.txt: a file where the sequence's folder should be$",
         "both.mp4": r"folder should be; a video .* is .*both\.mp4\?layout=sbs",
