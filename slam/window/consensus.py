@@ -12,7 +12,6 @@ import numpy as np
 from slam.chi_square import chi_square_limit
 from slam.geometry import kernels
 from slam.geometry.arrays import BoolArray, IndexArray, median
-from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.window.gating import MIN_CONSENSUS
@@ -46,7 +45,10 @@ def find_consensus(
     monocular rows; an inlier is off by `threshold` at most in each. Raises CalibrationError where the rig is not
     rectified.
     """
-    matches = _Matches.of(rig, points, measured, threshold)
+    stereo = RectifiedStereo.of(rig)
+    matches = _Matches(
+        stereo, np.ascontiguousarray(points, float), measured - [0.0, 0.0, stereo.doffs], threshold
+    )  # fmt: skip
     clear = CLEAR_MAJORITY * len(points)
     first = matches.polished(guess)
     if first.inliers.sum() >= clear:
@@ -54,7 +56,7 @@ def find_consensus(
     nearer = matches.polished(matches.approached(guess))
     if nearer.inliers.sum() >= max(clear, float(first.inliers.sum())):
         return nearer
-    hypothesis = matches.best_hypothesis(rig, measured, hypotheses, seed)
+    hypothesis = matches.best_hypothesis(hypotheses, seed)
     if hypothesis is None:
         return first
     best = matches.polished(hypothesis)
@@ -81,11 +83,6 @@ class _Matches:
     points: Array  # (M, 3) in world coordinates [m]
     z: Array  # (M, 3), see `RectifiedStereo.measure`
     threshold: float  # largest error of an inlier [px]
-
-    @classmethod
-    def of(cls, rig: StereoRig, points: Array, measured: Array, threshold: float) -> _Matches:
-        stereo = RectifiedStereo.of(rig)
-        return cls(stereo, np.ascontiguousarray(points, float), measured - [0.0, 0.0, stereo.doffs], threshold)
 
     def errors(self, poses: Array) -> Array:
         """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
@@ -135,20 +132,20 @@ class _Matches:
             T = self.fitted(good & (error <= median(error[good])), T, 2)
         return T
 
-    def best_hypothesis(self, rig: StereoRig, measured: Array, hypotheses: int, seed: int) -> Array | None:
+    def best_hypothesis(self, hypotheses: int, seed: int) -> Array | None:
         """The pose (4, 4) from three matches with which most matches agree; None where there is none.
 
         Stops before all hypotheses are tried where a better one is improbable (one in a hundred).
         """
         rng = np.random.default_rng(seed)
         best, most, tried = None, 0, 0
-        among = np.flatnonzero(np.isfinite(measured[:, :2]).all(axis=1))
+        among = np.flatnonzero(np.isfinite(self.z[:, :2]).all(axis=1))
         if len(among) < MINIMAL_POINTS:
             return None
         while tried < hypotheses:
             count = min(_BATCH, hypotheses - tried)
             triples = among[rng.random((count, len(among))).argsort(axis=1)[:, :MINIMAL_POINTS]]
-            poses = _poses_of_three(rig.left, self.points, measured, triples)
+            poses = self.poses_of_three(triples)
             tried += count
             if not len(poses):
                 continue
@@ -159,18 +156,17 @@ class _Matches:
                 break
         return best
 
+    def poses_of_three(self, triples: IndexArray) -> Array:
+        """Poses T_world_left (H, 4, 4) from left pixels of triples (K, 3) of matches: up to four each (P3P)."""
+        import cv2
 
-def _poses_of_three(camera: PinholeCamera, points: Array, measured: Array, triples: IndexArray) -> Array:
-    """Poses T_world_left (H, 4, 4) from left pixels of triples (K, 3) of points (M, 3) [m]: up to four each (P3P)."""
-    import cv2
-
-    bearings = camera.normalise(measured[:, :2])
-    poses = []
-    for three in triples:
-        _, turns, shifts = cv2.solveP3P(points[three], bearings[three], np.eye(3), None, cv2.SOLVEPNP_P3P)
-        for turn, shift in zip(turns, shifts):
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-            poses.append(inverse(T))
-    found = np.array(poses).reshape(-1, 4, 4)
-    return found[np.isfinite(found).all(axis=(1, 2))]
+        bearings = (self.z[:, :2] - [self.stereo.u0, self.stereo.v0]) / self.stereo.f
+        poses = []
+        for three in triples:
+            _, turns, shifts = cv2.solveP3P(self.points[three], bearings[three], np.eye(3), None, cv2.SOLVEPNP_P3P)
+            for turn, shift in zip(turns, shifts):
+                T = np.eye(4)
+                T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+                poses.append(inverse(T))
+        found = np.array(poses).reshape(-1, 4, 4)
+        return found[np.isfinite(found).all(axis=(1, 2))]
