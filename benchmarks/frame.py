@@ -3,9 +3,9 @@
     python benchmarks/frame.py [--quick] [--orbslam3 PYTHON] [--out DIR]
 
 Real and rendered recordings, all back ends, detector of moving objects on, reading left out. Frame by frame, in turns:
-each back end, one ``cv2.SIFT`` with 800 features on the left image, and `orb_odometry`. Then each back end by itself
-with overlap (`StereoSlam.run`): the time from one result to the next. Then, with ``--orbslam3``, ORB-SLAM3 on the same
-images as fast as it goes; PYTHON, by default what the variable ORBSLAM3 names, is the interpreter of an environment in
+each back end, and one ``cv2.SIFT`` with 800 features on the left image. Then each back end by itself with overlap
+(`StereoSlam.run`): the time from one result to the next. Then, with ``--orbslam3``, ORB-SLAM3 on the same images as
+fast as it goes; PYTHON, by default what the variable ORBSLAM3 names, is the interpreter of an environment in
 which ``orbslam3-python`` is installed (``python -m venv E && E/bin/pip install orbslam3-python``), which is never
 imported here. Median times; compare the ratios, not the milliseconds. ORB-SLAM3's vocabulary is a small one of
 rendered images, good for tracking.
@@ -24,7 +24,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -34,7 +34,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.calls import ways_of
-from benchmarks.orb_odometry import OrbOdometry
 from benchmarks.orb_vocabulary import write_vocabulary
 from experiments.common import script_options
 from experiments.tables import markdown, write_json
@@ -53,13 +52,13 @@ HEADER = ("images", "what", "wall [ms]", "CPU [ms]", "wall / SIFT", "CPU / SIFT"
           "frames lost", "ATE [mm]")  # fmt: skip
 STAGES = ("extract", "predict", "associate", "update", "estimate", "objects", "manage", "atlas")
 WAYS = ("images", "what", *(f"{name} [ms]" for name in STAGES), "files", "calls between files", "Python calls")
-SIFT, ORB, ORBSLAM3 = "cv2.SIFT, 800 features, left", "cv2.ORB and PnP", "ORB-SLAM3"
+SIFT, ORBSLAM3 = "cv2.SIFT, 800 features, left", "ORB-SLAM3"
 OVERLAP = "{}, overlap"  # of a back end
 
 
 @dataclass(frozen=True)
 class Size:
-    """A recording, frames whose times do not count, frames that do, and features for ORB."""
+    """A recording, frames whose times do not count, frames that do, and features for ORB-SLAM3."""
 
     name: str
     sequence: str
@@ -72,14 +71,9 @@ class Size:
 class Times:
     """Wall and CPU time of each frame [ms], its pose (None where it was lost)."""
 
-    wall: list[float]
-    cpu: list[float]
-    poses: list[Array | None]
-
-    @classmethod
-    def none(cls) -> Times:
-        """Of no frame yet."""
-        return cls([], [], [])
+    wall: list[float] = field(default_factory=list)
+    cpu: list[float] = field(default_factory=list)
+    poses: list[Array | None] = field(default_factory=list)
 
     def take(self, call: Callable[[], Array | None]) -> None:
         """Time one frame."""
@@ -108,14 +102,12 @@ def measure(size: Size, orbslam3: str | None) -> dict[str, Times]:
     sequence = open_sequence(size.sequence)
     frames = list(sequence.frames(0, size.skipped + size.counted))
     systems = {name: StereoSlam(sequence.rig, backend=name, kind=sequence.kind) for name in ONLINE}
-    sift, odometry = cv2.SIFT_create(800), OrbOdometry(sequence.rig, size.features)
-    times = {name: Times.none() for name in (*ONLINE, SIFT, ORB)}
+    sift, times = cv2.SIFT_create(800), {name: Times() for name in (*ONLINE, SIFT)}
 
     for frame in frames:
         for name, system in systems.items():
             times[name].take(lambda s=system, f=frame: tracked(s.process(f)))
         times[SIFT].take(lambda f=frame: sift.detectAndCompute(f.left, None) and None)
-        times[ORB].take(lambda f=frame: odometry.process(f.left, f.right).copy())
     for name in ONLINE:
         times[OVERLAP.format(name)] = overlapped(sequence, name, frames)
     if orbslam3 is not None:
@@ -125,7 +117,7 @@ def measure(size: Size, orbslam3: str | None) -> dict[str, Times]:
 
 def overlapped(sequence: Sequence, backend: str, frames: list[StereoFrame]) -> Times:
     """A back end's times from result to result, the next frame's features being extracted beside its estimation."""
-    results, times = StereoSlam(sequence.rig, backend=backend, kind=sequence.kind).run(frames), Times.none()
+    results, times = StereoSlam(sequence.rig, backend=backend, kind=sequence.kind).run(frames), Times()
     for _ in frames:
         times.take(lambda: tracked(next(results)[1]))
     return times

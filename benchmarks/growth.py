@@ -1,4 +1,4 @@
-"""How the cost of a frame grows: with landmarks, measurements, features, moving objects and frames.
+"""How the cost of a frame grows with landmarks, measurements, features and moving objects; for frames see `long_run`.
 
     python benchmarks/growth.py [--quick] [--out DIR]
 
@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
 from experiments.common import script_options, timed
-from experiments.long_run import DT, MODELS, RIG, Corridor, measured, run
+from experiments.long_run import DT, MODELS, RIG, measured
 from experiments.tables import markdown, picture, write_json
 from slam.config import SystemConfig
 from slam.geometry import se3
@@ -35,8 +35,8 @@ from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
 HEADER = ("by", "what", "size", "CPU [ms]", "floor [ms]", "ratio")
-LANDMARKS, MEASURED, FEATURES, OBJECTS, FRAMES = (
-    "landmarks in the map, 30 measured", "landmarks measured, of 240", "features, 320x240", "moving cars", "frame",
+LANDMARKS, MEASURED, FEATURES, OBJECTS = (
+    "landmarks in the map, 30 measured", "landmarks measured, of 240", "features, 320x240", "moving cars",
 )  # fmt: skip
 
 
@@ -146,23 +146,17 @@ def by_objects(name: str, cars: int, frames: int) -> Point:
     return Point(OBJECTS, name, cars, *found)
 
 
-def along(name: str, frames: int) -> list[Point]:
-    """A walk along a corridor."""
-    return [Point(FRAMES, name, c.frame, c.milliseconds, None) for c in run(name, frames, frames // 6, Corridor())]
-
-
 def points(quick: bool) -> list[Point]:
     """All curves."""
     maps, counts = ((60, 120), (10, 40)) if quick else ((60, 150, 300, 600), (10, 30, 60, 120))
     features, cars = ((100, 400), (0, 2)) if quick else ((100, 200, 400, 800, 1600), (0, 1, 2, 3))
-    repeats, images, length = (10, 6, 60) if quick else (20, 24, 300)
+    repeats, images = (10, 6) if quick else (20, 24)
     found = []
     for name in ONLINE:
         found += [by_size(LANDMARKS, name, n, 30, repeats) for n in maps]
         found += [by_size(MEASURED, name, 240, m, repeats) for m in counts]
         found += [by_features(name, n, images) for n in features]
         found += [by_objects(name, n, images) for n in cars]
-        found += along(name, length)
     return found
 
 

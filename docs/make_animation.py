@@ -24,14 +24,13 @@ PACE = 110  #: time that each is shown [ms]
 MOST = 3_000_000  #: bytes
 
 SIDE = 320  #: of the map [px]
-METRES = 76.0  #: that it shows
 
 
 def main() -> None:
     """Run the system and write the file."""
     sequence = slam.open_sequence(WORLD)
     system = slam.StereoSlam(sequence.rig, backend="ekf", kind=sequence.kind)
-    growing = GrowingMap(METRES)
+    growing = GrowingMap()
     pictures = []
     for k, frame in enumerate(sequence.frames(*FRAMES)):
         result = system.process(frame)

@@ -1,8 +1,8 @@
-"""Lists of what the API pages hold, below the name of each module, so that they can be read where no site is built.
+"""Lists of what the API pages hold, with links to the sources, so that they can be read where no site is built.
 
     python docs/make_api.py
 
-Everything between a line ``::: module`` and the next one is written anew.
+Everything between a line ``::: module`` and the next one is written anew; the site leaves it out (`notebook_links`).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import re
 from importlib import import_module
 from pathlib import Path
 
+ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted((Path(__file__).parent / "api").glob("*.md"))
 
 
@@ -25,7 +26,8 @@ def listed(name: str) -> str:
     ]
     names = ", ".join(f"`{thing.__name__}`" for thing in own if inspect.getdoc(thing))
     first = (inspect.getdoc(module) or "").partition("\n")[0]
-    return f"`{name}`: {first}" + (f" Holds {names}." if names else "")
+    source = Path(inspect.getsourcefile(module) or "").resolve().relative_to(ROOT).as_posix()
+    return f"[`{name}`](../../{source}): {first}" + (f" Holds {names}." if names else "")
 
 
 def written(page: str) -> str:

@@ -1,6 +1,6 @@
 """The bookshelf aisle of paper A, section V, rendered, with both back ends: its figures, and the errors.
 
-    python experiments/aisle.py [--quick] [--world synthetic:aisle] [--out DIR]
+    python experiments/aisle.py [--quick] [--out DIR]
 
 Leaves for each back end the files of a run, and the pictures ``top_view.png`` (paper A, Fig. 6) and ``errors.png``.
 Prints a Markdown table. The paper's marks: mean
@@ -17,12 +17,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from experiments.common import script_options
+from experiments.common import AssociationCheck, script_options
 from experiments.tables import show
 from frontends import create
 from slam.config import SystemConfig
-from slam.data import FrameResult, StereoFeatures, StereoFrame
-from slam.evaluation.association_truth import SurfacePoints
+from slam.data import StereoFeatures, StereoFrame
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.registry import ONLINE
@@ -52,26 +51,6 @@ class Remembered:
         return self._features[frame.index]
 
 
-class AssociationCheck:
-    """Counts right associations frame by frame.
-
-    Args:
-        sequence: a rendered world.
-    """
-
-    def __init__(self, sequence: Any) -> None:
-        self._points = SurfacePoints(sequence)
-        self.right = self.wrong = 0
-
-    def frame(self, result: FrameResult) -> None:
-        """Take in one frame."""
-        uv = result.features.uv_left
-        error = self._points.errors(result.index, result.matched, uv[result.matched_features])
-        self.right += int((error < 3).sum())
-        self.wrong += int((error >= 3).sum())
-        self._points.add(result.index, result.added, uv[result.added_features])
-
-
 def position_errors(path: Trajectory, truth: Trajectory) -> np.ndarray:
     """Distances (F,) [cm] from the truth, in the frame of the first pose; nothing is aligned."""
     poses = np.linalg.inv(truth.poses[0]) @ truth.poses[: len(path.poses)]
@@ -85,29 +64,28 @@ def _mean_and_peak(errors: np.ndarray) -> tuple[float, float]:
 def row(sequence: Sequence, backend: str, frontend: Remembered, config: SystemConfig, out: Path) -> list[Any]:
     """Run one back end; its row of the table."""
     check = AssociationCheck(sequence)
-    summary = run(sequence, RunOptions(backend, "surf", config, out / backend), check.frame, frontend)
+    summary = run(
+        sequence,
+        RunOptions(backend, "surf", config, out / backend),
+        lambda result: check.add(result.index, result),
+        frontend,
+    )
     data = RunData.read(out / backend, backend)
     assert sequence.ground_truth is not None
     online = position_errors(data.online, sequence.ground_truth)
     final = position_errors(data.final, sequence.ground_truth)
     tracked = summary["status"].get("tracked", 0) + summary["status"].get("started", 0)
-    right = 100 * check.right / max(check.right + check.wrong, 1)
     return [
         backend, f"{tracked} of {summary['frames']}", *_mean_and_peak(online), *_mean_and_peak(final),
-        summary["landmarks"], right,
+        summary["landmarks"], check.share,
     ]  # fmt: skip
 
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "30 frames")
-    parser.add_argument("--world", default="synthetic:aisle", help="a rendered world")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
     arguments = parser.parse_args()
-    world = (
-        arguments.world + ("&" if "?" in arguments.world else "?") + "frames=30" if arguments.quick else arguments.world
-    )
-    sequence = open_sequence(world)
-    config = SystemConfig.for_kind(sequence.kind).with_settings(arguments.set)
+    sequence = open_sequence("synthetic:aisle?frames=30" if arguments.quick else "synthetic:aisle")
+    config = SystemConfig.for_kind(sequence.kind)
     frontend = Remembered(create("surf", sequence.rig, **config.frontend))
     rows = [row(sequence, backend, frontend, config, arguments.out) for backend in ONLINE]
     runs = [RunData.read(arguments.out / backend, backend) for backend in ONLINE]

@@ -86,17 +86,16 @@ def show_drives(drives: Mapping[str, Path], out: Path, frames: int | None) -> No
     """Corrections by each drive that both of them show, and how far apart they are."""
     sequences = [open_sequence(f) for f in drives.values()]
     quiet = nullcontext(lambda _: None)
-    result = calibrate(sequences, out / "rig.json", lambda *_: quiet, (), (0, frames), overwrite=True)
-    apart = np.full(len(result.units), np.nan) if result.apart is None else result.apart
-    rows = [
-        [
-            result.kept.posterior.names[i], unit,
-            *(f"{factor * f.posterior.mean[i]:.2f} ± {factor * f.posterior.sigma[i]:.2f}" for f in result.found),
-            f"{apart[i]:.1f}",
-        ]
-        for i, (factor, unit) in enumerate(result.units) if np.isfinite(apart[i])
-    ]  # fmt: skip
-    show(out / "drives.json", ("parameter", "unit", *drives, "apart [sigma]"), rows, 2, result.agreed)
+    found = calibrate(sequences, out / "rig.json", lambda *_: quiet, (), (0, frames), overwrite=True)
+    alone = [one["parameters"] for one in found["recordings"]]
+    rows = []
+    for k, row in enumerate(found["parameters"]):
+        if found["apart"] is not None and np.isfinite(found["apart"][k]):
+            factor, unit = (1.0, "") if row["unit"] == "1" else (1e3, f"10⁻³ {row['unit']}")
+            cells = (f"{factor * one[k]['mean']:.3f} ± {factor * one[k]['sigma']:.3f}" for one in alone)
+            rows.append([row["name"], unit, *cells, f"{found['apart'][k]:.1f}"])
+    header = ("parameter", "unit", *drives, "apart [sigma]")
+    show(out / "drives.json", header, rows, 2, found["agreement"] or "")
 
 
 def main() -> int:
@@ -115,7 +114,7 @@ def main() -> int:
     show(out / "worlds.json", header, rows, 1)
     drives = recordings(DRIVES)
     if len(drives) == len(DRIVES):
-        print("\nThe same rig on two drives of one day (mean ± standard deviation):\n")
+        print("\nThe same rig on two drives of one day:\n")
         show_drives(drives, out, 12 if arguments.quick else None)
     return 0
 

@@ -7,13 +7,14 @@ import os
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
+from slam.evaluation.association_truth import SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence
 
@@ -69,3 +70,23 @@ def timed(step: Callable[[T], FrameResult], frames: Iterable[T]) -> tuple[list[F
         results.append(step(frame))
         times.append(1e3 * (time.process_time() - start))
     return results, np.array(times)
+
+
+class AssociationCheck:
+    """Counts right associations in a rendered world."""
+
+    def __init__(self, sequence: Any) -> None:
+        self._points = SurfacePoints(sequence)
+        self._right = self._known = 0
+
+    def add(self, k: int, result: FrameResult) -> None:
+        """Take in what was made of the world's frame k."""
+        uv = result.features.uv_left
+        off = self._points.errors(k, result.matched, uv[result.matched_features])
+        self._right, self._known = self._right + int((off < 3).sum()), self._known + int((~np.isnan(off)).sum())
+        self._points.add(k, result.added, uv[result.added_features])
+
+    @property
+    def share(self) -> float:
+        """Of the associations whose truth is known, those within 3 px of it [%]."""
+        return 100 * self._right / max(self._known, 1)

@@ -20,12 +20,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from experiments.common import script_options
+from experiments.common import AssociationCheck, script_options
 from experiments.tables import picture, show
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
-from slam.evaluation.association_truth import SurfacePoints
 from slam.geometry.se3 import inverse
 from slam.registry import ONLINE
 from slam.sequences import open_sequence
@@ -91,12 +90,10 @@ def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) 
     system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
     truth = sequence.ground_truth.poses
     world = np.linalg.inv(truth[features[0][0]])
-    points, results, errors, right, total = SurfacePoints(sequence), [], [], 0, 0
+    check, results, errors = AssociationCheck(sequence), [], []
     for k, seen in features:
         result = system.process_features(seen)
-        off = points.errors(k, result.matched, seen.uv_left[result.matched_features])
-        right, total = right + int((off < 3).sum()), total + int((~np.isnan(off)).sum())
-        points.add(k, result.added, seen.uv_left[result.added_features])
+        check.add(k, result)
         if result.status.value == "started":  # errors count from where the map begins
             world = result.estimate.T_world_left @ np.linalg.inv(truth[k])
         errors.append(100 * float(np.linalg.norm((inverse(world @ truth[k]) @ result.estimate.T_world_left)[:3, 3])))
@@ -105,7 +102,7 @@ def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) 
     after = errors[found[0] :] if found else [float("nan")]
     row = [
         fault.name, backend, states(results), float(np.mean(after)), max(after), errors[-1],
-        found[0] - fault.over if found else None, 100 * right / max(total, 1),
+        found[0] - fault.over if found else None, check.share,
     ]  # fmt: skip
     return row, errors
 

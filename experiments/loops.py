@@ -1,7 +1,7 @@
 """What closing loops gives on long drives that come back: the path's error with and without, and how sure it is.
 
     SLAM_DATA=/path/to/data python experiments/loops.py [--quick] [--paths 00 05 …] [--backend NAME ...]
-        [--set KEY=VALUE …] [--option KEY=VALUE …] [--out DIR]
+        [--set KEY=VALUE …] [--out DIR]
 
 Features of streets along true roads (``kitti_paths`` of the data folder), or of the built-in town where there is no
 such folder. The system is told a focal length that is 0.5 % too long, so that the path drifts. Prints a Markdown table
@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,10 +50,10 @@ _FAR = 40.0  # from which a place can be seen again, at most [m]
 class Drive:
     """One drive with one back end."""
 
-    results: list[FrameResult] = field(default_factory=list)  # of the frames, without their features
-    atlas: Atlas = field(default_factory=Atlas)  # at the end
-    final: Trajectory = field(default_factory=Trajectory.empty)  # the path as estimated at the end
-    truth: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # in the axes of its first pose (F, 4, 4)
+    results: list[FrameResult]  # of the frames, without their features
+    atlas: Atlas  # at the end
+    final: Trajectory  # the path as estimated at the end
+    truth: np.ndarray  # in the axes of its first pose (F, 4, 4)
 
     @property
     def online(self) -> np.ndarray:
@@ -66,28 +66,15 @@ class Drive:
         return np.array([inverse(r.T_map_odom) @ r.estimate.T_world_left for r in self.results])
 
 
-def drive(name: str, backend: str, settings: list[str], images: bool = False) -> Drive:
-    """Drive along a world's path, from its features, or from images.
-
-    Args:
-        name: of the sequence.
-        backend: its name.
-        settings: as of the command.
-        images: take them; else the features that a world gives.
-    """
+def drive(name: str, backend: str, settings: list[str]) -> Drive:
+    """Drive along a world's path, from its features."""
     sequence = open_sequence(name)
-    frontend = "surf" if images else None
-    config = SystemConfig.for_kind("driving", frontend).with_settings(settings)
-    system = StereoSlam(sequence.rig, frontend, backend, config=config)
-    out, count = Drive(), len(sequence)
-    frames = iter(sequence) if images else None
-    for k in range(count):
-        one = system.process_features(sequence.observations(k)) if frames is None else system.process(next(frames))
-        out.results.append(_light(one))
+    config = SystemConfig.for_kind("driving", None).with_settings(settings)
+    system = StereoSlam(sequence.rig, None, backend, config=config)
+    results = [_light(system.process_features(sequence.observations(k))) for k in range(len(sequence))]
     assert sequence.ground_truth is not None
-    truth = sequence.ground_truth.poses[:count]
-    out.atlas, out.final, out.truth = system.atlas, system.trajectory(), inverse(truth[0]) @ truth
-    return out
+    truth = sequence.ground_truth.poses
+    return Drive(results, system.atlas, system.trajectory(), inverse(truth[0]) @ truth)
 
 
 def _light(result: FrameResult) -> FrameResult:
@@ -153,14 +140,13 @@ def tables(rows: list[list[str]]) -> str:
 
 def worlds(given: argparse.Namespace) -> dict[str, str]:
     """Names of the drives, and the sequences."""
-    extra = "".join(f"&{option}" for option in given.option)
     if given.quick:
-        return {"town": f"synthetic:town?descriptor=16&focal_error=0.005&speed=2&frames=420{extra}"}
+        return {"town": "synthetic:town?descriptor=16&focal_error=0.005&speed=2&frames=420"}
     folder = Path(os.environ.get("SLAM_DATA", "")) / "kitti_paths"
     found = {
         n: folder / f"{n}.txt" for n in given.paths if "SLAM_DATA" in os.environ and (folder / f"{n}.txt").exists()
     }
-    options = f"descriptor=16&focal_error=0.005{extra}"
+    options = "descriptor=16&focal_error=0.005"
     return {n: f"synthetic:drive?path={f}&{options}" for n, f in found.items()} or {"town": f"synthetic:town?{options}"}
 
 
@@ -190,7 +176,6 @@ def main() -> None:
     parser.add_argument("--paths", nargs="*", default=["06"])
     parser.add_argument("--backend", nargs="*", default=list(ONLINE))
     parser.add_argument("--set", nargs="*", default=[])
-    parser.add_argument("--option", nargs="*", default=[])
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     quick = list(QUICK) if given.quick else []

@@ -1,12 +1,11 @@
 """Moving objects: found without being told, and by the papers' Procedure 1, against known truth.
 
-    [SLAM_DATA=/path/to/data] python experiments/moving_objects.py [--quick] [--resume] [--only PART,…]
-        [--out DIR]
+    [SLAM_DATA=/path/to/data] python experiments/moving_objects.py [--quick] [--only PART,…] [--out DIR]
 
 Parts: table1 (paper B, Table 1: a box at four places), moving (the box under a moving camera, with and without it),
 boxes, occlusion (the box's id after it was hidden), still (no false movers), people (cyclists, walkers), kitti (two
 overtaking cars), cyclists (KITTI raw 0001, several starts). Prints Markdown tables, leaves them in DIR as JSON. Worlds
-are rendered and SURF runs on them; with `--observations` they give noisy observations without images.
+are rendered, and SURF runs on them.
 """
 
 from __future__ import annotations
@@ -47,12 +46,6 @@ from slam.papers.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother", "window")
 PARTS = ("table1", "moving", "boxes", "occlusion", "still", "people", "kitti", "cyclists")
-TITLES = {
-    "table1": "The box at four places (paper B, Table 1)", "moving": "The box under a moving camera",
-    "boxes": "Four boxes", "occlusion": "The box is hidden",
-    "still": "Nothing moves", "people": "People", "kitti": "Cars of KITTI raw 0013",
-    "cyclists": "Cyclists of KITTI raw 0001",
-}  # fmt: skip
 # The box moves in frames 60 to 105: from which frame it is watched, when it vanishes, and for how many frames.
 WATCHED_FROM, HIDDEN_AT, HIDDEN_FOR, WATCHED_AFTER = 50, 85, (15, 60), 15
 PLACES_AT = (1.0, 5.0, 8.5, 12.0)  # when the box has stood at B0 to B3 for a while [s]
@@ -82,8 +75,8 @@ def absolute_pose_errors(estimated: Array, true: Array) -> PathErrors:
     return error_sizes(inverse(estimated @ body_alignment(estimated, true)) @ true)
 
 
-def table1(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Where the box is said to be while it rests at its four places, and the errors."""
+def table1(quick: bool, out: Path) -> list[dict[str, Any]]:
+    """The box at four places (paper B, Table 1): the largest errors while it rests."""
     name = "box?density=300&camera=still"
     sequence = slam.open_sequence(f"synthetic:{name}")
     frames = 40 if quick else len(sequence)
@@ -91,12 +84,12 @@ def table1(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     rows = []
     for backend in BACKENDS:
         for mode in ("detect", "procedure1"):
-            system = system_for(sequence, backend, images, [])
+            system = system_for(sequence, backend, [])
             if mode == "procedure1":
-                system.objects = known_box(sequence, system, *seen_in(name, images, frames)[0])
+                system.objects = known_box(sequence, system, *seen_in(name, frames)[0])
             poses: dict[int, dict[int, np.ndarray]] = {}
             world = None
-            for k, result, _ in steps(name, system, images, frames):
+            for k, result, _ in steps(name, system, frames):
                 if world is None:
                     world = inverse(result.estimate.T_world_left @ inverse(sequence.ground_truth.poses[0]))
                 for thing in result.objects:
@@ -134,15 +127,15 @@ def place_rows(sequence: Any, true: Any, poses: dict[int, Any], backend: str, mo
     return rows
 
 
-def moving(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """The box under a moving camera, and the same run without the box's features."""
+def moving(quick: bool, out: Path) -> list[dict[str, Any]]:
+    """The box under a moving camera: with, and without the box's features."""
     name, frames = "box?density=300&camera=moving&seed=0", 90 if quick else 10**6
     rows, scores = [], {}
     for backend in BACKENDS:
-        row, scores[backend] = scored_run(name, backend, images, frames)
+        row, scores[backend] = scored_run(name, backend, frames)
         sequence = slam.open_sequence(f"synthetic:{name}")
-        system = system_for(sequence, backend, images, ["objects.mode=off"])
-        bare = [result for _, result, _ in steps(name, system, images, frames, without=True)]
+        system = system_for(sequence, backend, ["objects.mode=off"])
+        bare = [result for _, result, _ in steps(name, system, frames, without=True)]
         row["ATE without the box [mm]"] = camera_figures(sequence, bare)["ATE [mm]"]
         rows.append(row)
     draw_errors(scores, out / "box.png")
@@ -164,19 +157,19 @@ def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
             turned.legend(fontsize=8)
 
 
-def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Three boxes and an articulated one, in three rooms: one run tells little of how they are counted."""
+def boxes(quick: bool, out: Path) -> list[dict[str, Any]]:
+    """Four boxes: three, and one with a lid on a hinge; three rooms."""
     frames, seeds = (20, 1) if quick else (300, 3)
     worlds = [f"boxes?density=300&seed={seed}&layout={seed}" for seed in range(seeds)]
-    return [scored_run(world, backend, images, frames)[0] for world in worlds for backend in BACKENDS]
+    return [scored_run(world, backend, frames)[0] for world in worlds for backend in BACKENDS]
 
 
-def occlusion(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """The box is hidden for half a second or two while it moves and comes to rest: how often it keeps its id."""
+def occlusion(quick: bool, out: Path) -> list[dict[str, Any]]:
+    """The box is hidden: how often it keeps its id, of ten runs."""
     found: dict[tuple[str, int], list[tuple[set[int], set[int], int]]] = {}
     for seed in range(1 if quick else 10):
         for backend, frames in [(b, h) for h in HIDDEN_FOR for b in BACKENDS][: 1 if quick else None]:
-            found.setdefault((backend, frames), []).append(ids_about(seed, backend, frames, images))
+            found.setdefault((backend, frames), []).append(ids_about(seed, backend, frames))
     return [
         {
             "back end": backend, "hidden [s]": frames / 30, "runs": len(runs),
@@ -188,13 +181,13 @@ def occlusion(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def ids_about(seed: int, backend: str, frames: int, images: bool) -> tuple[set[int], set[int], int]:
+def ids_about(seed: int, backend: str, frames: int) -> tuple[set[int], set[int], int]:
     """Ids measured before the box is hidden for so many frames, and soon after; frames until it is found."""
     name, back = f"box?density=300&camera=moving&seed={seed}", HIDDEN_AT + frames
     sequence = slam.open_sequence(f"synthetic:{name}")
-    system = system_for(sequence, backend, images, [])
+    system = system_for(sequence, backend, [])
     before, after, delay = set(), set(), WATCHED_AFTER
-    seen = seen_in(name, images, HIDDEN_AT + max(HIDDEN_FOR) + WATCHED_AFTER, WATCHED_FROM)
+    seen = seen_in(name, HIDDEN_AT + max(HIDDEN_FOR) + WATCHED_AFTER, WATCHED_FROM)
     for k, (features, labels) in enumerate(seen[: back + WATCHED_AFTER - WATCHED_FROM], WATCHED_FROM):
         shown = features.select(labels == 0) if HIDDEN_AT <= k < back else features
         ids = {thing.id for thing in system.process_features(shown).objects if thing.estimate.measured}
@@ -205,27 +198,27 @@ def ids_about(seed: int, backend: str, frames: int, images: bool) -> tuple[set[i
     return before, after, delay
 
 
-def still(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Worlds of which no part moves: whatever is found in them is wrong. Medians over the seeds."""
+def still(quick: bool, out: Path) -> list[dict[str, Any]]:
+    """Nothing moves: whatever is found is wrong. Medians over ten seeds."""
     seeds, frames = (1, 15) if quick else (10, 100)
     worlds = ("aisle?speed=2&", "desk?density=200&", "field?", "street?cars=0&")
-    return [scored_run(f"{w}seed={seed}", "ekf", images, frames)[0] for w in worlds for seed in range(seeds)]
+    return [scored_run(f"{w}seed={seed}", "ekf", frames)[0] for w in worlds for seed in range(seeds)]
 
 
-def people(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Cyclists and walkers beside parked cars; nothing in the detector was chosen on this world."""
-    return [scored_run("people?", backend, images, 20 if quick else 10**6)[0] for backend in BACKENDS]
+def people(quick: bool, out: Path) -> list[dict[str, Any]]:
+    """Cyclists and walkers: nothing in the detector was chosen on this world."""
+    return [scored_run("people?", backend, 20 if quick else 10**6)[0] for backend in BACKENDS]
 
 
-def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Two cars overtake, a van comes; parked cars must not be made objects."""
+def kitti(quick: bool, out: Path) -> list[dict[str, Any]]:
+    """Cars of KITTI raw 0013: two overtake; parked ones must not be made objects."""
     folder = recording(KITTI)
     if folder is None:
         return []
     labels = read_labels(folder / "label_02_0003.txt")
     sequence = slam.open_sequence(folder)
     frames = 12 if quick else len(sequence)
-    system = system_for(sequence, "ekf", True, [])
+    system = system_for(sequence, "ekf", [])
     features = [system.frontend.extract(frame) for frame in sequence.frames(0, frames)]
     clear = [f.select(~hidden(f, labels.get(k, {}), MOVING_CARS)) for k, f in enumerate(features)]
     rows = []
@@ -233,13 +226,12 @@ def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
         results = drive(sequence, backend, features)
         rows += car_rows(backend, results, labels)
         paths = {
-            "as it is": results,
-            "detector off": drive(sequence, backend, features, "objects.mode=off"),
+            "ATE [m]": results,
+            "without the detector": drive(sequence, backend, features, "objects.mode=off"),
             "moving cars masked out": drive(sequence, backend, clear, "objects.mode=off"),
         }
-        for name, run in paths.items():
-            ate = evaluate(path_of(run), sequence)["ATE RMSE [m]"]
-            rows.append({"back end": backend, "object": f"camera, {name}", "ATE [m]": ate})
+        ates = {name: evaluate(path_of(run), sequence)["ATE RMSE [m]"] for name, run in paths.items()}
+        rows.append({"back end": backend, **ates})
     return rows
 
 
@@ -253,14 +245,14 @@ def recording(name: str) -> Path | None:
     return None
 
 
-def cyclists(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Of all labelled objects the cyclists and a far tram move; whatever else is reported is wrong. Runs by start."""
+def cyclists(quick: bool, out: Path) -> list[dict[str, Any]]:
+    """Cyclists of KITTI raw 0001: what is reported besides is wrong. Four first frames."""
     folder = recording(CYCLISTS)
     if folder is None:
         return []
     labels = read_tracklets(folder / "tracklet_labels.xml", folder.parent)
     sequence = slam.open_sequence(folder)
-    system = system_for(sequence, "ekf", True, [])
+    system = system_for(sequence, "ekf", [])
     features = [system.frontend.extract(frame) for frame in sequence.frames(0, 12 if quick else len(sequence))]
     rows = []
     for backend in BACKENDS:
@@ -316,7 +308,7 @@ def seen_centre(result: FrameResult, thing: MovingObject) -> np.ndarray:
 
 def drive(sequence: Any, backend: str, features: list[StereoFeatures], *settings: str) -> list[FrameResult]:
     """A run on features that are extracted already."""
-    system = system_for(sequence, backend, True, list(settings))
+    system = system_for(sequence, backend, list(settings))
     return [system.process_features(f) for f in features]
 
 
@@ -341,7 +333,7 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
         rows.append({
             "back end": backend, "object": id, "car": car, "frames": f"{history[0][0]}-{history[-1][0]}",
             "measured": len(history), "speed within 25 m [m/s]": float(own),
-            "error [%]": float(100 * abs(own / true - 1)), "ATE [m]": None,
+            "error [%]": float(100 * abs(own / true - 1)),
         })  # fmt: skip
     return rows
 
@@ -350,7 +342,7 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """A Markdown table of the rows' plain values; where they have bodies, these follow in a table of their own."""
+    """Markdown tables of the rows' plain values, one for each kind of rows; bodies follow."""
     if not rows:
         return "(nothing)"
     bodies = [
@@ -359,25 +351,23 @@ def table(rows: list[dict[str, Any]]) -> str:
         for number, body in row.get("bodies", {}).items()
         if body["frames in view"] and row["world"].startswith("box?")  # of many bodies a table is too long
     ]
-    return plain_table(rows) + ("\n\n" + plain_table(bodies) if bodies else "")
+    kinds: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for row in (*rows, *bodies):
+        kinds.setdefault(tuple(row), []).append(row)
+    return "\n\n".join(map(plain_table, kinds.values()))
 
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "a few frames of each part")
-    parser.add_argument("--observations", action="store_true", help="worlds as observations, not rendered")
     parser.add_argument("--only", default=",".join(PARTS), help="parts, joined by commas")
-    parser.add_argument("--resume", action="store_true", help="parts that are in the folder already are not run again")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.only.split(","):
-        kept = arguments.out / f"{name}.json"
-        if arguments.resume and kept.exists():
-            rows = json.loads(kept.read_text())
-        else:
-            rows = globals()[name](not arguments.observations, arguments.quick, arguments.out)
+        rows = globals()[name](arguments.quick, arguments.out)
         shown = {"still": worlds_together, "table1": places_together}.get(name, list)(rows)
-        print(f"\n# {TITLES[name]}\n\n{globals()[name].__doc__}\n\n{table(shown)}", flush=True)
-        kept.write_text(json.dumps(rows, indent=2, default=str) + "\n")
+        title, _, said = globals()[name].__doc__.partition(": ")
+        print(f"\n# {title}\n\n{said and said[0].upper() + said[1:]}\n\n{table(shown)}", flush=True)
+        (arguments.out / f"{name}.json").write_text(json.dumps(rows, indent=2, default=str) + "\n")
     return 0
 
 

@@ -19,35 +19,28 @@ from slam.evaluation.summary import evaluate
 
 
 @lru_cache(maxsize=2)
-def seen_in(name: str, images: bool, frames: int, first: int = 0) -> list[tuple[StereoFeatures, Any]]:
-    """Features of a synthetic world's frames `first` up to, but without, `frames`, and the body of each feature.
-
-    They are found in its images, or simulated.
-    """
+def seen_in(name: str, frames: int, first: int = 0) -> list[tuple[StereoFeatures, Any]]:
+    """Features in a synthetic world's frames `first` up to, but without, `frames`, and the body of each feature."""
     sequence = slam.open_sequence(f"synthetic:{name}")
     numbers = range(first, min(frames, len(sequence)))
-    if not images:
-        return [(s.features, s.objects) for s in map(sequence.simulate, numbers)]
     options = SystemConfig.for_kind(sequence.kind).frontend
     frontend = registry.create("frontends", "surf", sequence.rig, **options)
     found = [frontend.extract(sequence.frame(k)) for k in numbers]
     return [(features, labels_in_images(sequence, k, features)) for k, features in zip(numbers, found)]
 
 
-def system_for(sequence: Any, backend: str, images: bool, settings: list[str]) -> slam.StereoSlam:
-    frontend = "surf" if images else None
-    config = SystemConfig.for_kind(sequence.kind, frontend).with_settings(settings)
-    return slam.StereoSlam(sequence.rig, frontend, backend, config=config)
+def system_for(sequence: Any, backend: str, settings: list[str]) -> slam.StereoSlam:
+    config = SystemConfig.for_kind(sequence.kind).with_settings(settings)
+    return slam.StereoSlam(sequence.rig, "surf", backend, config=config)
 
 
 def steps(
-    name: str, system: slam.StereoSlam, images: bool, frames: int, without: bool = False
+    name: str, system: slam.StereoSlam, frames: int, without: bool = False
 ) -> Iterator[tuple[int, FrameResult, Any]]:
     """Every frame's number, result and labels; `without` leaves out the features on moving bodies."""
-    for k, (features, labels) in enumerate(seen_in(name, images, frames)):
+    for k, (features, labels) in enumerate(seen_in(name, frames)):
         if without:
-            keep = labels == 0 if images else labels <= 0  # features on its outline move with it
-            features, labels = features.select(keep), labels[keep]
+            features, labels = features.select(labels == 0), labels[labels == 0]  # those on its outline move with it
         yield k, system.process_features(features), labels
 
 
@@ -56,17 +49,15 @@ def camera_figures(sequence: Any, results: list[FrameResult]) -> dict[str, float
     return {"ATE [mm]": 1e3 * evaluate(path, sequence)["ATE RMSE [m]"]}
 
 
-def scored_run(
-    name: str, backend: str, images: bool, frames: int, *settings: str
-) -> tuple[dict[str, Any], ObjectScore]:
+def scored_run(name: str, backend: str, frames: int, *settings: str) -> tuple[dict[str, Any], ObjectScore]:
     """One run of a world: the score's figures and the camera's; and the score."""
     sequence = slam.open_sequence(f"synthetic:{name}")
     score = score_for(sequence) or ObjectScore(
         np.zeros((0, len(sequence), 4, 4)), sequence.stamps, sequence.ground_truth.poses, sequence.rig.left.fu
     )
-    system = system_for(sequence, backend, images, list(settings))
+    system = system_for(sequence, backend, list(settings))
     results = []
-    for k, result, labels in steps(name, system, images, frames):
+    for k, result, labels in steps(name, system, frames):
         score.add(k, result, labels)
         results.append(result)
     summary = score.summary()

@@ -13,7 +13,6 @@ import ast
 import json
 import re
 import sys
-import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,8 @@ sys.path.insert(0, str(ROOT))
 
 #: Where constants that shape an estimate are; worlds, readers, reports and commands have none.
 ROOMS = (
-    "slam/kernels", "slam/geometry", "slam/tracks", "slam/tracks", "slam/calibration", "slam/bodies", "slam/papers",
-    "backends", "frontends",
+    "slam/kernels", "slam/geometry", "slam/input", "slam/tracks", "slam/window", "slam/atlas", "slam/calibration",
+    "slam/bodies", "backends", "frontends",
 )  # fmt: skip
 
 INTRODUCTION = """# Parameters
@@ -81,7 +80,6 @@ def find(root: Path = ROOT) -> list[Parameter]:
 
 def _of_file(file: Path, name: str) -> list[Parameter]:
     text = file.read_text(encoding="utf-8")
-    comments = _comments(file)
     found = []
     for node in ast.parse(text).body:
         if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
@@ -92,7 +90,7 @@ def _of_file(file: Path, name: str) -> list[Parameter]:
         for each, value in zip(names, values):
             number = _number(value)
             if number is not None and isinstance(each, ast.Name) and each.id == each.id.upper():
-                comment = _comment(comments, node.lineno, node.end_lineno)
+                comment = _comment(text.splitlines(), node.lineno, node.end_lineno)
                 kind, colon, rest = comment.partition(": ")
                 known = bool(colon) and kind in KINDS
                 found.append(Parameter(name, each.id, number, rest if known else comment, kind if known else "choice"))
@@ -110,27 +108,16 @@ def _number(node: ast.expr) -> Any:
     return value if good else None
 
 
-def _comments(file: Path) -> dict[int, tuple[str, bool]]:
-    """Comments by line, and whether they have the line for themselves."""
-    with tokenize.open(file) as lines:
-        tokens = tokenize.generate_tokens(lines.readline)
-        return {
-            t.start[0]: (t.string.lstrip("#: ").strip(), not t.line[: t.start[1]].strip())
-            for t in tokens
-            if t.type == tokenize.COMMENT
-        }
-
-
-def _comment(comments: dict[int, tuple[str, bool]], first: int, last: int | None) -> str:
-    """The comment behind a statement, else the lines of comment right above it."""
-    for line in range(first, (last or first) + 1):
-        if line in comments and not comments[line][1]:
-            return comments[line][0]
+def _comment(lines: list[str], first: int, last: int | None) -> str:
+    """The comment behind a statement in lines `first` to `last`, else the lines of comment right above it."""
+    for line in lines[first - 1 : last]:
+        if behind := re.search(r"#:? *(.*)", line):
+            return behind[1].strip()
     above: list[str] = []
-    line = first - 1
-    while line in comments and comments[line][1]:
-        above.insert(0, comments[line][0])
-        line -= 1
+    for line in lines[first - 2 :: -1]:
+        if not line.startswith("#"):
+            break
+        above.insert(0, line.lstrip("#: ").strip())
     return " ".join(above)
 
 

@@ -48,22 +48,9 @@ Image = np.ndarray
 Spoil = Callable[[Image, Image, np.random.Generator], tuple[Image, Image]]
 
 
-def unspoilt(left: Image, right: Image, _: np.random.Generator) -> tuple[Image, Image]:
-    return left, right
-
-
-def exposed(left: Image, right: Image, _: np.random.Generator) -> tuple[Image, Image]:
-    """The right image 1.3 times as bright."""
-    return left, 1.3 * right
-
-
 def noisy(sigma: float) -> Spoil:
     """Sensor noise [grey levels]."""
-
-    def spoil(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-        return left + rng.normal(0, sigma, left.shape), right + rng.normal(0, sigma, right.shape)
-
-    return spoil
+    return lambda left, right, rng: (left + rng.normal(0, sigma, left.shape), right + rng.normal(0, sigma, right.shape))
 
 
 def flickering(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
@@ -72,15 +59,10 @@ def flickering(left: Image, right: Image, rng: np.random.Generator) -> tuple[Ima
     return gain * left, gain * right
 
 
-def shifted(rows: float) -> Spoil:
-    """The right image lower by so many rows."""
-
-    def spoil(left: Image, right: Image, _: np.random.Generator) -> tuple[Image, Image]:
-        by = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, rows]])
-        size = right.shape[1], right.shape[0]
-        return left, cv2.warpAffine(right, by, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-    return spoil
+def lowered(image: Image, rows: float) -> Image:
+    """The image lower by so many rows."""
+    size, by = image.shape[1::-1], np.array([[1.0, 0.0, 0.0], [0.0, 1.0, rows]])
+    return cv2.warpAffine(image, by, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 @dataclass(frozen=True)
@@ -92,15 +74,15 @@ class Fault:
     every: int = 1  # so many frames are one of the recording
 
 
-NONE = Fault("none", unspoilt)
+NONE = Fault("none", lambda left, right, _: (left, right))
 FAULTS = (
-    Fault("right image 1.3 times as bright", exposed),
+    Fault("right image 1.3 times as bright", lambda left, right, _: (left, 1.3 * right)),
     Fault("noise of 5 grey levels", noisy(5.0)),
     Fault("noise of 10 grey levels", noisy(10.0)),
     Fault("flicker of 30 %", flickering),
-    Fault("5 frames a second", unspoilt, 2),
-    Fault("right image 0.5 px lower", shifted(0.5)),
-    Fault("right image 1 px lower", shifted(1.0)),
+    Fault("5 frames a second", NONE.spoil, 2),
+    Fault("right image 0.5 px lower", lambda left, right, _: (left, lowered(right, 0.5))),
+    Fault("right image 1 px lower", lambda left, right, _: (left, lowered(right, 1.0))),
 )
 
 

@@ -14,23 +14,22 @@ import argparse
 import ast
 import importlib
 import json
-import os
 import signal
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
-from experiments.common import path_of
+from experiments.common import path_of, recordings
 from experiments.parameters import ROOT, Parameter, find
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
@@ -39,90 +38,63 @@ from slam.evaluation.objects import labels_in_images, score_for
 
 BACKENDS = ("ekf", "smoother")
 FACTORS = (0.5, 2.0)
-_ORDER = ("backends", "slam/bodies", "slam/tracks", "slam/tracks", "slam/geometry", "slam/calibration")
+#: Two worlds with moving bodies, and a drive where the data are there: text, and how many frames of it.
+CASES = {
+    "box": ("synthetic:box?frames=20", 20),
+    "street": ("synthetic:street?frames=16", 16),
+    **{name: (str(folder), 15) for name, folder in recordings({"KITTI 06": "kitti_odometry/sequences/06"}).items()},
+}
 _PERTURBATIONS = 6  # runs of the default with noise, for the scatter
 _PIXEL_NOISE = 0.05  # [px]
 _LOST = 20.0  # times the error of the default: the run has lost its way
 _PATIENCE = 10.0  # times the CPU time of the default, after which a run counts as failed
 _FAILURES = (slam.SlamError, ArithmeticError, ValueError, LookupError, RuntimeError, TimeoutError)
 _UNCOVERED = 0.5  # share of the default's frames with a body below which bodies count as lost
+_FAILED = {"camera": "fails", "bodies": "fails"}
 
 
-@dataclass(frozen=True)
-class Case:
-    """A short sequence: its text, how many frames of it, and its name in the table."""
-
-    text: str
-    frames: int
-    name: str
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """A sequence with the features of its frames, and the body (N,) that each feature lies on where that is known."""
-
-    sequence: Any
-    features: list[StereoFeatures]
-    labels: list[np.ndarray] | None
-
-
-@dataclass(frozen=True)
-class Errors:
+class Errors(NamedTuple):
     """What a run was off by."""
 
     camera: float  # RMSE of the online positions [m]
     bodies: float | None  # RMSE of the bodies' motion from frame to frame [m]; None where the sequence knows of none
     covered: float  # share of the frames in view in which a body was measured
-    path: bytes  # the poses: equal for runs that are equal
-
-
-def cases() -> list[Case]:
-    """Two worlds with moving bodies, and a drive where the data are there."""
-    found = [Case("synthetic:box?frames=20", 20, "box"), Case("synthetic:street?frames=16", 16, "street")]
-    data = os.environ.get("SLAM_DATA")
-    drive = Path(data) / "kitti_odometry" / "sequences" / "06" if data else None
-    return found + ([Case(str(drive), 15, "KITTI 06")] if drive is not None and drive.is_dir() else [])
+    bytes: bytes  # equal for runs that are equal
+    seconds: float  # CPU time
 
 
 @cache
-def recorded(index: int) -> Recorded:
-    """The features of a case."""
-    case = cases()[index]
-    sequence = slam.open_sequence(case.text)
-    system = slam.StereoSlam(sequence.rig, backend="ekf", kind=sequence.kind)
-    assert system.frontend is not None
-    features = [system.frontend.extract(frame) for frame in sequence.frames(0, case.frames)]
+def recorded(case: str) -> tuple[Any, list[StereoFeatures], list[np.ndarray] | None]:
+    """A sequence, the features of its frames, and the body (N,) that each lies on where that is known."""
+    text, frames = CASES[case]
+    sequence = slam.open_sequence(text)
+    frontend = slam.StereoSlam(sequence.rig, backend="ekf", kind=sequence.kind).frontend
+    assert frontend is not None
+    features = [frontend.extract(frame) for frame in sequence.frames(0, frames)]
     known = score_for(sequence) is not None
-    labels = [labels_in_images(sequence, k, f) for k, f in enumerate(features)] if known else None
-    return Recorded(sequence, features, labels)
+    return sequence, features, [labels_in_images(sequence, k, f) for k, f in enumerate(features)] if known else None
 
 
-def run(index: int, backend: str, noise_seed: int | None = None) -> Errors:
+def run(case: str, backend: str, noise_seed: int | None = None) -> Errors:
     """The errors of one case, with pixels moved at random where a seed is given."""
-    data = recorded(index)
-    rng = np.random.default_rng(noise_seed)
-    score = score_for(data.sequence)
-    config = SystemConfig.for_kind(data.sequence.kind)
-    system = slam.StereoSlam(data.sequence.rig, None, backend, config=config)
+    sequence, features, labels = recorded(case)
+    rng, score, start = np.random.default_rng(noise_seed), score_for(sequence), time.process_time()
+    system = slam.StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
     results = []
-    for k, features in enumerate(data.features):
+    for k, seen in enumerate(features):
         if noise_seed is not None:
-            shift = _PIXEL_NOISE * rng.standard_normal(features.uv_left.shape)
-            features = replace(features, uv_left=features.uv_left + shift, uv_right=features.uv_right + shift)
-        results.append(system.process_features(features))
-        if score is not None and data.labels is not None:
-            score.add(k, results[-1], data.labels[k])
+            shift = _PIXEL_NOISE * rng.standard_normal(seen.uv_left.shape)
+            seen = replace(seen, uv_left=seen.uv_left + shift, uv_right=seen.uv_right + shift)
+        results.append(system.process_features(seen))
+        if score is not None and labels is not None:
+            score.add(k, results[-1], labels[k])
     path = path_of(results)
-    own, true = associate(path, data.sequence.ground_truth)
-    camera = absolute_errors(own, true).rmse
+    camera = absolute_errors(*associate(path, sequence.ground_truth)).rmse
     bodies = [] if score is None else list(score.summary()["bodies"].values())
-    moved = [b["ME"]["translation RMSE [m]"] for b in bodies if b.get("ME")]
+    moves = [b["ME"]["translation RMSE [m]"] for b in bodies if b.get("ME")]
     covered = float(np.mean([b["coverage"] or 0.0 for b in bodies])) if bodies else 0.0
-    blob = path.poses.tobytes() + repr(bodies).encode()
-    return Errors(camera, float(np.mean(moved)) if moved else None, covered, blob)
-
-
-# --- which constants can be changed ---
+    blob, took = path.poses.tobytes() + repr(bodies).encode(), time.process_time() - start
+    return Errors(camera, float(np.mean(moves)) if moves else None, covered, blob, took)
 
 
 def name_of(parameter: Parameter) -> str:
@@ -130,49 +102,40 @@ def name_of(parameter: Parameter) -> str:
     return f"{parameter.module}:{parameter.name}"
 
 
-@cache
-def importers() -> dict[tuple[str, str], list[str]]:
-    """Modules that import a name from another one, by that module and name."""
-    found: dict[tuple[str, str], list[str]] = {}
-    for file in [f for room in ("slam", "backends") for f in sorted((ROOT / room).rglob("*.py"))]:
-        module = file.relative_to(ROOT).as_posix().removesuffix(".py").replace("/", ".")
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                for name in node.names:
-                    found.setdefault((node.module, name.name), []).append(module)
-    return found
-
-
 def measured(parameter: Parameter) -> bool:
-    """Whether a changed value of a constant reaches the code that uses it: it is read inside functions alone."""
-    if parameter.file.startswith("frontends/") or "kernels" in parameter.file:
+    """Whether a changed value reaches the code that uses it: it is read inside functions alone, none compiled."""
+    if parameter.file.startswith("frontends/"):
         return False
-    inside, everywhere = 0, 0
     tree = ast.parse((ROOT / parameter.file).read_text(encoding="utf-8"))
-    bodies = [n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
-    held = {id(node) for body in bodies for statement in body.body for node in ast.walk(statement)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Name) and node.id == parameter.name and isinstance(node.ctx, ast.Load):
-            everywhere += 1
-            inside += id(node) in held
-    return inside == everywhere
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    compiled = ("kernel", "helper")
+    plain = [f for f in functions if not any(ast.unparse(d).endswith(compiled) for d in f.decorator_list)]
+    held = {id(node) for f in plain for statement in f.body for node in ast.walk(statement)}
+    reads = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and n.id == parameter.name]
+    return all(id(node) in held for node in reads if isinstance(node.ctx, ast.Load))
 
 
-# --- measuring ---
+def importers(parameter: Parameter) -> list[str]:
+    """Modules that import the constant by its name."""
+    found = []
+    for file in (f for room in ("slam", "backends") for f in sorted((ROOT / room).rglob("*.py"))):
+        nodes = (n for n in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(n, ast.ImportFrom))
+        if any(n.module == parameter.module and parameter.name in [a.name for a in n.names] for n in nodes):
+            found.append(file.relative_to(ROOT).as_posix().removesuffix(".py").replace("/", "."))
+    return found
 
 
 @contextmanager
 def changed(parameter: Parameter, factor: float) -> Iterator[None]:
     """The constant times a factor, wherever it is known by its name."""
-    names = [parameter.module, *importers().get((parameter.module, parameter.name), [])]
-    modules = [importlib.import_module(name) for name in names]
-    before = getattr(modules[0], parameter.name)
-    for module in modules:
+    knowing = [importlib.import_module(name) for name in (parameter.module, *importers(parameter))]
+    before = getattr(knowing[0], parameter.name)
+    for module in knowing:
         setattr(module, parameter.name, times(before, factor))
     try:
         yield
     finally:
-        for module in modules:
+        for module in knowing:
             setattr(module, parameter.name, before)
 
 
@@ -199,44 +162,28 @@ def limited(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGVTALRM, before)
 
 
-@dataclass(frozen=True)
-class Default:
-    """The default run of one case with one back end: its errors, and its CPU time [s]."""
-
-    index: int
-    backend: str
-    errors: Errors
-    seconds: float
-
-    @classmethod
-    def of(cls, index: int, backend: str) -> Default:
-        """Measure it."""
-        run(index, backend)  # compiles and loads
-        start = time.process_time()
-        errors = run(index, backend)
-        return cls(index, backend, errors, time.process_time() - start)
+Defaults = dict[tuple[str, str], Errors]  # of the default values, by case and back end
 
 
-def ratios(parameter: Parameter, factor: float, defaults: list[Default]) -> dict[str, float | str]:
+def ratios(parameter: Parameter, factor: float, defaults: Defaults) -> dict[str, float | str]:
     """Errors of the camera and of the bodies over the default's: means over the cases, the worse back end.
 
     "same" where all runs give the same bytes, "fails" where one does not end well.
     """
-    found: dict[tuple[int, str], Errors] = {}
+    new: Defaults = {}
     try:
         with changed(parameter, factor):
-            for d in defaults:
-                with limited(_PATIENCE * max(d.seconds, 1.0)):
-                    found[d.index, d.backend] = run(d.index, d.backend)
+            for key, default in defaults.items():
+                with limited(_PATIENCE * max(default.seconds, 1.0)):
+                    new[key] = run(*key)
     except _FAILURES:
-        return {"camera": "fails", "bodies": "fails"}
-    if all(found[d.index, d.backend].path == d.errors.path for d in defaults):
+        return _FAILED
+    if all(new[key].bytes == default.bytes for key, default in defaults.items()):
         return {"camera": "same", "bodies": "same"}
-    pairs = [(found.get((d.index, d.backend), d.errors), d) for d in defaults]
-    camera = [(new.camera / d.errors.camera, d.backend) for new, d in pairs]
-    known = [(new, d) for new, d in pairs if d.errors.bodies is not None]
-    lost = any(new.bodies is None or new.covered < _UNCOVERED * d.errors.covered for new, d in known)
-    bodies = [((new.bodies or 0.0) / (d.errors.bodies or 1.0), d.backend) for new, d in known]
+    known = {key: default for key, default in defaults.items() if default.bodies is not None}
+    lost = any(new[k].bodies is None or new[k].covered < _UNCOVERED * d.covered for k, d in known.items())
+    camera = [(new[k].camera / d.camera, k[1]) for k, d in defaults.items()]
+    bodies = [((new[k].bodies or 0.0) / (d.bodies or 1.0), k[1]) for k, d in known.items()]
     return {"camera": _worst(camera), "bodies": "fails" if lost else _worst(bodies)}
 
 
@@ -248,17 +195,15 @@ def _worst(values: list[tuple[float, str]]) -> float | str:
     return round(float(np.exp(max(logs))), 4)
 
 
-def scatter(defaults: list[Default], seeds: int) -> dict[str, float]:
+def scatter(defaults: Defaults, seeds: int) -> dict[str, float]:
     """The largest factor by which the errors of perturbed runs of one back end differ from the default's."""
     worst = {"camera": 1.0, "bodies": 1.0}
-    for backend in BACKENDS:
-        own = [d for d in defaults if d.backend == backend]
-        for seed in range(seeds):
-            new = [(run(d.index, backend, seed), d.errors) for d in own]
-            camera = np.mean([np.log(n.camera / e.camera) for n, e in new])
-            bodies = [np.log(n.bodies / e.bodies) for n, e in new if n.bodies and e.bodies]
-            worst["camera"] = max(worst["camera"], float(np.exp(abs(camera))))
-            worst["bodies"] = max(worst["bodies"], float(np.exp(abs(np.mean(bodies))))) if bodies else worst["bodies"]
+    for seed, backend in ((seed, backend) for seed in range(seeds) for backend in BACKENDS):
+        pairs = [(run(*key, seed), default) for key, default in defaults.items() if key[1] == backend]
+        for what in worst:
+            both = [(getattr(n, what), getattr(d, what)) for n, d in pairs if getattr(n, what) and getattr(d, what)]
+            logs = [np.log(new / default) for new, default in both]
+            worst[what] = max(worst[what], float(np.exp(abs(np.mean(logs)))) if logs else 1.0)
     return worst
 
 
@@ -268,32 +213,23 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="one constant, one world")
     parser.add_argument("--only", default="", help="constants whose module:NAME contains this")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "sensitivity.json")
-    arguments = parser.parse_args()
-    file = arguments.out / "sensitivity.json" if arguments.out.is_dir() else arguments.out
+    given = parser.parse_args()
+    file = given.out / "sensitivity.json" if given.out.is_dir() else given.out
     table = json.loads(file.read_text()) if file.exists() else {"ratios": {}}
     present = {name_of(p): p for p in find()}
-    table["ratios"] = {name: found for name, found in table["ratios"].items() if name in present}
-    wanted = [p for name, p in present.items() if arguments.only in name and measured(p)]
-    count = 1 if arguments.quick else len(cases())
-    defaults = [Default.of(i, b) for i in range(count) for b in BACKENDS]
-    wanted.sort(key=lambda p: [p.file.startswith(room) for room in _ORDER].index(True))
-    wanted = wanted[: 1 if arguments.quick else None]
+    found = table["ratios"] = {name: each for name, each in table["ratios"].items() if name in present}
+    wanted = {name: p for name, p in present.items() if given.only in name and name not in found and measured(p)}
+    cases = list(CASES)[: 1 if given.quick else None]
+    defaults = {(case, backend): (run(case, backend), run(case, backend))[1] for case in cases for backend in BACKENDS}
+    table["cases"] = cases
     if "scatter" not in table:
-        table["scatter"] = scatter(defaults, 1 if arguments.quick else _PERTURBATIONS)
-    table["cases"] = [c.name for c in cases()[:count]]
-    table["complete"] = False
-    for parameter in wanted:
-        name = name_of(parameter)
-        if name in table["ratios"]:
-            continue
-        table["ratios"][name] = [{"camera": "fails", "bodies": "fails"}] * len(FACTORS)  # where the process ends here
-        file.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-        table["ratios"][name] = [ratios(parameter, factor, defaults) for factor in FACTORS]
-        file.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-        print(name, table["ratios"][name], flush=True)
-    table["complete"] = not arguments.only and not arguments.quick
-    file.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    print(f"{len(table['ratios'])} constants; scatter {table['scatter']}")
+        table["scatter"] = scatter(defaults, 1 if given.quick else _PERTURBATIONS)
+    for name, parameter in list(wanted.items())[: 1 if given.quick else None]:
+        for outcome in ([_FAILED] * len(FACTORS), None):  # the first stays where the process ends here
+            found[name] = outcome or [ratios(parameter, factor, defaults) for factor in FACTORS]
+            file.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        print(name, found[name], flush=True)
+    print(f"{len(found)} constants; scatter {table.get('scatter')}")
     return 0
 
 

@@ -11,7 +11,7 @@ from slam.data import IdArray, Observations
 from slam.models import EstimatorModels, models_for
 from slam.run.recording import RecordedFrame, Recording
 from slam.tracks.config import MapConfig
-from slam.tracks.mapper import new_landmarks
+from slam.tracks.mapper import depth_is_known, new_landmarks
 from slam.worlds.observe import SimulatedFeatures
 from slam.worlds.sequence import WorldSequence
 
@@ -79,7 +79,9 @@ def _frames(
         good = (seen.ids >= 0) & (seen.objects == 0) & ~seen.false_stereo
         known = good & np.array([i in last_seen for i in seen.ids.tolist()], bool)
         occupied = seen.features.uv_left[known]
-        new = new_landmarks(seen.features, good & ~known, occupied, sequence.rig, models.pixel_sigma, config)
+        rows, rig = np.arange(len(known)), sequence.rig
+        deep = depth_is_known(rig, seen.features, rows, models.pixel_sigma, config.max_depth_error)
+        new = new_landmarks(seen.features, good & ~known & deep, occupied, rig, config)
         observed, added = _observations(seen, np.flatnonzero(known)), _observations(seen, new)
         for i in (*observed.ids.tolist(), *added.ids.tolist()):
             last_seen[i] = k

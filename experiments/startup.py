@@ -26,7 +26,7 @@ from experiments.common import script_options
 from experiments.tables import picture, show
 from slam.atlas.map_io import SavedMap
 from slam.config import SystemConfig
-from slam.data import Observations, StereoFeatures
+from slam.data import Observations
 from slam.geometry import se3
 from slam.models import MotionModel
 from slam.registry import ONLINE
@@ -42,6 +42,7 @@ STARTS = {  #: where the state begins [m], and how far it is turned about the ve
 }
 PAPER = np.array([0.0, -0.558, 0.037])  #: where paper B's filter stopped [m]
 STANDING = MotionModel(acceleration=0.1, angular_acceleration=0.1)  #: of a robot that trembles where it stands
+ALONE = "stereo, no search"
 KNOWN = 1e-3  #: standard deviation of the stored positions [m]
 HEADER = (
     "pixels", "back end", "frame 0 [cm]", "mean after [cm]", "worst after [cm]", "1 sigma at the end [cm]",
@@ -52,7 +53,7 @@ HEADER = (
 class StartUp:
     """One start."""
 
-    pixels: str  # ``"stereo"`` or ``"left"``, or ``"stereo, no search"`` for the back end by itself
+    pixels: str  # ``"stereo"`` or ``"left"``, or `ALONE` for the back end by itself
     backend: str  # names
     start: str  # likewise
     positions: np.ndarray  # estimated places of the camera (F + 1, 3) [m]; the first is where the state began
@@ -88,48 +89,34 @@ def stored_map(sequence: WorldSequence) -> SavedMap:
 
 
 def start_up(sequence: WorldSequence, known: SavedMap, backend: str, start: str, frames: int, pixels: str) -> StartUp:
-    """Run one start."""
+    """Run one start: in the system, or the back end alone with true associations, without the search in the map."""
     place, turn = STARTS[start]
     T = se3.pose(se3.so3_exp(np.array([0, 0, np.deg2rad(turn)])) @ FACING, np.array(place))
     config = SystemConfig.for_kind(sequence.kind, None)
     sigma_px = sequence.values["sigma"]
     models = replace(config.models, T_world_left=T.tolist(), pixel_sigma=sigma_px, motion=STANDING)
-    system = StereoSlam(sequence.rig, None, backend, config=replace(config, models=models), prior_map=known)
+    if pixels == ALONE:
+        models = replace(models, initial_position_sigma=1.0, initial_rotation_sigma=0.3)
+        estimator: Any = create(backend, sequence.rig, models=models)
+        estimator.insert(known.ids, known.positions, known.covariances)
+    else:
+        system = StereoSlam(sequence.rig, None, backend, config=replace(config, models=models), prior_map=known)
     positions, sigma = [T[:3, 3]], []
     for k in range(frames):
-        estimate = system.process_features(taken(sequence.observations(k), pixels)).estimate
+        if pixels == ALONE:
+            seen = sequence.simulate(k)
+            rows, f = np.isin(seen.ids, known.ids), seen.features
+            estimator.predict(f.stamp)
+            estimator.update(Observations(seen.ids[rows], f.uv_left[rows], f.uv_right[rows]))
+            estimate = estimator.estimate(landmarks=False)
+        else:
+            f = sequence.observations(k)
+            f = f if pixels == "stereo" else replace(f, uv_right=np.full_like(f.uv_right, np.nan))
+            estimate = system.process_features(f).estimate
         positions.append(estimate.T_world_left[:3, 3])
         sigma.append(np.sqrt(np.trace(estimate.covariance[3:, 3:])))
     truth = sequence.ground_truth.positions[:frames]
     return StartUp(pixels, backend, start, np.array(positions), truth, np.array(sigma))
-
-
-def by_itself(sequence: WorldSequence, known: SavedMap, backend: str, start: str, frames: int) -> StartUp:
-    """A back end alone, from the wrong state, with true associations: no search in the map helps it."""
-    place, turn = STARTS[start]
-    T = se3.pose(se3.so3_exp(np.array([0, 0, np.deg2rad(turn)])) @ FACING, np.array(place))
-    models = replace(
-        SystemConfig.for_kind(sequence.kind, None).models, T_world_left=T.tolist(), motion=STANDING,
-        pixel_sigma=sequence.values["sigma"], initial_position_sigma=1.0, initial_rotation_sigma=0.3,
-    )  # fmt: skip
-    estimator: Any = create(backend, sequence.rig, models=models)
-    estimator.insert(known.ids, known.positions, known.covariances)
-    positions, sigma = [T[:3, 3]], []
-    for k in range(frames):
-        seen = sequence.simulate(k)
-        rows, f = np.isin(seen.ids, known.ids), seen.features
-        estimator.predict(f.stamp)
-        estimator.update(Observations(seen.ids[rows], f.uv_left[rows], f.uv_right[rows]))
-        estimate = estimator.estimate(landmarks=False)
-        positions.append(estimate.T_world_left[:3, 3])
-        sigma.append(np.sqrt(np.trace(estimate.covariance[3:, 3:])))
-    truth = sequence.ground_truth.positions[:frames]
-    return StartUp("stereo, no search", backend, start, np.array(positions), truth, np.array(sigma))
-
-
-def taken(features: StereoFeatures, pixels: str) -> StereoFeatures:
-    """The features, without their right pixels where the left ones alone are to be used."""
-    return features if pixels == "stereo" else replace(features, uv_right=np.full_like(features.uv_right, np.nan))
 
 
 def worst_of_starts(runs: list[StartUp]) -> list[list[object]]:
@@ -170,9 +157,8 @@ def main() -> int:
     sequence = open_sequence("synthetic:startup")
     assert isinstance(sequence, WorldSequence)
     known, frames = stored_map(sequence), 30 if arguments.quick else 150
-    cases = [(pixels, backend, start) for pixels in ("stereo", "left") for backend in ONLINE for start in STARTS]
+    cases = [(pixels, backend, start) for pixels in ("stereo", "left", ALONE) for backend in ONLINE for start in STARTS]
     runs = [start_up(sequence, known, backend, start, frames, pixels) for pixels, backend, start in cases]
-    runs += [by_itself(sequence, known, backend, start, frames) for backend in ONLINE for start in STARTS]
     print(f"{len(known)} stored features, {frames} frames; of three wrong starts the worst\n")
     show(arguments.out / "table.json", HEADER, worst_of_starts(runs), 2)
     draw([run for run in runs if run.pixels == "stereo"], arguments.out / "startup.png")

@@ -14,9 +14,6 @@ import numpy as np
 from slam.errors import ConfigurationError
 from slam.naming import unknown
 
-#: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
-FORBID_UNKNOWN = {"extra": "forbid"}
-
 #: Numbers of settings lie below this, in whatever unit: their squares and products stay far from overflow.
 MOST = 1e9
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Any, get_type_hints
 
 from slam.atlas.config import AtlasConfig
 from slam.bodies.config import ObjectsConfig
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for, require_not_negative
+from slam.models import EstimatorModels, models_for, require_not_negative
 from slam.settings import apply_settings
 from slam.tracks.config import AssociationConfig, MapConfig
 
@@ -70,8 +70,6 @@ class SystemConfig:
     frontend: dict[str, Any] = field(default_factory=dict)
     backend: dict[str, Any] = field(default_factory=dict)
 
-    __pydantic_config__ = FORBID_UNKNOWN
-
     def __post_init__(self) -> None:
         require_not_negative(self)
         for section in ("frontend", "backend"):
@@ -106,12 +104,8 @@ class SystemConfig:
         Raises:
             ConfigurationError: a key is unknown, or a value is of the wrong type or out of range.
         """
-        from pydantic import TypeAdapter, ValidationError
-
-        try:
-            return TypeAdapter(cls).validate_python(tree)
-        except ValidationError as error:
-            raise ConfigurationError(_refused(error.errors()[0])) from None
+        built: SystemConfig = _built(cls, tree)
+        return built
 
     def with_settings(self, settings: Sequence[str] | Mapping[str, Any]) -> SystemConfig:
         """A copy with settings applied: ``{"map.max_landmarks": 300}``, or ``["map.max_landmarks=300"]``.
@@ -130,19 +124,20 @@ class SystemConfig:
 #: What the system itself gives to front ends and back ends that it makes.
 _GIVEN = ("self", "rig", "models")
 
-#: What is required of a setting, by pydantic's name of the fault.
-_WANTED = {
-    "int": "a whole number", "float": "a number", "finite": "a finite number", "bool": "true or false",
-    "string": "a text", "list": "a list", "tuple": "a list", "is": "a list", "dict": "an object", "none": "null",
-}  # fmt: skip
 
-
-def _refused(fault: Mapping[str, Any]) -> str:
-    """The line for a value that pydantic refuses: the setting, what it must be, and what it is."""
-    where = ".".join(str(part) for part in fault["loc"])
-    if fault["type"] == "unexpected_keyword_argument":
-        return f"setting {where}: there is no such setting in this version"
-    wanted = _WANTED.get(fault["type"].partition("_")[0])
-    if wanted is None:
-        return f"setting {where}: {fault['msg']}"
-    return f"setting {where}: must be {wanted}, got {fault['input']!r:.80}"
+def _built(kind: Any, tree: Mapping[str, Any], where: str = "") -> Any:
+    """A dataclass of settings, and those in it, from a tree of plain types; `where` is its place in the whole."""
+    if not isinstance(tree, Mapping):
+        raise ConfigurationError(f"settings must be an object, got {tree!r:.80}")
+    hints, names, values = get_type_hints(kind), {f.name for f in fields(kind)}, {}
+    for key, value in tree.items():
+        if key not in names:
+            raise ConfigurationError(f"setting {where}{key}: there is no such setting in this version")
+        if is_dataclass(hints[key]):
+            value = _built(hints[key], value, f"{where}{key}.")
+        values[key] = tuple(value) if isinstance(value, list) else value
+    try:
+        return kind(**values)
+    except ConfigurationError as error:
+        said = str(error).removeprefix(f"{where[:-1].rpartition('.')[2]}: ")  # the section names itself
+        raise ConfigurationError(f"setting {where}{said}") from None

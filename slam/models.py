@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam.bounds import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.bounds import require_not_negative as require_not_negative
 from slam.bounds import require_positive
 from slam.checks import is_rigid
@@ -60,8 +59,6 @@ class MotionModel:
     angular_acceleration: float = 1.0
     wheels: bool = False
 
-    __pydantic_config__ = FORBID_UNKNOWN
-
     def __post_init__(self) -> None:
         require_positive(self, {"acceleration": _DENSITIES, "angular_acceleration": _DENSITIES})
 
@@ -100,8 +97,6 @@ class ObjectModels:
     max_acceleration: float = 100.0
     max_turn_rate: float = 20.0
     drift: float = 0.0
-
-    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self, _BODY_RANGES, "objects")
@@ -171,8 +166,6 @@ class EstimatorModels:
     initial_angular_velocity_sigma: float = 1.0
     T_world_left: Sequence[Sequence[float]] | None = None
     objects: ObjectModels = field(default_factory=ObjectModels)
-
-    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_positive(self, _RANGES)

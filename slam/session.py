@@ -13,6 +13,7 @@ import numpy as np
 
 from slam import registry
 from slam.atlas.atlas import Atlas, TrackingGap
+from slam.atlas.loop_closer import Found
 from slam.atlas.map_io import SavedMap
 from slam.checks import definite
 from slam.data import (
@@ -20,6 +21,7 @@ from slam.data import (
     Estimate,
     FrameResult,
     FrameStatus,
+    IdArray,
     Prediction,
     StereoFeatures,
     UpdateReport,
@@ -56,11 +58,19 @@ class Session:
         self._tracker.rig_error.follow(first)
         if prior_map is None:
             return State(first)
+        name, most = type(first).__name__, getattr(first, "most_landmarks", None)
         if self._backend is None:
             raise ConfigurationError("a system that starts in a prior map needs its back end by name")
         if not len(prior_map) and not prior_map.keyframes:
             raise SlamError(f"{prior_map.source}: the map holds no landmarks, so the camera cannot be found in it")
-        _fill(first, prior_map)
+        if not isinstance(first, MapBackend):
+            raise ConfigurationError(f"{name} cannot start in a prior map: it has no insert")
+        if most is not None and len(prior_map) > most:
+            raise SlamError(
+                f"{prior_map.source}: {len(prior_map)} landmarks, but {name} takes a map of at most {most}: "
+                "start in a smaller map, or with another back end"
+            )
+        first.insert(prior_map.ids, prior_map.positions, prior_map.covariances)
         atlas = Atlas.of_earlier_run(prior_map.keyframes, prior_map.keyframe_poses, prior_map.loops)
         dimensions, mapped = prior_map.dimensions if len(prior_map) else None, len(prior_map) > 0
         tracks = Tracks.empty(prior_map.descriptors.shape[1]).with_landmarks(prior_map.rows)
@@ -78,12 +88,8 @@ class Session:
             if place is None:
                 return None
             T = place.T_odom_left
-        new, tracks = self._start(T), state.tracks
-        _fill(new, saved)
         self._tracker.mapper.next_id = saved.next_id
-        if place is not None:
-            assert tracks is not None
-            tracks = self._tracker.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
+        new, tracks = self._start(state.tracks, T, (saved.ids, saved.positions, saved.covariances), place)
         return replace(state, backend=new, tracks=tracks, prior_map=None)
 
     def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
@@ -128,14 +134,10 @@ class Session:
             after = new.estimate(landmarks=False)
             atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._config.models)
         else:
-            new, seen_at, tracks = self._start(T), None, state.tracks
-            whole = self._tracker.rig_error.added_to(old, old.estimate())
-            new.insert(whole.ids, whole.positions, definite(whole.covariances))  # type: ignore[attr-defined]
-            if elsewhere.place is not None:
-                assert tracks is not None
-                place = elsewhere.place
-                tracks = self._tracker.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
-                seen_at = place.stamp
+            whole, place = self._tracker.rig_error.added_to(old, old.estimate()), elsewhere.place
+            landmarks = whole.ids, whole.positions, definite(whole.covariances)
+            new, tracks = self._start(state.tracks, T, landmarks, place)
+            seen_at = None if place is None else place.stamp
             prediction = new.predict(stamp)
             standing = state.standing.after(self._tracker.rig, self._config.models.pixel_sigma, features).moving()
             atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), seen_at)
@@ -162,10 +164,20 @@ class Session:
         joined = np.setdiff1d(begun.tracks.landmarks().ids, before.tracks.landmarks().ids)
         return replace(step, joined=np.union1d(step.joined, joined))
 
-    def _start(self, T_world_left: Array) -> Backend:
-        """A back end without landmarks at a pose (4, 4) that is only roughly known."""
+    def _start(
+        self, tracks: Tracks | None, T_world_left: Array, landmarks: tuple[IdArray, Array, Array], place: Found | None
+    ) -> tuple[Backend, Tracks]:
+        """A back end at a pose (4, 4) that is only roughly known, and the table with a place's landmarks.
+
+        It is given landmarks (their ids, positions, covariances) and those of the place that are not among them.
+        """
+        assert tracks is not None
         sigmas = {"initial_position_sigma": POSITION_SIGMA, "initial_rotation_sigma": ROTATION_SIGMA}
-        return self._new(CommonError(), T_world_left=T_world_left.tolist(), **sigmas)
+        new = self._new(CommonError(), T_world_left=T_world_left.tolist(), **sigmas)
+        new.insert(*landmarks)  # type: ignore[attr-defined]
+        if place is not None:
+            tracks = self._tracker.mapper.insert(new, tracks, place.landmarks, place.positions, place.covariances)
+        return new, tracks
 
     def _new(self, common: CommonError, **models: Any) -> Backend:
         """Another back end of the same kind; `common` is the error by the rig that its first pose has."""
@@ -174,17 +186,3 @@ class Session:
         backend: Backend = registry.create("backends", self._backend, self._tracker.rig, **options)
         self._tracker.rig_error.follow(backend, common.jacobian if common.jacobian.size else None)
         return backend
-
-
-def _fill(backend: Backend, saved: SavedMap) -> None:
-    """Give a back end a saved map."""
-    name = type(backend).__name__
-    if not isinstance(backend, MapBackend):
-        raise ConfigurationError(f"{name} cannot start in a prior map: it has no insert")
-    most = getattr(backend, "most_landmarks", None)
-    if most is not None and len(saved) > most:
-        raise SlamError(
-            f"{saved.source}: {len(saved)} landmarks, but {name} takes a map of at most {most}: "
-            "start in a smaller map, or with another back end"
-        )
-    backend.insert(saved.ids, saved.positions, saved.covariances)

@@ -20,7 +20,7 @@ from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import transform
 from slam.geometry.trajectory import Trajectory
-from slam.input.extraction import Extracted, Extractor, as_frame
+from slam.input.extraction import Extracted, Extractor
 from slam.input.features import Rectification, documented, following
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
@@ -31,7 +31,7 @@ from slam.runtime.compilation import Stages
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.threads import OneThread, one_blas_thread, prefetch
 from slam.session import Session
-from slam.third_party import named_failures
+from slam.third_party import checked, named_failures
 from slam.tracker import Elsewhere, State, Tracker, frame_result
 from slam.tracks.step import Step
 from slam.tracks.table import LandmarkTable
@@ -130,12 +130,8 @@ class StereoSlam:
 
     @property
     def objects(self) -> ObjectDetector:
-        """The detector of what moves; another one may be put in its place."""
+        """The detector of what moves."""
         return self._tracker.objects
-
-    @objects.setter
-    def objects(self, detector: ObjectDetector) -> None:
-        self._tracker.objects = detector
 
     def __repr__(self) -> str:
         frontend = "no front end" if self.frontend is None else type(self.frontend).__name__
@@ -182,9 +178,14 @@ class StereoSlam:
             MeasurementError: images without a stamp, or a frame with one; or as `process_features`.
             SequenceError: the images are of another type or size than the rig's.
         """
-        frame = as_frame(left, right, stamp, self._state.index + 1)
+        if not isinstance(left, StereoFrame):
+            if stamp is None:
+                raise MeasurementError("process: two images need their time [s]: process(left, right, stamp)")
+            left = StereoFrame(self._state.index + 1, stamp, left, right)
+        elif right is not None or stamp is not None:
+            raise MeasurementError("process: a frame has its right image and its stamp already")
         with self._stepping:
-            return self._timed_step(self._extractor.extract(self.frontend, frame))
+            return self._timed_step(self._extractor.extract(self.frontend, left))
 
     def run(self, frames: Iterable[StereoFrame], overlap: bool = True) -> Iterator[tuple[StereoFrame, FrameResult]]:
         """Every frame with the result of its step.
@@ -318,9 +319,9 @@ class StereoSlam:
         self._roll_back()
         if self._state.prior_map is not None:
             return self._session.map_estimate(self._state, float("nan"))
-        estimate = self._tracker.whole_estimate(self._state)
-        common = self._tracker.rig_error.common(self.backend, as_reported=False)
-        return self.atlas.estimate(estimate, common, not of_map)
+        estimate, error = checked(self.backend, "estimate", self.backend.estimate()), self._tracker.rig_error
+        common = error.common(self.backend, as_reported=False)
+        return self.atlas.estimate(error.added_to(self.backend, estimate), common, not of_map)
 
     @one_blas_thread
     def snapshot(self) -> SavedMap:

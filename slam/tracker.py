@@ -31,7 +31,7 @@ from slam.data import (
     UpdateStatus,
 )  # fmt: skip
 from slam.geometry.arrays import Array, isin
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import MINIMAL_POINTS, StereoRig
 from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.input.warnings import REPEATED
@@ -39,7 +39,7 @@ from slam.interfaces import AligningFrontend, Backend, Frontend, MapBackend, Res
 from slam.object_data import MovingObject
 from slam.third_party import checked
 from slam.tracks.alignment import align, take_patches
-from slam.tracks.localizer import Localizer, Search
+from slam.tracks.localizer import Localizer, Search, median_deviation
 from slam.tracks.mapper import Mapper
 from slam.tracks.standing import Standing
 from slam.tracks.step import HIDDEN, LandmarkMatches, Step, TrackingState
@@ -111,10 +111,10 @@ class Tracker:
         c = config
         self.rig, self.config, self.calibration, self.objects = rig, c, calibration, objects
         self.rig_error = RemainingRigError(calibration)
-        self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
+        self.localizer = Localizer(rig, c.association, c.models)
         self.mapper = Mapper(rig, c.map, self.localizer, backend)
         self.loop_closer = LoopCloser(rig, c.atlas.enabled, c.association, c.models, c.map.max_depth_error)
-        self._restarts = restarts
+        self._can_restart = restarts and isinstance(backend, MapBackend)
         self.advanced = -np.inf  # stamp to which a back end was last advanced [s]; an interrupted step counts
         aligns = c.association.align and isinstance(frontend, AligningFrontend)
         self._aligning: AligningFrontend | None = frontend if aligns else None  # type: ignore[assignment]
@@ -122,10 +122,6 @@ class Tracker:
     def find(self, state: State, features: StereoFeatures) -> Found | None:
         """The camera's pose by the keyframes of the atlas."""
         return self.loop_closer.find(state.atlas, features, self.calibration.applied, state.index + 1)
-
-    def _can_restart(self, state: State) -> bool:
-        """Whether another back end can take over."""
-        return self._restarts and isinstance(state.backend, MapBackend)
 
     def revise(self, state: State) -> Revision | None:
         """Apply the present estimate of the rig's error, also to earlier measurements if the back end can."""
@@ -151,7 +147,7 @@ class Tracker:
         tracks = state.tracks
         if tracks is None or (tracks.descriptors.shape[1] != features.descriptors.shape[1] and not len(tracks.mapped)):
             tracks = Tracks.empty(features.descriptors.shape[1])
-        tracks = tracks.begun(len(features), self.objects.window)
+        tracks = tracks.begun(len(features.scale), self.objects.window)
         landmarks, backend = tracks.landmarks(), state.backend
         positions = checked(backend, "positions", backend.positions(landmarks.ids), n=len(landmarks.ids))
 
@@ -167,7 +163,7 @@ class Tracker:
         else:
             matches, tracking, standing = search.follow(tracking, standing, elsewhere)
         if matches.kidnapped:
-            if self._can_restart(state):
+            if self._can_restart:
                 return Elsewhere(matches.T_world_left, place)
             matches = LandmarkMatches.nothing()
         tracks.count_returning(matches.returning)
@@ -192,18 +188,27 @@ class Tracker:
         return np.union1d(self.objects.suspects, parting)
 
     def update(self, state: State, step: Step) -> Step | Elsewhere:
-        """Update the back end; `Elsewhere` in an unknown place."""
-        matches, standing = step.matches, step.standing
+        """Update the back end; `Elsewhere` in an unknown place.
+
+        The pose was not measured if the back end used less than half of the landmarks that agree with each other; a
+        lost camera must match more landmarks than a tracked one.
+        """
+        matches, standing, before, c = step.matches, step.standing, step.tracking, self.config
         answer = state.backend.update(matches.observations(step.features), matches.T_world_left)
         report: UpdateReport = checked(state.backend, "update", answer)
-        tracking = self.localizer.state_after(
-            step.tracking, step.prediction, step.features, matches, report, standing.stands
-        )
+        least = c.association.minimum_consistent if before.lost else MINIMAL_POINTS
+        measured = len(report.used) >= least and 2 * len(report.used) >= len(matches.ids)
+        uncertain, stereo = False, 0  # asked where the pose was not measured
+        if not measured:
+            uncertain = median_deviation(step.prediction) > c.association.tight_window
+            # A pose that agrees with the last frame's, but awaits a third one, does not show an unknown place.
+            stereo = 0 if before.doubted.count > 1 else int(step.features.has_stereo.sum())
+        tracking = before.after(measured, standing.stands, uncertain, stereo, c.map.lost_after)
         if state.begins_at(step.index):
             report = replace(report, reason=report.reason if len(step.tracks.mapped) else NEW_MAP)
         elif (
-            tracking.in_unknown_place(self.config.map.restart_after) and not standing.holds(tracking.lost)
-            and self.config.atlas.enabled and len(state.atlas) > 0 and self._can_restart(state)
+            tracking.in_unknown_place(c.map.restart_after) and not standing.holds(tracking.lost)
+            and c.atlas.enabled and len(state.atlas) > 0 and self._can_restart
         ):  # fmt: skip
             return Elsewhere(None)
         return replace(step, report=report, tracking=tracking)
@@ -248,11 +253,6 @@ class Tracker:
         if state.prior_map is not None or not np.isfinite(self.advanced):  # that back end has not begun
             return state
         return replace(state, tracks=self.mapper.reconcile(state.backend, state.tracks))
-
-    def whole_estimate(self, state: State) -> Estimate:
-        """Pose and map of the back end, with the rig's uncertainty."""
-        estimate = checked(state.backend, "estimate", state.backend.estimate())
-        return self.rig_error.added_to(state.backend, estimate)
 
 
 def _shifted_as(corrected: StereoFeatures, before: StereoFeatures, now: StereoFeatures) -> StereoFeatures:

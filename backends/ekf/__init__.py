@@ -1,16 +1,16 @@
-"""The papers' filter: an extended Kalman filter over camera and landmarks. See `backends.ekf.filter`.
+"""The papers' filter: an extended Kalman filter over camera and landmarks. See `backends.ekf.backend`.
 
 In the papers' order:
 
-- `motion`: the camera's state and its transition (paper B, section 2), in the angles of `angles`.
+- `motion`: the camera's state and its transition (paper B, section 2), in angles kept from their singularity.
 - `landmarks`: a landmark's three numbers, and the table of all.
 - `solve`: measurement, innovation, gate, and the update of the mean (A, Eqs. 5-11; B, Eqs. 1-5); `recovery`: what else
   is tried where it fails.
 - `covariance`: ``A P Aᵀ + W Q Wᵀ`` (B, section 2), landmarks that join (A, Eq. 10), ``P − K S Kᵀ`` (A, Eq. 11).
 - `state`: camera, landmarks and covariance, and the steps from one such state to the next.
-- `filter`: the back end.
+- `filter`: a back end for any camera; `backend`: the papers'.
 """
 
-from backends.ekf.filter import EkfBackend, EkfConfig
+from backends.ekf.backend import EkfBackend, EkfConfig
 
 __all__ = ["EkfBackend", "EkfConfig"]

@@ -51,6 +51,11 @@ class Covariance:
         return len(self.marks) // 3
 
     @property
+    def poses(self) -> int:
+        """1 + K: the present pose and those before it that are kept."""
+        return 1 + (len(self.head) - CAMERA) // POSE
+
+    @property
     def camera(self) -> Array:
         """Of the camera (12, 12)."""
         return self.head[:CAMERA, :CAMERA]
@@ -87,7 +92,8 @@ class Covariance:
         with_past = J @ self.head[:POSE, CAMERA:k]
         P = np.block([[J @ self.pose @ J.T, with_past], [with_past.T, self.head[CAMERA:k, CAMERA:k]]])
         order = np.arange(POSE * n).reshape(n, POSE)[::-1].reshape(-1)
-        return np.asarray(P[order[:, None], order])
+        P = P[order[:, None], order]
+        return np.asarray(0.5 * (P + P.T))
 
     # --- the camera moves ---
 

@@ -1,23 +1,22 @@
-"""The EKF back end (paper A, Eq. 11; paper B, section 2)."""
+"""An extended Kalman filter over a camera and landmarks, as a back end: `backends.ekf.backend`, `backends.iekf`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from backends.ekf.covariance import CAMERA, POSE, Covariance, positive
-from backends.ekf.landmarks import COORDINATES, Coordinates, FilterLandmarks, distant_anchors
-from backends.ekf.motion import EulerCamera, Motion, motion_noise
+from backends.ekf.landmarks import Coordinates, FilterLandmarks, distant_anchors
+from backends.ekf.motion import Motion, motion_noise
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import UnsolvableError, Update
 from backends.ekf.state import FilterState
-from slam.bounds import from_options, require_positive
 from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
-from slam.errors import ConfigurationError, MeasurementError
+from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -28,123 +27,38 @@ from slam.window.consensus import landmarks_pose
 from slam.window.gating import INFLATION
 from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
-MEASUREMENTS = ("stereo", "left")
-LANDMARKS = ("inverse_depth", "euclidean")
-
-
-@dataclass(frozen=True)
-class EkfConfig:
-    """Options of `EkfBackend`.
-
-    Attributes:
-        papers: closest to the papers' filter: the left pixel alone, one linearisation, landmarks in the world, a
-            covariance that is not transported. The other options do not count then. What stays is the gate by what all
-            others predict, the outlier test, the recovery, and the limit of 300 landmarks in the state.
-        measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
-        iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
-            updates where the first is not linear to within the noise.
-        landmarks: coordinates of a landmark in the state: ``"inverse_depth"`` by the camera that saw it first, or
-            ``"euclidean"`` in the world, as the papers do. See `backends.ekf.landmarks`.
-        consistent: keep the unobservable pose of the whole map (where the world's origin is and which way it faces)
-            from seeming to be measured: the covariance is transported to the corrected state after each update.
-
-    Raises:
-        ConfigurationError: a value is out of its range.
-    """
-
-    papers: bool = False
-    measurement: str = "stereo"
-    iterations: int = 5
-    landmarks: str = "inverse_depth"
-    consistent: bool = True
-
-    def __post_init__(self) -> None:
-        require_positive(self, {"iterations": (1, 1000)}, "ekf")
-        for name, known in (("measurement", MEASUREMENTS), ("landmarks", LANDMARKS)):
-            if getattr(self, name) not in known:
-                raise ConfigurationError(f"ekf: {name} must be one of {known}, got {getattr(self, name)!r}")
-
-    def resolved(self) -> EkfConfig:
-        """The options that count: those of the papers' filter where it is asked for."""
-        if self.papers:
-            return EkfConfig(True, "left", 1, "euclidean", False)
-        return self
-
-
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
-@dataclass(frozen=True, eq=False)
-class Form:
-    """What a filter is of: the camera and its error, and the landmarks' coordinates."""
-
-    name: str  # of the back end, for messages
-    config: Any  # its options
-    camera: Any  # the first one: `backends.ekf.motion.EulerCamera`, or another
-    covariance: Array  # of its error (12, 12)
-    coordinates: Coordinates  # of the landmarks
-    iterations: int  # most linearisations of an update
-    stereo: bool = True  # whether the right pixel is measured
-
-
-def papers_form(models: EstimatorModels, options: dict[str, Any]) -> Form:
-    """The papers' Euler angles, by the options of `EkfConfig`."""
-    config = from_options(EkfConfig, "ekf", options)
-    use = config.resolved()
-    stereo = use.measurement == "stereo"
-    camera, P = EulerCamera.first(models, use.consistent)
-    return Form("ekf", config, camera, P, COORDINATES[use.landmarks], use.iterations, stereo)
-
-
-class EkfBackend:
-    """Extended Kalman filter over the camera's motion and the landmarks: the papers' state estimator, made consistent.
-
-    The state is ``[r, φ, v, ω]`` (12), world position, Euler angles, world velocity and angle rates (paper B, section
-    2), then three coordinates per landmark. The camera moves at constant velocity disturbed by impulses, with
-    the printed A and W. A landmark enters with its full cross-covariance (paper A, Eqs. 8 and 10).
-
-    By default this is not the papers' plain filter. It differs in what it measures (the right pixel as well as the
-    left), in the landmarks' coordinates (inverse depth, `backends.ekf.landmarks`), in updates that are linearised again
-    where the first time is not enough, in landmarks tested against all others and in recovery (`backends.ekf.solve`,
-    `backends.ekf.recovery`), and in a covariance that is transported to each corrected state, so that nothing seems to
-    be learnt of where the world is (`backends.ekf.state`). The option ``papers=True`` undoes four of these: the left
-    pixel alone, one linearisation, landmarks in the world, no transport; tests and recovery stay. The angles refer to a
-    world of their own in both (`backends.ekf.angles`).
+class LandmarkFilter:
+    """The filter for any camera and coordinates of landmarks. A back end gives it these, and a `name` for messages.
 
     Args:
         rig: the cameras, rectified.
         models: noise, priors, motion and gate.
-        form: makes what the filter is of, by models and options: the papers' Euler angles, or another camera.
-        options: of the form; see `EkfConfig`.
+        camera: the first one: `backends.ekf.motion.EulerCamera`, or another.
+        P: covariance (12, 12) of its error.
+        coordinates: of the landmarks.
+        iterations: most linearisations of an update.
+        stereo: whether the right pixel is measured.
 
     Attributes:
         state: what is believed now. Each call makes a new one beside it, which takes its place at the end of the call.
-
-    Raises:
-        ConfigurationError: an option is unknown or out of range.
     """
+
+    name: str
 
     #: Of a prior map: those that were measured keep their joint covariance (72 N² bytes).
     most_landmarks = 2000
 
     def __init__(
-        self,
-        rig: StereoRig,
-        models: EstimatorModels = EstimatorModels(),  # noqa: B008
-        form: Callable[[EstimatorModels, dict[str, Any]], Form] = papers_form,
-        **options: Any,
-    ) -> None:
+        self, rig: StereoRig, models: EstimatorModels, camera: Any, P: Array, coordinates: Coordinates, iterations: int,
+        stereo: bool = True,
+    ) -> None:  # fmt: skip
         self.rig, self.models = rig, models
-        if not callable(form):
-            raise ConfigurationError(
-                "form: a function of models and options makes the form of a filter; it is no option"
-            )
-        self._form = form(models, options)
-        self.config, self._coordinates = self._form.config, self._form.coordinates
+        self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
         self._measure = RectifiedMeasurement(rig, models)
-        stereo = self._measure.stereo
-        self._farthest = stereo.f * stereo.baseline / _DISPARITY  # depth of a new landmark [m]
-        self.state = FilterState.first(self._form.camera, self._form.covariance)
+        self.state = FilterState.first(camera, P)
         self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
@@ -163,8 +77,8 @@ class EkfBackend:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         s = self._started("update")
-        require_not_measured(self._form.name, s.measured)
-        require_guess(self._form.name, guess)
+        require_not_measured(self.name, s.measured)
+        require_guess(self.name, guess)
         s = replace(s.with_all_of(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
@@ -175,8 +89,9 @@ class EkfBackend:
         """See `slam.interfaces.Backend.add`."""
         s = self._started("add")
         s.landmarks.require_new(observations.ids)
-        z = self._measure.stereo.measure(observations)
-        new = self._measure.first_sight(observations.ids, z, self._farthest)
+        stereo = self._measure.stereo
+        farthest = stereo.f * stereo.baseline / _DISPARITY
+        new = self._measure.first_sight(observations.ids, stereo.measure(observations), farthest)
         self.state = s.placed(self._coordinates, observations.ids, *new)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
@@ -202,16 +117,15 @@ class EkfBackend:
 
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: what was believed at each stamp, never revised."""
-        s = self.state
-        path = [*self._past[: s.frame], (s.stamp, s.pose)] if s.frame >= 0 else []
-        return Trajectory(np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4))
+        return Trajectory(*self._path())
 
     def recent(self, n: int) -> RecentPoses:
         """The last n poses, at most five, as believed in their time; see `slam.data.RecentPoses`.
 
         Raises MeasurementError before the first `predict`, or where n is less than one.
         """
-        return self._started("recent").recent_poses(require_recent(self._form.name, n))
+        s, n = self._started("recent"), min(require_recent(self.name, n), self.state.covariance.poses)
+        return RecentPoses(*self._path(n), s.covariance.joint_poses(s.camera.by_error(), n))
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -219,7 +133,7 @@ class EkfBackend:
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         s = self.state
-        known = known_landmarks(self._form.name, s.landmarks, ids, positions, covariances, False)
+        known = known_landmarks(self.name, s.landmarks, ids, positions, covariances, False)
         ids, positions, covariances = known
         anchors = distant_anchors(positions, covariances)
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame)
@@ -230,7 +144,7 @@ class EkfBackend:
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
-        known = known_landmarks(self._form.name, s.landmarks, ids, local, covariances, True)
+        known = known_landmarks(self.name, s.landmarks, ids, local, covariances, True)
         self.state = s.placed(self._coordinates, *known)
 
     # --- errors of the rig (documented in slam.interfaces.ConsideringBackend) ---
@@ -239,7 +153,7 @@ class EkfBackend:
         """See `slam.interfaces.ConsideringBackend.consider`."""
         s, m = self.state, field(np.zeros((0, 3))).shape[2]
         if s.frame >= 0 or len(s.landmarks):
-            raise MeasurementError(f"{self._form.name}: {TOO_LATE}")
+            raise MeasurementError(f"{self.name}: {TOO_LATE}")
         by_rig = np.zeros((CAMERA, m))
         if pose is not None:
             by_rig[:POSE] = np.linalg.solve(s.camera.by_error(), pose)
@@ -268,7 +182,7 @@ class EkfBackend:
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
             rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[: s.covariance.correlated])
-            z = stereo.corrected(self._form.name, z[rows], correct)
+            z = stereo.corrected(self.name, z[rows], correct)
             points = se3.transform(s.pose, stereo.triangulate(z))
             good = np.isfinite(points).all(axis=1)
             rows, points = rows[good], points[good]
@@ -280,10 +194,17 @@ class EkfBackend:
 
     # --- the filter's parts ---
 
+    def _path(self, last: int = 0) -> tuple[Array, Array]:
+        """Stamps (F,) [s] and poses (F, 4, 4) so far, or the last ones."""
+        s = self.state
+        before = self._past[max(s.frame + 1 - last, 0) if last else 0 : s.frame]
+        path = [*before, (s.stamp, s.pose)] if s.frame >= 0 else []
+        return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
+
     def _predicted(self, stamp: float, moved: Callable[[Any, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""
         s = self.state
-        require_stamp(self._form.name, stamp, s.stamp if s.frame >= 0 else None)
+        require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, measured=False)
         else:
@@ -311,12 +232,11 @@ class EkfBackend:
         if not len(observations):
             return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         rows, z = s.landmarks.rows_of(observations.ids), self._measure.stereo.measure(observations)
-        if not self._form.stereo:
+        if not self._stereo:
             z[:, 2] = np.nan
         update = Update(
-            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self.models.pixel_sigma, self._measure.stereo,
-            self._coordinates, self._form.iterations, self.models.gate_probability, guess,
-            self._measure.field,
+            s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure, self._coordinates,
+            self._iterations, guess,
         )  # fmt: skip
         noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)
 
@@ -325,18 +245,18 @@ class EkfBackend:
             return landmarks_pose(self._measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
-            found = agreement(update, noises, search, self.models)
+            found = agreement(update, noises, search)
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
             after = s.corrected(found)
         except UnsolvableError as error:
-            return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self._form.name}: {error}")
+            return s, UpdateReport.nothing(UpdateStatus.FAILED, f"{self.name}: {error}")
         used, w = found.used, found.whitened.w
         dof, ids = int(np.isfinite(z[used]).sum()), observations.ids
         return after, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], float(w @ w), dof)
 
     def _started(self, what: str) -> FilterState:
         if self.state.frame < 0:
-            raise MeasurementError(f"{self._form.name}: {what} before the first predict")
+            raise MeasurementError(f"{self.name}: {what} before the first predict")
         return self.state

@@ -22,14 +22,13 @@ from scipy.special import bdtrc
 from backends.ekf.solve import Gated, Posterior, UnsolvableError, Update, gate, solve
 from slam.geometry import se3
 from slam.geometry.se3 import Array
-from slam.models import EstimatorModels
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
 
 #: The pose (4, 4) on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]
 
 
-def agreement(update: Update, noises: Iterable[Array], search: Search, models: EstimatorModels) -> Posterior | None:
+def agreement(update: Update, noises: Iterable[Array], search: Search) -> Posterior | None:
     """Solve with the prior that most observations agree with; None where there is none.
 
     Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
@@ -49,7 +48,10 @@ def agreement(update: Update, noises: Iterable[Array], search: Search, models: E
     finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
     T = search() if finite and len(update.z) >= least else None
     if T is not None:
-        there = replace(update, guess=T).wider(restart_noise(update.camera.pose, T, models))
+        models, before = update.measure.models, update.camera.pose
+        far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
+        sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
+        there = replace(update, guess=T).wider(np.diag(np.repeat(np.array(sigmas, float) ** 2, 3)))
         try:
             restarted = solve(gate(there, at_guess=True))
             if restarted is not None and restarted.used.sum() >= least:
@@ -88,12 +90,5 @@ def _agreed(gated: Gated) -> Posterior | None:
     rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
     if not len(rejected):
         return None
-    share = share_by_chance(rejected, float(gated.limits.max()))
-    return None if bdtrc(used - 1, count, share) > 1 - gated.innovation.at.update.gate_probability else found
-
-
-def restart_noise(before: Array, after: Array, models: EstimatorModels) -> Array:
-    """The noise (12, 12) of a camera that is at a pose (4, 4) instead of another, and whose speed is unknown."""
-    far, turned = np.linalg.norm(after[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ after[:3, :3])
-    speeds = models.initial_velocity_sigma, models.initial_angular_velocity_sigma
-    return np.diag(np.repeat(np.array([far, turned, *speeds], float) ** 2, 3))
+    share, models = share_by_chance(rejected, float(gated.limits.max())), gated.innovation.at.update.measure.models
+    return None if bdtrc(used - 1, count, share) > 1 - models.gate_probability else found

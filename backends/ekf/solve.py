@@ -28,7 +28,7 @@ from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
-from slam.window.stereo import Field, RectifiedStereo, no_field
+from slam.window.stereo import RectifiedMeasurement
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: it moves points to where noisy pixels want them, and claims information that is not
@@ -53,13 +53,15 @@ class Update:
     landmarks: FilterLandmarks  # those that were measured (M,); all are in the state
     rows: IndexArray  # their rows (M,) in the table of all
     z: Array  # measurements (M, 3) [px], NaN where a component is not measured
-    sigma: float  # pixel noise [px]
-    stereo: RectifiedStereo
+    measure: RectifiedMeasurement  # what they measure, their noise, and the gate
     coordinates: Coordinates
     iterations: int  # most linearisations
-    gate_probability: float  # quantile of χ² beyond which a landmark's measurement is rejected
     guess: Array | None = None  # a pose (4, 4) worth trying where the prior is far off
-    field: Field = no_field  # derivatives of measurements by errors of the rig
+
+    @property
+    def sigma(self) -> float:
+        """Pixel noise [px]."""
+        return self.measure.models.pixel_sigma
 
     def wider(self, noise: Array) -> Update:
         """With more noise (12, 12) of the camera."""
@@ -81,20 +83,25 @@ class Update:
         """
         anchors, moved = self.landmarks.anchors, change[CAMERA + self.numbers].reshape(-1, 3)
         c = self.coordinates.moved(self.landmarks.c, moved)
-        z, J = self.stereo.project((self.coordinates.points(anchors, c) - T[:3, 3]) @ T[:3, :3])
+        z, J = self.measure.stereo.project((self.coordinates.points(anchors, c) - T[:3, 3]) @ T[:3, :3])
         return z, J @ (T[:3, :3].T @ self.coordinates.jacobian(anchors, c))
 
     def at(self, camera: Any = None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
-        """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose."""
-        there, J, mean = self.camera, np.eye(CAMERA), np.zeros(CAMERA)
+        """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose.
+
+        Where the covariance is transported, so is an error of the pose: it moves landmarks as it does at the prior.
+        """
+        there, J, mean, marks = self.camera, np.eye(CAMERA), np.zeros(CAMERA), self.landmarks
         size = CAMERA + len(self.covariance.marks) - 3 * self.covariance.left
         change = np.zeros(size) if change is None else change.copy()
+        if not there.transports:
+            marks = marks.moved(self.coordinates, slice(None), change[CAMERA + self.numbers].reshape(-1, 3))
         if camera is not None:
             there = self.camera.at(camera.pose)
             J = self.camera.transport(there)
             mean = np.linalg.solve(J, self.camera.seen_from(there))
             change[:CAMERA] = np.concatenate([np.zeros(POSE), camera.seen_from(there)[POSE:]])
-        lever = self.landmarks.gauge @ (there.world() @ J[:POSE, :POSE])
+        lever = marks.gauge @ (there.world() @ J[:POSE, :POSE])
         return Linearisation(self, there, J, mean, change, *self.seen(there.pose, change), lever, from_prior)
 
 
@@ -149,20 +156,6 @@ class Innovation:
     nu: Array  # innovation of the prior's mean (3M,)
     S: Array  # its covariance (3M, 3M)
 
-    def with_rest(self) -> tuple[Array, Array]:
-        """``H P`` with the last poses and what has left the state; derivatives (3M, m) of ν by errors of the rig."""
-        update, P = self.at.update, self.at.update.covariance
-        numbers, h, b = 3 * P.left + update.numbers, len(P.head), 3 * P.left
-        with_pose = np.concatenate([P.head[:POSE, CAMERA:h], P.head[:POSE, h : h + b]], axis=1)
-        with_marks = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
-        by_rig = _times(self.own, self.by_pose, P.by_rig[:POSE], P.by_rig[h + numbers])
-        by_rig -= np.where(self.rows[:, :, None], update.field(update.z), 0.0).reshape(by_rig.shape)
-        return _times(self.own, self.by_pose, with_pose, with_marks), by_rig
-
-    def transposed_times(self, y: Array) -> Array:
-        """``Hᵀ y`` (6 + 3M,) of [pose, measured landmarks], for y (3M,); it is zero elsewhere."""
-        return np.concatenate([y @ self.by_pose, (y.reshape(-1, 1, 3) @ self.own).reshape(-1)])
-
     def whitened(self, used: BoolArray) -> Whitened:
         """That of some landmarks (mask (M,)), whitened; UnsolvableError where S is not positive definite."""
         nu, S, out = self.nu, self.S, np.flatnonzero(np.repeat(~used, 3))
@@ -210,11 +203,15 @@ class Whitened:
 
     def lost(self) -> tuple[tuple[Array, Array, Array], Array]:
         """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
-        (with_camera, with_marks), (rest, by_rig) = self.innovation.HP, self.innovation.with_rest()
-        narrow = np.concatenate([with_camera, rest], axis=1)
-        V, V_marks = (dtrmm(1.0, self.inverse.T, HX.T, side=1) for HX in (narrow, with_marks))
-        h = len(self.innovation.at.update.covariance.head)
-        return (V[:h], V[h:], V_marks), self.inverse @ by_rig
+        nu, (with_camera, with_marks), update = self.innovation, self.innovation.HP, self.innovation.at.update
+        P, H = update.covariance, (nu.own, nu.by_pose)
+        h, b, numbers = len(P.head), 3 * P.left, 3 * P.left + update.numbers
+        poses_and_left = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
+        rest = _times(*H, P.head[:POSE, CAMERA : h + b], poses_and_left)
+        V = dtrmm(1.0, self.inverse.T, np.concatenate([with_camera, rest], axis=1).T, side=1)
+        by_rig = _times(*H, P.by_rig[:POSE], P.by_rig[h + numbers])
+        by_rig -= np.where(nu.rows[:, :, None], update.measure.field(update.z), 0.0).reshape(by_rig.shape)
+        return (V[:h], V[h:], dtrmm(1.0, self.inverse.T, with_marks.T, side=1)), self.inverse @ by_rig
 
     def distances(self) -> Array:
         """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
@@ -236,16 +233,6 @@ class Posterior:
 
     whitened: Whitened  # the last innovation, from which the covariance follows
     change: Array  # of the state (n,) from the prior; the pose's part counts from the last linearisation
-
-    @property
-    def update(self) -> Update:
-        """What it is of."""
-        return self.whitened.innovation.at.update
-
-    @property
-    def camera(self) -> Any:
-        """The corrected camera."""
-        return self.whitened.innovation.at.camera_after(self.change)
 
     @property
     def used(self) -> BoolArray:
@@ -274,7 +261,7 @@ def gate(update: Update, at_guess: bool = False) -> Gated:
         raise UnsolvableError("the predicted state is not finite")
     visible = np.asarray(np.isfinite(start.z).all(axis=1))
     innovation = start.innovation(measured & visible[:, None])
-    m, limits = len(visible), chi_square_limits(measured.sum(axis=1), update.gate_probability)
+    m, limits = len(visible), chi_square_limits(measured.sum(axis=1), update.measure.models.gate_probability)
     blocks = innovation.S.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)]
     own = squared_distances(innovation.nu.reshape(m, 3), blocks)
     if not np.isfinite(own).all():
@@ -296,7 +283,7 @@ def solve(gated: Gated) -> Posterior | None:
         excess = found.whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            left = found.update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
+            left = gated.innovation.at.update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
             return found
@@ -321,7 +308,9 @@ def _iterate(whitened: Whitened) -> Posterior:
             raise UnsolvableError("the corrected state is not finite")
         if update.iterations == 1 or _linear(whitened, change):
             return Posterior(whitened, change)
-        following, step = _descend(now, rows, whitened.innovation.transposed_times(y), change)
+        innovation = whitened.innovation
+        towards = np.concatenate([y @ innovation.by_pose, (y.reshape(-1, 1, 3) @ innovation.own).reshape(-1)])  # Hᵀ y
+        following, step = _descend(now, rows, towards, change)
         if iteration == 1 and update.guess is not None:
             following = min(following, _at_guess(update), key=lambda iterate: iterate.cost(rows))
         if following is now:

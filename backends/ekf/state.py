@@ -11,7 +11,7 @@ from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from backends.ekf.motion import Motion
 from backends.ekf.solve import Posterior, UnsolvableError
-from slam.data import IdArray, IndexArray, RecentPoses
+from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
 RECENT = 4  #: cost: poses before the present one that are kept
@@ -33,7 +33,6 @@ class FilterState:
     camera: Any  # `backends.ekf.motion.EulerCamera`, or another: pose and velocities, and what their error means
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
-    recent: tuple[tuple[float, Array], ...] = ()  # stamps [s] and poses (4, 4) of the last frames, the newest first
 
     @classmethod
     def first(cls, camera: Any, P: Array) -> FilterState:
@@ -55,19 +54,10 @@ class FilterState:
 
     def advanced(self, stamp: float, motion: Motion) -> FilterState:
         """At a later time, after a motion of the camera."""
-        covariance = self.covariance.with_pose(self.camera.by_error(), RECENT).camera_moved(motion.J, motion.noise)
-        recent = ((self.stamp, self.pose), *self.recent)[:RECENT]
-        return replace(
-            self, stamp=stamp, frame=self.frame + 1, dt=stamp - self.stamp, measured=False, camera=motion.camera,
-            covariance=covariance, recent=recent,
-        )  # fmt: skip
-
-    def recent_poses(self, n: int) -> RecentPoses:
-        """The last poses, as they were believed in their time, with their joint covariance; at most n."""
-        path = [(self.stamp, self.pose), *self.recent][:n][::-1]
-        joint = self.covariance.joint_poses(self.camera.by_error(), len(path))
-        stamps, poses = np.array([stamp for stamp, _ in path]), np.array([T for _, T in path])
-        return RecentPoses(stamps, poses, 0.5 * (joint + joint.T))
+        camera, J, noise = motion
+        covariance = self.covariance.with_pose(self.camera.by_error(), RECENT).camera_moved(J, noise)
+        dt, frame = stamp - self.stamp, self.frame + 1
+        return replace(self, stamp=stamp, frame=frame, dt=dt, measured=False, camera=camera, covariance=covariance)
 
     # --- landmarks join and leave ---
 
@@ -148,8 +138,8 @@ class FilterState:
         and Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none. Raises
         UnsolvableError where the new state is not finite.
         """
-        update, before, P = found.update, self.landmarks, self.covariance
-        camera, state = found.camera, slice(P.left, P.correlated)
+        at, before, P = found.whitened.innovation.at, self.landmarks, self.covariance
+        update, camera, state = at.update, at.camera_after(found.change), slice(P.left, P.correlated)
         marks = before.moved(update.coordinates, state, found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")

@@ -1,4 +1,4 @@
-"""The right-invariant EKF as a form of the filter that `backends.ekf` runs: another camera, another error.
+"""The right-invariant EKF: the filter of `backends.ekf` with another camera, and another error.
 
 The state ``χ = (R, p, v, p_1, …, p_N)`` is an element of SE_{2+N}(3) (Barrau and Bonnabel, 2015; Zhang, Wu, Song, Huang
 and Dissanayake, 2017): attitude, position and velocity of the camera, and the landmarks, all in the world. Beside it
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from backends.ekf.covariance import CAMERA, POSE
-from backends.ekf.filter import EkfBackend, Form
+from backends.ekf.filter import LandmarkFilter
 from backends.ekf.landmarks import InverseDepth
 from backends.ekf.motion import Motion, after_gap, motion_noise, prior
 from slam.bounds import from_options, require_positive
@@ -86,20 +86,20 @@ class InvariantCamera:
         """See `EulerCamera`: ``R ← R Exp(ω Δt)``, ``p ← p + v Δt``, disturbed by the papers' impulses."""
         gap = after_gap(models, P, dt)
         if gap is not None:  # it may be turned anyhow: it stays, independent of the map
-            still = replace(self, v=np.zeros(3), rate=np.zeros(3))
-            return Motion(still, np.zeros((CAMERA, CAMERA)), gap)
+            return self._stopped(), np.zeros((CAMERA, CAMERA)), gap
         R, turn = self.pose[:3, :3], self.rate * dt
         after = se3.nearest_rotation(R @ se3.so3_exp(turn))  # products of many rotations lose digits
         T = se3.pose(after, self.pose[:3, 3] + dt * self.v)
-        A, G = np.eye(CAMERA), np.eye(CAMERA)
-        G[3:6, 3:6] = R @ se3.so3_left_jacobian(turn)
-        A[:3, 6:9], A[3:6, 9:] = dt * np.eye(3), dt * G[3:6, 3:6]
-        return Motion(replace(self, pose=T), A, G @ motion_noise(models, dt) @ G.T)
+        A = np.eye(CAMERA)
+        A[:3, 6:9], A[3:6, 9:] = dt * np.eye(3), dt * R @ se3.so3_left_jacobian(turn)
+        return replace(self, pose=T), A, motion_noise(models, dt, A[:, POSE:])
 
     def at_rest(self) -> Motion:
         """See `EulerCamera`."""
-        still = replace(self, v=np.zeros(3), rate=np.zeros(3))
-        return Motion(still, np.diag(np.repeat([1.0, 0.0], POSE)))
+        return self._stopped(), np.diag(np.repeat([1.0, 0.0], POSE)), np.zeros((CAMERA, CAMERA))
+
+    def _stopped(self) -> InvariantCamera:
+        return replace(self, v=np.zeros(3), rate=np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class IekfConfig:
         require_positive(self, {"iterations": (1, 1000)}, "iekf")
 
 
-def IekfBackend(rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> EkfBackend:  # noqa: B008
+class IekfBackend(LandmarkFilter):
     """Right-invariant extended Kalman filter over the camera's motion and the landmarks.
 
     Gate, update, iteration, recovery, and the landmarks that leave the dense state are those of `backends.ekf`; what is
@@ -129,17 +129,16 @@ def IekfBackend(rig: StereoRig, models: EstimatorModels = EstimatorModels(), **o
     state takes its error in the world as it is with it, and comes back to the invariant one.
 
     Args:
-        rig: the cameras.
+        rig: the cameras, rectified.
         models: noise, priors, motion and gate.
         options: see `IekfConfig`.
 
     Raises:
         ConfigurationError: an option is unknown or out of range.
     """
-    return EkfBackend(rig, models, form=_form, **options)
 
+    name = "iekf"
 
-def _form(models: EstimatorModels, options: dict[str, Any]) -> Form:
-    config = from_options(IekfConfig, "iekf", options)
-    camera, P = InvariantCamera.first(models)
-    return Form("iekf", config, camera, P, InverseDepth(), config.iterations)
+    def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
+        self.config = from_options(IekfConfig, "iekf", options)
+        super().__init__(rig, models, *InvariantCamera.first(models), InverseDepth(), self.config.iterations)

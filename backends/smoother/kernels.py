@@ -4,80 +4,123 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import multiply
+from slam.kernels.linear import invert_symmetric, multiply, trace
 from slam.kernels.se3 import transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.kernels.velocities import velocity_change
-from slam.runtime.compilation import kernel
+from slam.runtime.compilation import helper, kernel
+
+_GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
+_DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
+_BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
+_FREE = 1e-12  # numerics: share of an information that is added to keep the inverse finite: far points leave depth free
 
 
-@kernel
-def information_of(camera, poses, frames, z, points, rows, sigma):
-    """What measurements z (n, 3) [px], made in `frames` (n,), say of landmarks, linearised at their `points` (M, 3).
+@helper
+def add_information(camera, T, z, point, weight, H, g, work):
+    """Add what a measurement z (3,) from a pose T (4, 4) says of a point (3,) to information H (3, 3), gradient g (3,).
 
-    `camera` (7,) is as in `slam.kernels.stereo`, `poses` T_world_left (F, 4, 4); `rows` (M, K) are
-    the measurements of each landmark, −1 for none. Returns the information of each measurement (M, K, 3, 3) [1/m²], the
-    gradient (M, 3) towards the optimum, half the negative derivative of the sum of squares, which is the third (M,),
-    and the number of measurements whose landmark lies behind the camera (M,): they count for nothing in the others.
+    Returns its sum of squares, or `_BEHIND` where the point lies behind the camera: it says nothing else then. `camera`
+    is as in `slam.kernels.stereo`; `weight` is one over the variance of a pixel; `work` (6, 3) is overwritten.
     """
-    count, most = rows.shape
-    information, gradient = np.zeros((count, most, 3, 3)), np.zeros((count, 3))
-    squares, behind = np.zeros(count), np.zeros(count)
-    weight = 1 / (sigma * sigma)
-    local, r, J, d = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    for m in range(count):
-        for k in range(most):
-            row = rows[m, k]
-            if row < 0:
-                continue
-            T = poses[frames[row]]
-            transform_back(T, points[m], local)
-            if not residual(camera, local, z[row], r, J):
-                behind[m] += 1
-                continue
-            for c in range(3):  # uL, vL, uR
-                if not np.isfinite(r[c]):
-                    continue
-                squares[m] += weight * r[c] * r[c]
-                by_point(J[c], T, d)
-                for i in range(3):
-                    gradient[m, i] += weight * r[c] * d[i]
-                    for j in range(3):
-                        information[m, k, i, j] += weight * d[i] * d[j]
-    return information, gradient, squares, behind
-
-
-@kernel
-def carried_by(known, poses, frames, points, rows, information, older, covariance):
-    """How poses (W, 4, 4) of the frames `known`, ascending, carry landmarks along: Jacobians (M, 3, 6 W) by the poses.
-
-    `frames`, `points` and `rows` are as in `information_of`, `information` (M, K, 3, 3) is by it. That of measurements
-    before these, `older` (M, 3, 3), counts for the pose of the oldest of these. The landmarks have `covariance`
-    (M, 3, 3) where all poses are known.
-    """
-    count, most, width = len(points), rows.shape[1], len(known)
-    out = np.zeros((count, 3, 6 * width))
-    places, d = np.empty(most, np.int64), np.empty(3)
-    share, C, D = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for m in range(count):
-        oldest = width - 1
-        for k in range(most):
-            places[k] = -1
-            if rows[m, k] >= 0:
-                place = 0
-                while place < width - 1 and known[place] < frames[rows[m, k]]:
-                    place += 1
-                places[k] = place
-                oldest = min(oldest, place)
-        for w in range(width):
+    local, r, d, J = work[0], work[1], work[2], work[3:]
+    transform_back(T, point, local)
+    if not residual(camera, local, z, r, J):
+        return _BEHIND
+    squares = 0.0
+    for c in range(3):  # uL, vL, uR
+        if np.isfinite(r[c]):
+            squares += weight * r[c] * r[c]
+            by_point(J[c], T, d)
             for i in range(3):
-                d[i] = points[m, i] - poses[w, i, 3]
+                g[i] += weight * r[c] * d[i]
                 for j in range(3):
-                    share[i, j] = older[m, i, j] if w == oldest else 0.0
-                    for k in range(most):
-                        if places[k] == w:
-                            share[i, j] += information[m, k, i, j]
-            multiply(covariance[m], share, C)
+                    H[i, j] += weight * d[i] * d[j]
+    return squares
+
+
+@kernel
+def refine(camera, poses, frames, z, sigma, mean, information, points, own):
+    """Move points (M, 3) to where their measurements put them, given poses (F, 4, 4), and fill in their covariances.
+
+    Each by Levenberg-Marquardt for itself: a plain step from a distant start may end behind the camera. A landmark
+    without measurements stays as it is.
+
+    Args:
+        camera: see `add_information`.
+        poses: T_world_left.
+        frames: poses that measured each (M, K), negative for none.
+        z: the measurements (M, K, 3) [px].
+        sigma: noise of a pixel [px].
+        mean: what is known of each besides (M, 3),
+        information: and how well (M, 3, 3) [1/m²].
+        points: changed in place.
+        own: covariances (M, 3, 3) [m²] where all poses are known, changed in place.
+    """
+    weight = 1 / (sigma * sigma)
+    H, g, A, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    H_there, g_there, x, step = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    work = np.empty((6, 3))
+    for m in range(len(points)):
+        if frames[m].max() < 0:
+            continue
+        damping, cost = 0.0, np.inf
+        x[:] = points[m]
+        for iteration in range(_STEPS + 1):
+            there = 0.0
+            for i in range(3):
+                g_there[i] = 0.0
+                for j in range(3):
+                    H_there[i, j] = information[m, i, j]
+                    g_there[i] += information[m, i, j] * (mean[m, j] - x[j])
+                there += g_there[i] * (mean[m, i] - x[i])
+            for k in range(frames.shape[1]):
+                if frames[m, k] >= 0:
+                    there += add_information(camera, poses[frames[m, k]], z[m, k], x, weight, H_there, g_there, work)
+            if there < cost or not iteration:
+                cost, damping = there, 0.1 * damping
+                points[m], H[:], g[:] = x, H_there, g_there
+            else:
+                damping = max(10 * damping, _DAMPING)
+            A[:] = H
+            for i in range(3):
+                A[i, i] *= 1 + damping
+            invert_symmetric(A, _FREE * (1 + trace(A)), inverse)
+            gain = 0.0
+            for i in range(3):
+                step[i] = inverse[i, 0] * g[0] + inverse[i, 1] * g[1] + inverse[i, 2] * g[2]
+                gain += g[i] * step[i]
+            if not gain > _GAIN:
+                break
+            for i in range(3):
+                x[i] = points[m, i] + step[i]
+        invert_symmetric(H, _FREE * (1 + trace(H)), own[m])
+
+
+@kernel
+def carried_by(camera, poses, width, frames, z, sigma, points, older, own):
+    """How the last poses carry landmarks along: Jacobians (M, 3, 6 width) by the last `width` of the poses.
+
+    The other arguments are as in `refine`. Measurements from earlier poses, and what is known besides them, `older`
+    (M, 3, 3), count for the oldest of these poses that measured the landmark.
+    """
+    first, weight = len(poses) - width, 1 / (sigma * sigma)
+    out, share = np.zeros((len(points), 3, 6 * width)), np.empty((width, 3, 3))
+    d, g, C, D, work = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((6, 3))
+    for m in range(len(points)):
+        share[:] = 0.0
+        oldest = width - 1
+        for k in range(frames.shape[1]):
+            if frames[m, k] >= 0:
+                place = max(frames[m, k] - first, 0)
+                oldest = min(oldest, place)
+                add_information(camera, poses[frames[m, k]], z[m, k], points[m], weight, share[place], g, work)
+        share[oldest] += older[m]
+        for w in range(width):
+            T = poses[first + w]
+            multiply(own[m], share[w], C)
+            for i in range(3):
+                d[i] = points[m, i] - T[i, 3]
             for i in range(3):  # C times the negative cross product matrix of d
                 D[i, 0] = C[i, 2] * d[1] - C[i, 1] * d[2]
                 D[i, 1] = C[i, 0] * d[2] - C[i, 2] * d[0]
@@ -85,8 +128,8 @@ def carried_by(known, poses, frames, points, rows, information, older, covarianc
             for i in range(3):
                 for j in range(3):
                     for h in range(3):
-                        out[m, i, 6 * w + j] += D[i, h] * poses[w, h, j]
-                        out[m, i, 6 * w + 3 + j] += C[i, h] * poses[w, h, j]
+                        out[m, i, 6 * w + j] += D[i, h] * T[h, j]
+                        out[m, i, 6 * w + 3 + j] += C[i, h] * T[h, j]
     return out
 
 

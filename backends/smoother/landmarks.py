@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from backends.smoother.kernels import carried_by, information_of
+from backends.smoother import kernels
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.arrays import LandmarkRows
 from slam.geometry.se3 import Array, points_by_pose
@@ -15,9 +15,6 @@ from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
 VARIABLE = -(10**9)  #: in place of the number of the pose with which a smart factor begins: a variable of the graph
-_GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
-_DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
-_BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +81,7 @@ class SmootherLandmarks(LandmarkRows):
         old = np.zeros(len(self), bool)
         old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
-            self = _put(self, old, self.without_measurements())
+            self = self.without_measurements(old)
         away = self.away.copy()
         away[rows] = 0.0
         zs, poses = self.z.copy(), self.pose.copy()
@@ -145,13 +142,11 @@ class SmootherLandmarks(LandmarkRows):
         away[unseen] += by_pose @ drift @ np.swapaxes(by_pose, 1, 2)
         return replace(self, away=away)
 
-    def without_measurements(self) -> Self:
-        """As they stand, with what is known of them now in place of their measurements."""
-        information = np.where(self.world[:, None, None], self.information, inverses(self.from_newest))
-        mean = np.where(self.world[:, None], self.mean, self.position)
-        return replace(
-            self, mean=mean, information=information, z=np.full_like(self.z, np.nan), pose=-1 + 0 * self.pose
-        )
+    def without_measurements(self, chosen: BoolArray) -> Self:
+        """As they stand, with what is known of some (S,) now in place of their measurements."""
+        some = self._known_by(chosen & ~self.world, self.from_newest)
+        z = np.where(chosen[:, None, None], np.nan, self.z)
+        return replace(some, z=z, pose=np.where(chosen[:, None], -1, self.pose))
 
     def folded(self, first: int, oldest: int) -> Self:
         """With what they are known by in place of all measurements, where one was made before pose number `first`.
@@ -160,52 +155,20 @@ class SmootherLandmarks(LandmarkRows):
         Landmarks that pose `oldest` or a later one measured go on with the measurements that are left.
         """
         old = ((self.pose >= 0) & (self.pose < first)).any(axis=1) & (self.pose.max(axis=1) < oldest) & ~self.world
-        return replace(
-            self, mean=np.where(old[:, None], self.position, self.mean),
-            information=np.where(old[:, None, None], inverses(self.own), self.information),
-            z=np.where(old[:, None, None], np.nan, self.z),
-        )  # fmt: skip
+        return replace(self._known_by(old, self.own), z=np.where(old[:, None, None], np.nan, self.z))
+
+    def _known_by(self, chosen: BoolArray, covariances: Array) -> Self:
+        """Where some (S,) stand is what is known of them, with covariances (S, 3, 3)."""
+        information = np.where(chosen[:, None, None], inverses(covariances), self.information)
+        return replace(self, mean=np.where(chosen[:, None], self.position, self.mean), information=information)
 
     def refined(self, stereo: RectifiedStereo, sigma: float, first: int, poses: Array) -> Self:
-        """Where their measurements put them, given the poses (K, 4, 4) from number `first` on.
-
-        Each landmark by Levenberg-Marquardt for itself: a plain step from a distant start may end behind the camera.
-        """
-        rows = np.where(self.pose >= first, np.arange(self.pose.size).reshape(self.pose.shape), -1)
-        todo = np.flatnonzero((rows >= 0).any(axis=1))
-        if not len(todo):
-            return self
-        frames, z = (self.pose - first).ravel(), self.z.reshape(-1, 3)
-
-        def at(x: Array, m: IndexArray) -> tuple[Array, Array, Array]:
-            information, gradient, squares, behind = information_of(
-                stereo.intrinsics, poses, frames, z, x, rows[m], sigma
-            )
-            off = self.mean[m] - x
-            pull = (self.information[m] @ off[:, :, None])[:, :, 0]
-            cost = squares + _BEHIND * behind + (off * pull).sum(axis=1)
-            return information.sum(axis=1), gradient + pull, cost
-
-        x, own = self.position.copy(), self.own.copy()
-        seen, all_rows = todo, np.zeros((len(self), 3, 3))
-        damping, gradient, cost = np.zeros(len(self)), np.zeros((len(self), 3)), np.zeros(len(self))
-        all_rows[todo], gradient[todo], cost[todo] = at(x[todo], todo)
-        for _ in range(_STEPS):
-            H = _regular(all_rows[todo] + self.information[todo])
-            np.einsum("mii->mi", H)[:] *= 1 + damping[todo, None]
-            step = np.linalg.solve(H, gradient[todo][:, :, None])[:, :, 0]
-            far = (gradient[todo] * step).sum(axis=1) > _GAIN
-            todo, step = todo[far], step[far]
-            if not len(todo):
-                break
-            tried = x[todo] + step
-            found = at(tried, todo)
-            better = found[2] < cost[todo]
-            done = todo[better]
-            x[done], all_rows[done], gradient[done], cost[done] = tried[better], *(part[better] for part in found)
-            damping[todo] = np.where(better, 0.1 * damping[todo], np.maximum(10 * damping[todo], _DAMPING))
-        own[seen] = inverses(all_rows[seen] + self.information[seen])
-        return replace(self, position=x, own=own)
+        """Where their measurements put them, given the poses (K, 4, 4) from number `first` on."""
+        position, own = self.position.copy(), self.own.copy()
+        kernels.refine(
+            stereo.intrinsics, poses, self.pose - first, self.z, sigma, self.mean, self.information, position, own
+        )
+        return replace(self, position=position, own=own)
 
     def covariances(
         self, stereo: RectifiedStereo, sigma: float, chosen: IndexArray, first: int, poses: Array, joint: Array
@@ -218,36 +181,22 @@ class SmootherLandmarks(LandmarkRows):
         measured is carried by the newest, with the drift since it is known. All `poses` (N, 4, 4) are from number
         `first` on.
         """
-        frames, z = (self.pose - first).clip(0).ravel(), self.z.reshape(-1, 3)
-        rows = np.where(self.pose >= 0, np.arange(self.pose.size).reshape(self.pose.shape), -1)[chosen]
-        x, own = self.position[chosen], self.own[chosen]
-        information, *_ = information_of(stereo.intrinsics, poses, frames, z, x, rows, sigma)
-        older = np.where(self.world[chosen, None, None], 0.0, self.information[chosen])
-        n, width = len(chosen), len(joint)
-        known = np.arange(len(poses) - width // 6, len(poses))
-        J = carried_by(known, poses[known], frames, x, rows, information, older, own)
-        C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
-        C += np.where(np.asarray((rows < 0).all(axis=1))[:, None, None], self.away[chosen], 0.0)
+        marks, n, width = self.select(chosen), len(chosen), len(joint)
+        frames = np.where(marks.pose >= 0, (marks.pose - first).clip(0), -1)
+        older = np.where(marks.world[:, None, None], 0.0, marks.information)
+        J = kernels.carried_by(
+            stereo.intrinsics, poses, width // 6, frames, marks.z, sigma, marks.position, older, marks.own
+        )
+        C = marks.own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
+        C[frames.max(axis=1) < 0] += marks.away[frames.max(axis=1) < 0]
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
 
 
-def _put(marks: SmootherLandmarks, chosen: BoolArray, others: SmootherLandmarks) -> SmootherLandmarks:
-    """Landmarks with some rows (S,) taken from others."""
-    columns = zip(marks.columns, others.columns)
-    return SmootherLandmarks(
-        *(np.where(chosen.reshape(-1, *[1] * (mine.ndim - 1)), its, mine) for mine, its in columns)
-    )
-
-
-def _regular(H: Array) -> Array:
-    """Information matrices (M, 3, 3) with a little added to keep the inverse finite: far points leave depth free."""
-    H = H.copy()
-    diagonal = np.einsum("mii->mi", H)
-    diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-12
-    return H
-
-
 def inverses(H: Array) -> Array:
-    """Inverses (M, 3, 3) of information matrices or covariances, symmetric to the last digit."""
-    P = np.linalg.inv(_regular(H))
-    return 0.5 * (P + np.swapaxes(P, 1, 2))
+    """Inverses (M, 3, 3) of information matrices or covariances, symmetric to the last digit.
+
+    A little is added to keep them finite: far points leave depth free.
+    """
+    H = H + (1e-12 + 1e-12 * np.trace(H, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+    P = np.linalg.inv(H)
+    return np.asarray(0.5 * (P + np.swapaxes(P, 1, 2)))

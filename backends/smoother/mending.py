@@ -44,16 +44,14 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
         now[-1] = s.poses[-1]
     D = now[0] @ inverse(s.poses[s.of(first)])
     moved = np.concatenate([D @ s.poses[: s.of(first)], now])
-    marks = s.landmarks
+    marks, last = s.landmarks, s.last.copy()
     unseen = ~marks.world & ~(marks.pose >= first).any(axis=1)
     position = np.where(unseen[:, None], transform(D, marks.position), marks.position)
     marks = replace(marks, position=position, mean=np.where(unseen[:, None], position, marks.mean))
-    last = s.last.copy()
     if s.anchored:
         last[1] = moved[-1] @ inverse(s.poses[-1]) @ s.last[1]
-    before = s.poses[-1] if s.inside is False or len(moved) < 2 else s.poses[-2]
-    after = moved[-1] if s.inside is False or len(moved) < 2 else moved[-2]
-    last[0] = after @ inverse(before) @ s.last[0]
+    at = -2 if s.inside and len(moved) > 1 else -1  # the pose at which the last frame but one hangs
+    last[0] = moved[at] @ inverse(s.poses[at]) @ s.last[0]
     marks = marks.refined(steps.stereo, steps.models.pixel_sigma, s.first, moved)
     s = replace(s, poses=moved, last=last, landmarks=marks)
     with suppress(SolverError):  # then the next update tries again
@@ -64,28 +62,18 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
 def path_solved(s: SmootherState, make: FactorMaker, before: Array) -> Array:
     """All poses of the graph, those that are kept solved for together; as they are where that fails.
 
-    The newest pose stays where it is, and the path moves, but where landmarks are known in the world.
+    The newest pose stays where it is, and the path moves, but where landmarks are known in the world. Those that are
+    kept no more are `before` (N, 4, 4).
     """
     first = max(s.begun, s.first)
-    try:
-        kept = np.concatenate([s.poses[: s.of(first)], optimised(s, make, first)])
-    except SolverError:
-        kept = s.poses
-    M = np.eye(4) if s.anchored else s.poses[-1] @ inverse(kept[-1])
-    return M @ np.concatenate([before, kept])
-
-
-def optimised(s: SmootherState, make: FactorMaker, first: int) -> Array:
-    """Poses from number `first` on that fit their measurements best, the first with a prior.
-
-    Raises SolverError as `minimised`.
-    """
-    problem, tracks = GraphProblem(), Tracks(make, None)
+    problem, tracks, kept = GraphProblem(), Tracks(make, None), s.poses.copy()
     problem.factors.add(make.prior(first, s.poses[s.of(first)], held(s, first)[0]))
-    numbers = range(first, s.number + 1)
-    for number in numbers:
+    for number in range(first, s.number + 1):
         tracks.add_pose(problem, s, number, first)
         tracks.add_rows(problem, s, number, first)
     tracks.make_smart(problem)
-    values = minimised(problem, _ITERATIONS)
-    return np.array([values.atPose3(pose_key(i)).matrix() for i in numbers])
+    with suppress(SolverError):
+        values = minimised(problem, _ITERATIONS)
+        kept[s.of(first) :] = [values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)]
+    M = np.eye(4) if s.anchored else s.poses[-1] @ inverse(kept[-1])
+    return np.asarray(M @ np.concatenate([before, kept]))

@@ -77,6 +77,8 @@ class SmootherState:
     last: Array  # their poses (2, 4, 4)
     pair: Array  # their joint covariance (12, 12), where the newest pose of the graph is known
     by_rig: Array  # their derivatives by errors of the rig (12, m)
+    # covariance of the attitude of the pose with which the problem begins (3, 3) [rad²], about the world's axes
+    turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
     tie: Tie | None = None  # of the newest frame to the newest pose of the graph that is before it
     frame: int = -1  # number of the newest frame
     since: int = 0  # frames since the problem has begun, 0 for its first one

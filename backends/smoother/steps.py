@@ -1,4 +1,8 @@
-"""The steps of the smoother: functions from a state to the next."""
+"""The steps of the smoother: functions from a state to the next.
+
+Errors of the rig are considered, not estimated (Schmidt, 1966). The pose follows from the landmarks as they stand, and
+each landmark from its measurements given the poses: these gains move the derivatives by the errors, too.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from backends.smoother.config import SmootherConfig
-from backends.smoother.considered import by_pose_and_rig, landmarks_by_rig
 from backends.smoother.graph import Graph, Solved, SolverError
 from backends.smoother.landmarks import VARIABLE, SmootherLandmarks, inverses
 from backends.smoother.state import Known, Sight, SmootherState, Tie
@@ -110,7 +113,8 @@ class Steps(RectifiedMeasurement):
         def search() -> Array | None:
             return landmarks_pose(self, one.points, z, one.predicted, s.number)
 
-        lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(s.spread[-1])
+        R = s.poses[-1][:3, :3]
+        lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[-1][:3, :3] @ R.T - s.turned)
         return agreement(one, one.predicted if guess is None else guess, search, s.contradicted, lost)
 
     def _corrected(
@@ -120,20 +124,20 @@ class Steps(RectifiedMeasurement):
         used, marks = found.used, s.landmarks
         seen, number = rows[used], s.number + (found.jump is not None or not s.inside)
         if found.jump is not None:
-            marks = marks.without_measurements().measured(seen, z[used], number, self.track)
+            marks = marks.without_measurements(np.ones(len(marks), bool)).measured(seen, z[used], number, self.track)
             after = _begun(s, found.T, world_covariance(s.covariance), Sight.of(marks, seen, z[used]))
             known = {serial: one for serial, one in s.known.items() if one.pose < 0}
             after = replace(after, known=known, landmarks=marks)
             return self.settled(after, graph.rebuilt(after)), float("nan"), ""
         one = replace(one, points=one.points[used], z=z[used], noise=one.noise[used])
         field, before = self.field(one.z), marks.by_rig[seen]
-        G, F = by_pose_and_rig(one, found.T, before, field)
+        G, F = _by_pose_and_rig(one, found.T, before, field)
         x = log(inverse(one.predicted) @ found.T)
         nis = float(one.distances(found.T).sum() + x @ one.information @ x)
         by_rig = np.linalg.solve(one.information + G.T @ G, one.information @ s.by_rig[6:] + G.T @ F)
         marks = replace(marks, by_rig=marks.by_rig.copy())
         own = marks.from_newest[seen]
-        marks.by_rig[seen] = landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
+        marks.by_rig[seen] = _landmarks_by_rig(one, found.T, by_rig, before, field, own, self.models.pixel_sigma)
         linear = math.sqrt(self.stereo.f / self.models.pixel_sigma)
         marks = marks.with_variables(seen, z[used], number, self.track, self.config.landmarks, found.T, linear)
         marks = marks.measured(seen, z[used], number, self.track, graph.oldest(s, number), graph.newest)
@@ -255,7 +259,7 @@ def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> Smoot
     return replace(
         s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
         spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
-        since=0, inside=True, tie=None,
+        turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T, since=0, inside=True, tie=None,
     )  # fmt: skip
 
 
@@ -289,6 +293,33 @@ def _entered(s: SmootherState) -> SmootherState:
     pair[:6, :6] = relative_covariance(np.roll(s.pair, 6, (0, 1)), s.last[1], s.last[0])
     marks = s.landmarks.left_behind(np.zeros(0, np.intp), s.last[1], s.own)
     return replace(_joined(s, Sight.none()), pair=pair, landmarks=marks, measured=True)
+
+
+def _by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field: Array) -> tuple[Array, Array]:
+    """Derivatives of whitened residuals by a pose T (3 M, 6), and by errors of the rig where it is known (3 M, m).
+
+    The errors move the landmarks in the world by `by_rig` (M, 3, m), and measurements by `field` (M, 3, m).
+    """
+    H = one.stereo.project((one.points - T[:3, 3]) @ T[:3, :3])[1] @ T[:3, :3].T
+    W = one.whiteners
+    F = W @ np.nan_to_num(field - H @ by_rig)
+    return (W @ one.derivatives(T)).reshape(-1, 6), F.reshape(3 * len(F), F.shape[2])
+
+
+def _landmarks_by_rig(
+    one: pose_only.PoseProblem, T: Array, pose: Array, by_rig: Array, field: Array, own: Array, sigma: float
+) -> Array:
+    """`by_rig` (M, 3, m) after the measurements, from a pose T (4, 4) that the errors move by `pose` (6, m).
+
+    The landmarks had covariances `own` (M, 3, 3) where the pose is known; `sigma` is the noise of a pixel.
+    """
+    local = (one.points - T[:3, 3]) @ T[:3, :3]
+    D = one.stereo.project(local)[1]
+    D[np.isnan(one.z[:, 2]), 2] = 0.0
+    H = D @ T[:3, :3].T
+    rest = np.nan_to_num(field) - (D @ points_by_pose(local)) @ pose - H @ by_rig
+    gain = own @ np.swapaxes(H, 1, 2) @ np.linalg.inv(H @ own @ np.swapaxes(H, 1, 2) + sigma**2 * np.eye(3))
+    return np.asarray(by_rig + gain @ rest)
 
 
 def _drift(P: Array, before: Array, newest: Array) -> Array:

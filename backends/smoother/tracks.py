@@ -97,8 +97,7 @@ class Tracks:
 
     def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
         """Variables that the state keeps do not leave; their serial numbers."""
-        serials = s.landmarks.serial[s.landmarks.begun == VARIABLE].tolist()
-        kept = [serial for serial in serials if self._is_there(serial)]
+        kept = list(filter(self._is_there, s.landmarks.serial[s.landmarks.begun == VARIABLE].tolist()))
         for serial in kept:
             self._stays(problem, serial, s.number)
         return kept

@@ -37,70 +37,56 @@ class HalfImage(NamedTuple):
     between: NDArray[np.float32]  # grey values half a column further to the right
 
 
-def half_image(image: NDArray, full_scale: float) -> HalfImage:
-    """Halve a grey image (H, W) of pixels 0..full_scale for `search_rows`; an odd last row or column is left out."""
-    shape = max(image.shape[0] // 2, 1), max(image.shape[1] // 2, 1)
-    return HalfImage(shape, *_halved(np.ascontiguousarray(image), shape, np.float32(0.25 * 255.0 / full_scale)))
+def half_image(image: NDArray[np.float32], scale: float) -> HalfImage:
+    """Halve an image (H, W), brought to 0..255 by `scale`; an odd last row or column is left out."""
+    import cv2
+
+    rows, columns = max(image.shape[0] // 2, 1), max(image.shape[1] // 2, 1)
+    flat = np.zeros((3, rows * columns + _LANES), np.float32)
+    pixels, weight, between = (plane[: rows * columns].reshape(rows, columns) for plane in flat)
+    if min(rows, columns) >= _SIDE:
+        image, mean = image[: 2 * rows] if scale == 1 else np.float32(scale) * image[: 2 * rows], cv2.INTER_AREA
+        cv2.resize(image[:, : 2 * columns], (columns, rows), pixels, interpolation=mean)
+        between[:, :-1] = cv2.resize(image[:, 1 : 2 * columns - 1], (columns - 1, rows), interpolation=mean)
+        between[:, -1] = 0.25 * (image[::2, 2 * columns - 1] + image[1::2, 2 * columns - 1])
+        between[:, -1] += 0.25 * (image[::2, -1] + image[1::2, -1])
+        _weigh(pixels, np.empty((2, columns), np.float32), weight)
+    return HalfImage((rows, columns), *flat)
 
 
 @vector_helper
-def _halve_row(upper, lower, column, scale, pixels, between):
-    """Means of blocks of four pixels, and of those a column further to the right; `column` takes sums of two rows."""
-    two, one = np.uint64(2), np.uint64(1)
-    for x in range(len(upper)):
-        column[x] = np.uint32(upper[x]) + np.uint32(lower[x])
-    column[len(upper)] = column[len(upper) - 1]
-    for x in range(len(upper) // 2):
-        k = two * np.uint64(x)
-        middle = column[k + one]
-        pixels[x] = scale * np.float32(np.int32(column[k] + middle))
-        between[x] = scale * np.float32(np.int32(middle + column[k + two]))
-
-
-@vector_helper
-def _row_weights(sums, squares, weight, y):
-    """Weights of a row from the column sums of its patches."""
-    area, zero = np.float32(_SIDE * _SIDE), np.float32(0.0)
-    least = np.float32(_FLAT * _FLAT) * area
-    for x in range(sums.size - 2 * _HALF):
-        s, q = zero, zero
-        for c in range(_SIDE):
-            s += sums[x + c]
-            q += squares[x + c]
-        spread = q - s * s / area
-        weight[y, x + _HALF] = np.float32(1.0) / np.sqrt(spread) if spread > least else zero
-
-
-@vector_helper
-def _column_sums(pixels, y, sums, squares):
+def _column_sums(pixels, y, sums):
     """Sums of pixels and of their squares over the patch rows about row y, less a middle grey to keep digits."""
     grey = np.float32(128.0)
-    for x in range(sums.size):
+    for x in range(sums.shape[1]):
         s, q = np.float32(0.0), np.float32(0.0)
         for r in range(_SIDE):
             v = pixels[y - _HALF + r, x] - grey
             s += v
             q += v * v
-        sums[x], squares[x] = s, q
+        sums[0, x], sums[1, x] = s, q
+
+
+@vector_helper
+def _row_weights(sums, weight, y):
+    """Weights of a row from the column sums of its patches."""
+    area, zero = np.float32(_SIDE * _SIDE), np.float32(0.0)
+    least = np.float32(_FLAT * _FLAT) * area
+    for x in range(sums.shape[1] - 2 * _HALF):
+        s, q = zero, zero
+        for c in range(_SIDE):
+            s += sums[0, x + c]
+            q += sums[1, x + c]
+        spread = q - s * s / area
+        weight[y, x + _HALF] = np.float32(1.0) / np.sqrt(spread) if spread > least else zero
 
 
 @kernel
-def _halved(image, shape, scale):
-    """The planes of a `HalfImage`."""
-    rows, columns = shape
-    flat = np.zeros((3, rows * columns + _LANES), np.float32)
-    pixels, weight, between = (
-        flat[0, : rows * columns].reshape(shape), flat[1, : rows * columns].reshape(shape),
-        flat[2, : rows * columns].reshape(shape),
-    )  # fmt: skip
-    column = np.zeros(image.shape[1] + 1, np.uint32)
-    for y in range(image.shape[0] // 2):
-        _halve_row(image[2 * y], image[2 * y + 1], column, scale, pixels[y], between[y])
-    sums, squares = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    for y in range(_HALF, rows - _HALF):
-        _column_sums(pixels, y, sums, squares)
-        _row_weights(sums, squares, weight, y)
-    return flat[0], flat[1], flat[2]
+def _weigh(pixels, sums, weight):
+    """The weights of a `HalfImage`; `sums` is work space."""
+    for y in range(_HALF, len(pixels) - _HALF):
+        _column_sums(pixels, y, sums)
+        _row_weights(sums, weight, y)
 
 
 @vector_helper

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
 from frontends.surf.correlation import align, cut_patches, patch_windows
-from frontends.surf.epipolar import HalfImage, half_image, search_rows
+from frontends.surf.epipolar import search_rows
 from frontends.surf.images import Picture, following_white, grey
 from frontends.surf.keypoints import Keypoints, adapted_threshold, spread
 from frontends.surf.surf import Surf
@@ -30,14 +30,6 @@ _REACH = 3.0  # largest sub-pixel correction along the row [px]
 _FINE_REACH = 1.5  # largest further correction by the narrow window, either way [px]
 _COARSE = 0.9  # the search along the row may correlate less than the final patches, by this factor
 _OWN_BAND = 1.5  # rows [px] that the search reaches without looking into neighbouring rows
-
-
-class _View(NamedTuple):
-    """A rectified image."""
-
-    picture: Picture
-    pixels: NDArray[np.float32]  # the same in float32
-    half: HalfImage | None  # at half resolution, if it is one of two
 
 
 class SurfFrontend:
@@ -61,11 +53,6 @@ class SurfFrontend:
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
         self._masks: tuple[NDArray | None, NDArray | None] = None, None  # of the last frame: as given, and rectified
 
-    @property
-    def threshold(self) -> float:
-        """D_threshold for the next frame."""
-        return self._threshold
-
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         """Features of one stereo frame, see `slam.interfaces.Frontend`."""
         if not isinstance(frame, StereoFrame):
@@ -75,23 +62,26 @@ class SurfFrontend:
         given = [frame.left] if frame.right is None else [frame.left, frame.right]
         given = [self._checked(frame, image, side) for side, image in enumerate(given)]
         self._white = white = following_white(given[0], self._white)
-        views = self._surf.workers.run([partial(self._view, image, k, white, len(given) > 1)
-                                        for k, image in enumerate(given)])  # fmt: skip
-        left = views[0].picture
+        tasks = [partial(self._picture, image, k, white, len(given) > 1) for k, image in enumerate(given)]
+        left, *right = self._surf.workers.run(tasks)
         keypoints, threshold = self._detect(left)
         keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
         keypoints = self._spread(self._surf.localise(left, keypoints), self.config.features)
-        keypoints, descriptors = self._surf.describe(left, keypoints)
-        images = ImagePair(views[0].pixels, None if frame.right is None else views[1].pixels)
         uv, size = keypoints.uv, keypoints.size
-        right = np.full_like(uv, np.nan)
-        if frame.right is not None:
-            (right,) = self._surf.workers.over(len(uv), lambda a, b: (self._match(views, uv[a:b], size[a:b]),))
-        angle = np.zeros(len(uv)) if self.config.upright else keypoints.angle
-        return StereoFeatures(
-            frame.stamp, uv, right, size, angle, keypoints.response, keypoints.laplacian, descriptors, threshold,
-            images, rectified=True,
+
+        def describe_and_match(first: int, last: int) -> tuple[NDArray, ...]:
+            """Angles, descriptors and right pixels of some of the features."""
+            here = uv[first:last]
+            matched = self._match(left, right[0], here, size[first:last]) if right else np.full_like(here, np.nan)
+            return *self._surf.described(left.integral, keypoints, first, last), matched
+
+        angle, descriptors, uv_right = self._surf.workers.over(len(uv), describe_and_match)
+        features = StereoFeatures(
+            frame.stamp, uv, uv_right, size, np.zeros(len(uv)) if self.config.upright else angle, keypoints.response,
+            keypoints.laplacian, descriptors, threshold,
+            ImagePair(left.pixels, right[0].pixels if right else None), rectified=True,
         )  # fmt: skip
+        return features if np.isfinite(angle).all() else features.select(np.isfinite(angle))
 
     def patches(self, images: ImagePair, uv_left: NDArray, size: NDArray) -> Patches:
         """The left image around pixels, see `slam.interfaces.AligningFrontend`."""
@@ -122,10 +112,11 @@ class SurfFrontend:
             )
         return image
 
-    def _view(self, image: NDArray, side: int, white: float, paired: bool) -> _View:
-        """What is needed of the image of the left (0) or right (1) camera."""
-        image = self._rectify(image, side)
-        return _View(Picture(image, white), image.astype(np.float32), half_image(image, white) if paired else None)
+    def _picture(self, image: NDArray, side: int, white: float, paired: bool) -> Picture:
+        """The image of the left (0) or right (1) camera, rectified, with what is needed of it."""
+        picture = Picture(self._rectify(image, side), white)
+        _ = picture.pixels, picture.half if paired else None
+        return picture
 
     def _rectify(self, image: NDArray, side: int) -> NDArray:
         """Image of the rectified rig's left (0) or right (1) camera."""
@@ -160,9 +151,9 @@ class SurfFrontend:
         """At most `limit` features, spread over the image."""
         return keypoints.select(spread(keypoints.uv, limit, _GRID, (self.rig.width, self.rig.height)))
 
-    def _match(self, views: list[_View], uv: NDArray, size: NDArray) -> NDArray[np.float64]:
+    def _match(self, left: Picture, right: Picture, uv: NDArray, size: NDArray) -> NDArray[np.float64]:
         """Right pixels (N, 2) of left features in the rectified images, NaN where unmatched."""
-        c, (left, right) = self.config, views
+        c = self.config
         rectified = self.rig.rectified.rig
         shift, product = rectified.left.u0 - rectified.right.u0, rectified.left.fu * rectified.baseline
         low, high = product / c.max_depth + shift, product / c.min_depth + shift

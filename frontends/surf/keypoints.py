@@ -30,32 +30,21 @@ class Keypoints(Table):
     """Detected features, a row each, by falling response.
 
     As a sequence its items are ``cv2.KeyPoint``: ``cv2.drawKeypoints`` and the like take it as it is.
-
-    Attributes:
-        uv: pixels (N, 2), the centre of the first pixel at (0, 0).
-        size: diameter (N,) [px]: the side of the box filter that responded most.
-        angle: orientation (N,) [rad] in 0..2π, y down; `UPRIGHT_ANGLE` where upright; NaN where not measured.
-        response: determinant of the Hessian (N,), on OpenCV's scale for 8-bit images.
-        laplacian: sign of the Laplacian (N,) int8, +1 for a dark blob on bright ground, 0 where not known.
-        octave: 0-based octave (N,) int8.
     """
 
-    uv: NDArray[np.float64]
-    size: NDArray[np.float64]
-    angle: NDArray[np.float64]
-    response: NDArray[np.float64]
-    laplacian: NDArray[np.int8]
-    octave: NDArray[np.int8]
+    uv: NDArray[np.float64]  # pixels (N, 2), the centre of the first pixel at (0, 0)
+    size: NDArray[np.float64]  # diameter (N,) [px]: the side of the box filter that responded most
+    angle: NDArray[np.float64]  # (N,) [rad] in 0..2π, y down; `UPRIGHT_ANGLE` where upright; NaN where not measured
+    response: NDArray[np.float64]  # determinant of the Hessian (N,), on OpenCV's scale for 8-bit images
+    laplacian: NDArray[np.int8]  # its sign (N,), +1 for a dark blob on bright ground, 0 where not known
+    octave: NDArray[np.int8]  # 0-based octave (N,)
 
     def __getitem__(self, row: int) -> cv2.KeyPoint:
         import cv2
 
-        (x, y), angle = self.uv[row], self.angle[row]
-        degrees = float(np.rad2deg(angle)) if np.isfinite(angle) else _NO_ANGLE
-        return cv2.KeyPoint(
-            float(x), float(y), float(self.size[row]), degrees, float(self.response[row]), int(self.octave[row]),
-            int(self.laplacian[row]),
-        )  # fmt: skip
+        degrees = np.nan_to_num(np.rad2deg(self.angle[row]), nan=_NO_ANGLE)
+        x, y, size, turn, response = map(float, (*self.uv[row], self.size[row], degrees, self.response[row]))
+        return cv2.KeyPoint(x, y, size, turn, response, int(self.octave[row]), int(self.laplacian[row]))
 
     def __iter__(self) -> Iterator[cv2.KeyPoint]:
         return (self[row] for row in range(len(self)))
@@ -108,9 +97,7 @@ def spread(uv: NDArray[np.float64], limit: int, grid: tuple[int, int], size: tup
     `uv` are pixels (N, 2), strongest first; `grid` has columns and rows of cells in an image of width and height `size`
     [px]. Each cell has an equal share of `limit`; what some leave over goes to the strongest of the others.
     """
-    if len(uv) <= limit:
-        return np.arange(len(uv))
-    return np.flatnonzero(_served(uv, limit, grid, size))
+    return np.arange(len(uv)) if len(uv) <= limit else np.flatnonzero(_served(uv, limit, grid, size))
 
 
 @kernel

@@ -33,12 +33,8 @@ class Surf:
     Images are (H, W) or (H, W, 3|4), uint8 or uint16, of any size; methods raise SequenceError for others.
 
     Args:
-        threshold: D_threshold, the least determinant of the Hessian, on OpenCV's scale for 8-bit images.
-        octaves: 1 to 4. Paper A uses two.
-        layers: layers searched for maxima in each octave, 2 or 3.
-        descriptor: 16 (paper A) or 64 (regular) dimensions.
-        upright: leave the orientation out; better where the camera keeps its roll, as in stereo.
-        threads: number of threads; results do not depend on it.
+        threshold: least determinant of the Hessian; as the other settings, see `SurfConfig`.
+        octaves, layers, descriptor, upright, threads: see `SurfConfig`.
 
     Attributes:
         config: these settings.
@@ -48,40 +44,23 @@ class Surf:
     """
 
     def __init__(
-        self,
-        threshold: float = 100.0,
-        octaves: int = 2,
-        layers: int = 2,
-        descriptor: int = 64,
-        upright: bool = True,
+        self, threshold: float = 100.0, octaves: int = 2, layers: int = 2, descriptor: int = 64, upright: bool = True,
         threads: int = 1,
-    ) -> None:
-        self.config = SurfConfig(
-            threshold=threshold, octaves=octaves, layers=layers, descriptor=descriptor, upright=upright, threads=threads
-        )
+    ) -> None:  # fmt: skip
+        settings = {"threshold": threshold, "octaves": octaves, "layers": layers, "descriptor": descriptor}
+        self.config = SurfConfig(**settings, upright=upright, threads=threads)  # type: ignore[arg-type]
         self.workers = Workers(threads)
         self._weights = gaussian_weights(4 if descriptor == 64 else 2)
 
     @classmethod
     def create(
-        cls,
-        hessianThreshold: float = 100.0,
-        nOctaves: int = 4,
-        nOctaveLayers: int = 3,
-        extended: bool = False,
+        cls, hessianThreshold: float = 100.0, nOctaves: int = 4, nOctaveLayers: int = 3, extended: bool = False,
         upright: bool = False,
-    ) -> Surf:
+    ) -> Surf:  # fmt: skip
         """As ``cv2.xfeatures2d.SURF_create``: the same arguments in the same order, with the same defaults.
 
-        Args:
-            hessianThreshold: least determinant of the Hessian.
-            nOctaves: 1 to 4.
-            nOctaveLayers: 2 or 3.
-            extended: 128 numbers in a descriptor, which this SURF does not have; only False is taken.
-            upright: leave the orientation out.
-
-        Raises:
-            ConfigurationError: a value is out of its range.
+        There is no `extended` descriptor of 128 numbers: only False is taken. Raises ConfigurationError where a value
+        is out of its range.
 
         Examples:
             >>> Surf.create(400).config.octaves
@@ -97,13 +76,8 @@ class Surf:
     ) -> Keypoints:
         """Features of an image by falling response; no angle yet.
 
-        Args:
-            image: the image.
-            mask: (H, W); features lie where it is not zero.
-            threshold: D_threshold for this image alone.
-
-        Raises:
-            SequenceError: the image is unusable, or the mask is of another shape.
+        They lie where the `mask` (H, W) is not zero. `threshold` is D_threshold for this image alone. Raises
+        SequenceError where the image is unusable, or the mask is of another shape.
         """
         picture, c = Picture.of(image), self.config
         if mask is not None and np.shape(mask) != picture.grey.shape:
@@ -151,18 +125,19 @@ class Surf:
 
         Returns the features and their unit descriptors (N, 16 or 64) float32.
         """
-        integral, upright = Picture.of(image).integral, self.config.upright
-
-        def orient_and_describe(a: int, b: int) -> tuple[NDArray, ...]:
-            """Angles, NaN where there is none, and descriptors of some of the features."""
-            uv, size = keypoints.uv[a:b], keypoints.size[a:b]
-            angle = np.full(b - a, UPRIGHT_ANGLE) if upright else orientations(integral, uv, size, DISC)
-            box = UPRIGHT_BOX if upright else TURNED_BOX
-            return angle, describe(integral, uv, size, np.nan_to_num(angle), box, self._weights)
-
-        angle, descriptors = self.workers.over(len(keypoints), orient_and_describe)
+        work = partial(self.described, Picture.of(image).integral, keypoints)
+        angle, descriptors = self.workers.over(len(keypoints), work)
         good = np.isfinite(angle)
         return replace(keypoints, angle=angle).select(good), descriptors[good]
+
+    def described(
+        self, integral: NDArray[np.int32], keypoints: Keypoints, first: int, last: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Angles, NaN where there is none, and descriptors of the features from `first` to before `last`."""
+        uv, size, upright = keypoints.uv[first:last], keypoints.size[first:last], self.config.upright
+        angle = np.full(last - first, UPRIGHT_ANGLE) if upright else orientations(integral, uv, size, DISC)
+        box = UPRIGHT_BOX if upright else TURNED_BOX
+        return angle, describe(integral, uv, size, np.nan_to_num(angle), box, self._weights)
 
     def detect_and_describe(self, image: NDArray, mask: NDArray | None = None) -> tuple[Keypoints, NDArray[np.float32]]:
         """`detect` and `describe` in one."""
@@ -195,10 +170,8 @@ class Surf:
     ) -> tuple[tuple[cv2.KeyPoint, ...], NDArray[np.float32]]:
         """The same as OpenCV's method of this name: ``cv2.KeyPoint`` objects and descriptors (N, 16 or 64).
 
-        `descriptors` is OpenCV's place for the output; keypoints of one's own are for `compute`.
-
-        Raises:
-            ConfigurationError: `useProvidedKeypoints` is true.
+        `descriptors` is OpenCV's place for the output. Raises ConfigurationError where `useProvidedKeypoints` is true:
+        keypoints of one's own are for `compute`.
         """
         if useProvidedKeypoints:
             raise ConfigurationError("useProvidedKeypoints: use compute(image, keypoints)")

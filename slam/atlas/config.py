@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from slam.models import FORBID_UNKNOWN
+from slam.bounds import require_not_negative
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,9 @@ class AtlasConfig:
     """
 
     enabled: bool = True
+
+    def __post_init__(self) -> None:
+        require_not_negative(self)
 
     #: A frame becomes a keyframe if less than this share of the last keyframe's features is in view.
     keyframe_share: ClassVar[float] = 0.8
@@ -38,5 +41,3 @@ class AtlasConfig:
     spread: ClassVar[float] = 0.1
     #: Places farther off than this many standard deviations of the position are not compared, beyond drift and view.
     gate_sigmas: ClassVar[float] = 5.0
-
-    __pydantic_config__ = FORBID_UNKNOWN

@@ -37,7 +37,7 @@ def verify(
         return None
     measured = measurement_rows(features.uv_left[seen], features.uv_right[seen])
     try:
-        T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
+        T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.models.pixel_sigma)
     except np.linalg.LinAlgError:  # points that fix no pose, such as those of a corrupt map
         return None
     slide = 1 / rig.left.fu  # seen from another viewpoint, all features of a place shift by a pixel on the surface

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN, require_not_negative
+from slam.models import require_not_negative
 
 MODES = ("detect", "procedure1", "off")
 _LONGEST = 200  # guard: window [frames]: every track keeps so many measurements
@@ -72,8 +72,6 @@ class ObjectsConfig:
     database: str = ""
     least_side: float = 0.08
     least_sine: float = 0.3
-
-    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self, {"max_points": (0, 10_000), "search_limit": (0, 1e4)}, "objects")

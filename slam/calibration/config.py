@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from slam.models import FORBID_UNKNOWN, require_positive
+from slam.models import require_positive
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,6 @@ class SelfCalibrationConfig:
     kept_share: ClassVar[float] = 0.3
     #: Factor on the variance of the evidence at first, until its scatter has been measured.
     inflation: ClassVar[float] = 4.0
-
-    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_positive(self, {"systematic": (1e-4, 1e4)}, "self_calibration")  # [px]

@@ -6,27 +6,31 @@ import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from slam.calibration.posterior import SIGMAS
 from slam.commands.display import progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import ConfigurationError
 from slam.files import noting_inputs
-from slam.run.calibrating import Calibrated
 from slam.run.calibrating import calibrate as run
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 from slam.settings import require_settable
 
 _SIGN = (
-    "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the\n"
-    "calibration's principal point and focal length are too large."
+    "Corrections are added to measured pixels, seen from the principal point: cx and f are positive where the "
+    "calibration's are too large. Usual is how far good calibrations are off in that parameter alone; several together "
+    "may cancel, so the pixels below say whether it is much."
 )
-_NARROW, _COLUMN = 42, 17  # characters of the table, and of each recording's column in it
+_NARROW, _COLUMN = 50, 17  # characters of the table, and of each recording's column in it
+_SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}  # what a parameter is multiplied by, and its unit then
+_SHARES = "f", "aspect", "down", "forward"  # shown in per cent
 
 
 def calibrate(
@@ -50,38 +54,46 @@ def calibrate(
     require_settable(settings, SystemConfig().to_json(), "surf")
     with noting_inputs() as inputs:
         opened = [open_sequence(text, format=format) for text in texts]
-    done = run(opened, out, show, settings, frames, inputs, opencv, overwrite)
-    if done.warning:
-        logging.getLogger(__name__).warning("%s", done.warning)
-    if not quiet:
-        _print(done)
-        if opencv:
-            print(f"The corrected calibration holds the corrections to {done.off:.3f} px, and no uncertainty.")
-        print(f"Use it: slam run SEQUENCE --calibration {out}" if done.worth else f"File: {out}")
+    found = run(opened, out, show, settings, frames, inputs, opencv, overwrite)
+    for warning in found["warnings"]:
+        logging.getLogger(__name__).warning("%s", warning)
+    if quiet:
+        return
+    _print(found)
+    if opencv:
+        off = found["opencv_off_px"]
+        print(f"The corrected calibration holds the corrections to {off:.3f} px, and no uncertainty.")
+    print(f"Use it: slam run SEQUENCE --calibration {out}" if found["worth_correcting"] else f"File: {out}")
 
 
-def _print(done: Calibrated) -> None:
+def _print(found: dict[str, Any]) -> None:
     """The table, and what it says."""
-    console, joint, apart = Console(), done.kept.posterior, done.apart
+    console, apart, recordings = Console(), found["apart"], found["recordings"]
     if not console.is_terminal:  # a file or a pipe is not 80 columns wide
-        console = Console(width=_NARROW + _COLUMN * (1 + len(done.found)))
-    fits = _NARROW + _COLUMN * len(done.found) <= console.width
-    shown = done.found if fits and len(done.found) > 1 else ()  # of a single one, all is that
+        console = Console(width=_NARROW + _COLUMN * (1 + len(recordings)))
+    fits = _NARROW + _COLUMN * len(recordings) <= console.width
+    shown = recordings if fits and len(recordings) > 1 else ()  # of a single one, all is that
     table = Table(title="corrections: mean ± standard deviation", show_lines=False)
     table.add_column("parameter")
     table.add_column("unit")
-    for name in ("all", *(f"({number})" for number in range(1, len(shown) + 1)), *([] if apart is None else ["apart"])):
+    numbers = (f"({number})" for number in range(1, len(shown) + 1))
+    for name in ("all", *numbers, *(["apart"] if apart else []), "usual"):
         table.add_column(name, justify="right", no_wrap=True)
-    for row, (name, (factor, unit)) in enumerate(zip(joint.names, done.units)):
-        beliefs = [joint, *(one.posterior for one in shown)]
-        cells = [f"{factor * p.mean[row]:.2f} ± {factor * p.sigma[row]:.2f}" for p in beliefs]
-        if apart is not None:
-            cells.append(f"{apart[row]:.1f} σ" if np.isfinite(apart[row]) else "–")
-        table.add_row(name, unit, *cells)
+    for k, row in enumerate(found["parameters"]):
+        lens = row["name"].removeprefix("left_").removeprefix("right_")
+        factor, unit = (100.0, "%") if lens in _SHARES else _SHOWN.get(row["unit"], (found["rig"]["focal"], "px"))
+        own = [row, *(one["parameters"][k] for one in shown)]
+        cells = [f"{factor * one['mean']:.2f} ± {factor * one['sigma']:.2f}" for one in own]
+        if apart:
+            cells.append(f"{apart[k]:.1f} σ" if np.isfinite(apart[k]) else "–")
+        table.add_row(row["name"], unit, *cells, f"± {factor * SIGMAS[lens]:.2g}")
     console.print(table)
-    print(_SIGN)
-    for number, one in enumerate(done.found, 1):
-        tells = "" if one.evidence is not None else ": no motion that shows anything, left out"
-        console.print(f"({number}) {one.name}: {one.frames} frames, {one.pairs} pairs of views{tells}", markup=False)
-    for text in filter(None, (done.judgement, done.agreed)):
+    console.print(_SIGN, highlight=False)
+    for number, one in enumerate(recordings, 1):
+        pairs, unsolved = one["pairs"], one["unsolved_pairs"]
+        tells = f"{pairs} pairs of views" if pairs else "no pair of views that shows motion: left out"
+        if unsolved:
+            tells += f"; in {unsolved} others too few features agree on one motion of the camera"
+        console.print(f"({number}) {one['sequence']}: {one['frames']} frames, {tells}", markup=False)
+    for text in filter(None, (found["judgement"], found["agreement"])):
         console.print(text, markup=False, highlight=False)

@@ -157,12 +157,13 @@ def run_command(
         raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     with noting_inputs() as inputs:
         opened, options = prepare(
-            sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
-        )
+            sequence, config, settings or (), frames, backend=backend, frontend=frontend, kind=kind, format=format,
+            prior_map=prior_map, mono=mono, calibration=calibration, record=record, save_map=save_map, live=live,
+        )  # fmt: skip
     shown_as = frame_count(opened, options.start, options.stop), title(opened, options.backend), quiet
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))
-        options = replace(options, out=folder, record=record, save_map=save_map, live=live)
+        options = replace(options, out=folder)
         written = [*options.outputs, *([drawing.output(draw)] if draw else []), *viewing.outputs(viewer, "--viewer")]
         require_outputs(written, [*inputs, *options.inputs], overwrite)
         gathered = RunRecord()  # its time of compiling begins here
@@ -176,7 +177,8 @@ def run_command(
             watches.append(stack.enter_context(drawing.FramePictures(draw, draw_map)).show)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
-            print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
+            what = "are taken until" if is_live(opened) else "come at their own rate, to the last one or until"
+            print(f"slam: loading; then frames {what} Ctrl-C ends the run", file=sys.stderr)
         end_of_frame = stack.enter_context(whole_frames(tell, folder, until))
         summary = run(opened, options, end_of_frame, watches=watches, until=until, record=gathered)
     finish(summary, written, picture, quiet)

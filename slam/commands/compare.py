@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from slam import registry
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import write_report
-from slam.compare.sweep import Run, check, is_done, run_alone, sweep
+from slam.compare.sweep import Run, check, is_done, run_jobs, sweep
 from slam.compare.tables import groups, most_tests, write_tables
 from slam.compare.trial import COMPLETED, RESULT
 from slam.compare.wording import caution
@@ -19,7 +19,7 @@ from slam.errors import ConfigurationError, UnknownNameError
 from slam.files import read_object
 from slam.naming import unknown
 from slam.runtime.threads import available_cores
-from slam.sequences.faults import said_before
+from slam.sequences.base import said_before
 from slam.settings import require_settable
 
 _MOST_WORKERS = 1024
@@ -114,7 +114,8 @@ def _seconds(left: Sequence[Trial], frames: Mapping[str, int]) -> float | None:
         if kind not in tried:
             with said_before(), TemporaryDirectory(prefix="slam_trial_") as folder:
                 stop = trial.start + min(_TRIED, frames[trial.sequence])
-                run_alone(replace(trial, seed=0, mode=CLOSED_LOOP, stop=stop), Path(folder))
+                first = replace(trial, seed=0, mode=CLOSED_LOOP, stop=stop)
+                run_jobs([(first, Path(folder), None)], 1, lambda trial: None)
                 result = read_object(Path(folder) / RESULT)
             if result["outcome"] != COMPLETED:
                 return None

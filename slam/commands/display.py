@@ -76,13 +76,16 @@ def print_conclusions(every: Sequence[Group], caution: str) -> None:
     used = set()
     for group in every:
         _say(f"\n{group.name}", "bold")
-        for text in filter(None, (*wording.sentences(group), wording.failed(group))):
+        for text in wording.sentences(group):
             _say(text)
         table = _table("", group.runs)
-        for label, (first, *others) in (wording.row(group, metric) for metric in group.metrics if metric.main):
+        for metric in group.metrics:
+            if not metric.main:
+                continue
+            first, *others = wording.row(group, metric)
             used |= {cell["verdict"] for cell in others if cell["direction"]}
             cells = [f"{cell['mean']} [{_COLOURS[cell['direction']]}]{cell['badge']}[/]" for cell in others]
-            table.add_row(escape(label), first["mean"], *cells)
+            table.add_row(escape(metric.title), first["mean"], *cells)
         _console.print(table, highlight=False)
         for text in wording.honesty(group):
             _say(text)

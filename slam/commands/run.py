@@ -20,7 +20,6 @@ from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
 from slam.run.options import RunOptions, parse_frames
-from slam.run.outcome import nothing_tracked
 from slam.run.plots import leave_picture
 from slam.run.recording import Recording
 from slam.run.repeat import changed_versions, load, versions
@@ -36,53 +35,41 @@ _LONGEST = 60  # characters of a sequence's name in a folder's
 def prepare(
     sequence: str | None,
     config: Path | None = None,
-    backend: str | None = None,
-    frontend: str | None = None,
     settings: Sequence[str] = (),
     frames: str | None = None,
-    kind: str | None = None,
-    format: str | None = None,
-    prior_map: Path | None = None,
-    mono: bool = False,
-    calibration: Path | None = None,
+    **choices: Any,
 ) -> tuple[StereoSequence, RunOptions]:
     """The sequence, opened, and what to do with it; the folder is still to be chosen.
 
-    Arguments are those of the command line, None where it says nothing; `config` is the ``config.json`` of an earlier
-    run, whose choices hold then. Raises SlamError on bad input; one line says what and where.
+    `choices` are fields of `RunOptions`, None or False where the command line says nothing; `config` is the
+    ``config.json`` of an earlier run, whose choices hold then. Raises SlamError on bad input.
     """
-    made_with: dict[str, str] = {}
-    before = RunOptions("", "", SystemConfig(), source=sequence or "", prior_map=prior_map, calibration=calibration)
+    said = {name: value for name, value in choices.items() if value}
+    before, made_with = RunOptions(_BACKEND, _FRONTEND, SystemConfig(), source=sequence or ""), dict[str, str]()
     if config is not None:
-        before, made_with = load(config, sequence, prior_map, calibration)
-        if kind is not None:
+        before, made_with = load(config, sequence, said.get("prior_map"), said.get("calibration"))
+        if "kind" in said:
             raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
-        if sequence is None:  # a given sequence has a format of its own
-            format = format or before.format
-    if not before.source and sequence is None:
+        if sequence is not None:  # which has a format of its own
+            before = replace(before, format=None)
+    options = replace(before, **said)
+    if not options.source and sequence is None:
         raise ConfigurationError("name a sequence (see `slam list`), or --config FILE of an earlier run")
-    opened = open_sequence(before.source, format=format)
-    kind = kind or before.kind or opened.kind
-    frontend, backend = frontend or before.frontend or _FRONTEND, backend or before.backend or _BACKEND
-    mono = mono or before.mono
-    if mono and before.prior_map is None:
+    opened = open_sequence(options.source, format=options.format)
+    if options.mono and options.prior_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
-    chosen = SystemConfig.for_kind(kind, frontend)
+    kind = options.kind or opened.kind
+    chosen = SystemConfig.for_kind(kind, options.frontend)
     if config is not None:  # options of another front end or back end than its are the defaults
         if changed := changed_versions(made_with, versions()):
             logging.getLogger(__name__).warning("made with other versions, results may differ: %s", "; ".join(changed))
-        chosen = replace(
-            before.config,
-            frontend=before.config.frontend if frontend == before.frontend else chosen.frontend,
-            backend=before.config.backend if backend == before.backend else chosen.backend,
-        )
-    require_settable(settings, chosen.to_json(), frontend)
-    chosen = chosen.with_settings([*(["map.monocular=true"] if mono else []), *settings])
-    start, stop = (before.start, before.stop) if frames is None else parse_frames(frames)
-    return opened, replace(
-        before, backend=backend, frontend=frontend, config=chosen, start=start, stop=stop, mono=mono, format=format,
-        kind=kind, command=command_line(),
-    )  # fmt: skip
+        parts = ("frontend", "backend")
+        other = [part for part in parts if getattr(options, part) != getattr(before, part)]
+        chosen = replace(before.config, **{part: getattr(chosen, part) for part in other})
+    require_settable(settings, chosen.to_json(), options.frontend)
+    chosen = chosen.with_settings([*(["map.monocular=true"] if options.mono else []), *settings])
+    start, stop = (options.start, options.stop) if frames is None else parse_frames(frames)
+    return opened, replace(options, config=chosen, start=start, stop=stop, kind=kind, command=command_line())
 
 
 def title(sequence: StereoSequence | Recording, backend: str) -> str:
@@ -114,7 +101,7 @@ def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, qu
     if summary["tracking"]:
         no_picture = "; no picture: no frame has a pose" if picture and not drawn else ""
         print(f"slam: {summary['tracking']}{no_picture}", file=sys.stderr)
-    if nothing_tracked(summary):
+    if summary["frames"] > 1 and not summary["status"].get("tracked"):
         raise typer.Exit(1)
 
 

@@ -143,11 +143,9 @@ def parse_variant(text: str, common: tuple[str, ...] = ()) -> Variant:
     """
     name, *parts = [part for part in text.split(":") if part] or [""]
     frontend = parts.pop(0) if parts and "=" not in parts[0] else ""
-    if not name or text.startswith(":") or "=" in name or any("=" not in part for part in parts):
-        raise ConfigurationError(f"variant {text!r} is not of the form NAME:FRONTEND:KEY=VALUE:…")
-    if not frontend and not parts:
+    named = name and not text.startswith(":") and "=" not in name
+    if not named or not (frontend or parts) or any("=" not in part for part in parts):
         raise ConfigurationError(
-            f"variant {text!r} names no front end and no setting: write NAME:FRONTEND:KEY=VALUE:…, "
-            f"such as {name}:surf:frontend.descriptor=16"
+            f"variant {text!r} is not of the form NAME:FRONTEND:KEY=VALUE:…, such as small:surf:frontend.descriptor=16"
         )
     return Variant(name, frontend or "surf", (*common, *parts))

@@ -14,10 +14,9 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from slam import registry
 from slam.compare.plan import CLOSED_LOOP, REPLAY, SIMULATED, Plan, Trial
@@ -29,7 +28,7 @@ from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder, write_json
 from slam.run.repeat import changed_versions, running_code
 from slam.sequences import open_sequence
-from slam.sequences.faults import said_before
+from slam.sequences.base import said_before
 
 RUNS, SWEEP = "runs", "sweep.json"
 
@@ -39,7 +38,7 @@ NAMES = (SWEEP, f"{RUNS}/", "runs.csv", "differences.csv", "report.html")
 #: Outcome of a trial whose process died, and died again where it was run alone.
 KILLED = "failed: its process was killed: too little memory, perhaps"
 
-_Job = tuple[Trial, Path, Path | None]  # arguments of `run_trial`
+Job = tuple[Trial, Path, Path | None]  # arguments of `run_trial`
 
 
 @dataclass(frozen=True)
@@ -63,9 +62,6 @@ def sweep(
 ) -> list[Run]:
     """Run what is not done yet, and read all runs of the plan, in its order.
 
-    Where a worker process dies, the trials in work are run once more, one by one, each in a process of its own; one
-    whose process dies again has failed.
-
     Args:
         plan: what to run.
         out: folder; one of an earlier sweep with the same versions is gone on with.
@@ -83,86 +79,83 @@ def sweep(
         out.mkdir(parents=True, exist_ok=True)
     write_json(out / SWEEP, {"trials": [asdict(trial) for trial in plan.every], "versions": running_code()})
     for mode in plan.modes:  # a replay needs the closed loop
-        left = []
+        jobs: list[Job] = []
         for trial in plan.trials_of(mode):
-            if overwrite or not is_done(trial, out):
-                left.append(trial)
-            else:
+            if not overwrite and is_done(trial, out):
                 told(trial)
-        _run_all(left, plan.backends[0], out, workers, told)
+                continue
+            recording = None
+            if mode == REPLAY:  # of the first back end's run
+                given = read_run(replace(trial, backend=plan.backends[0], mode=CLOSED_LOOP), out)
+                recording = given.folder / RECORDING if given.completed else None
+            jobs.append((trial, out / RUNS / trial.folder, recording))
+        run_jobs(jobs, workers, told)
     return [read_run(trial, out) for trial in plan.every]
 
 
-def _run_all(trials: Sequence[Trial], first: str, out: Path, workers: int, told: Callable[[Trial], None]) -> None:
-    """Run trials in processes; `first` is the back end that is replayed."""
+def run_jobs(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) -> None:
+    """`run_trial` on each of these arguments in processes of its own; `told` of each that has ended.
 
-    def job(trial: Trial) -> _Job:
-        recording = None
-        if trial.mode == REPLAY:
-            given = read_run(replace(trial, backend=first, mode=CLOSED_LOOP), out)
-            recording = given.folder / RECORDING if given.completed else None
-        return trial, out / RUNS / trial.folder, recording
-
-    jobs = deque(map(job, trials))
-    while jobs:
-        for lost in _run_in_pool(jobs, workers, told):
-            run_alone(*lost)
-            told(lost[0])
-
-
-def _run_in_pool(jobs: deque[_Job], workers: int, told: Callable[[Trial], None]) -> list[_Job]:
-    """Run jobs, taken from `jobs`, until none is left or a process dies; returns those that were in work then."""
-    running: dict[Future[None], _Job] = {}
-    lost: list[_Job] = []
-    with _processes(min(workers, len(jobs))) as pool:
-        while running or (jobs and not lost):
-            with suppress(BrokenProcessPool):  # those in work tell it
-                while jobs and len(running) < workers:
-                    running[pool.submit(run_trial, *jobs[0])] = jobs[0]
-                    jobs.popleft()
-            if not running:  # a process died that had no work
-                break
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job, error = running.pop(future), future.exception()
-                if isinstance(error, BrokenProcessPool):
-                    lost.append(job)
-                    continue
-                if error is not None:
-                    keep_result(job[0], job[1], error)
-                told(job[0])
-    return lost
-
-
-def run_alone(trial: Trial, folder: Path, recording: Path | None = None) -> None:
-    """`run_trial` in a process of its own; where that dies, the trial is kept as failed.
-
-    Raises SlamError where no process can be started.
+    Those whose process died are run once more, one at a time: of several at once one may have taken all memory. One
+    whose process dies again has failed. Raises SlamError where no process can be started.
     """
-    with _processes(1) as pool:
-        try:
-            pool.submit(int).result()
-        except BrokenProcessPool as error:
-            raise SlamError(
-                'no worker process can be started: a script must call this below `if __name__ == "__main__":`'
-            ) from error
-        failure = pool.submit(run_trial, trial, folder, recording).exception()
-    if failure is not None:
-        keep_result(trial, folder, KILLED if isinstance(failure, BrokenProcessPool) else failure)
+    for trial, folder, _ in _killed(list(_killed(jobs, workers, told)), 1, told):
+        keep_result(trial, folder, KILLED)
+        told(trial)
+
+
+def _killed(jobs: Sequence[Job], workers: int, told: Callable[[Trial], None]) -> Iterator[Job]:
+    """Run jobs, each worker in a pool of its own; yields those whose process died."""
+    left, running = deque(jobs), dict[Future[None], tuple[ProcessPoolExecutor, Job]]()
+    with _pools() as new_pool:
+        idle = [new_pool() for _ in range(min(workers, len(jobs)))]
+        while left or running:
+            while left and idle:
+                pool = idle.pop()
+                try:
+                    future = pool.submit(run_trial, *left[0])
+                except BrokenProcessPool:  # its process died when it had no work
+                    idle.append(new_pool())
+                    continue
+                running[future] = pool, left.popleft()
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                pool, job = running.pop(future)
+                error = future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    pool = new_pool()
+                    try:
+                        pool.submit(int).result()
+                    except BrokenProcessPool:
+                        raise SlamError(
+                            "no worker process can be started: a script must call this below "
+                            '`if __name__ == "__main__":`'
+                        ) from error
+                    yield job
+                else:
+                    if error is not None:
+                        keep_result(job[0], job[1], error)
+                    told(job[0])
+                idle.append(pool)
 
 
 @contextmanager
-def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes, which end with this context however it ends."""
-    before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin_worker)
+def _pools() -> Iterator[Callable[[], ProcessPoolExecutor]]:
+    """Makes pools of one process, which end with this context however it ends."""
+    before, pools = set(multiprocessing.active_children()), list[ProcessPoolExecutor]()
+
+    def new_pool() -> ProcessPoolExecutor:
+        pools.append(ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_worker))
+        return pools[-1]
+
     try:
-        yield pool
+        yield new_pool
     except BaseException:
         for process in set(multiprocessing.active_children()) - before:
             process.terminate()
         raise
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        for pool in pools:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _begin_worker() -> None:
@@ -206,8 +199,7 @@ def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
         before, trials = held.get("versions"), held.get("trials")
         if not isinstance(before, dict) or not isinstance(trials, list):
             raise SlamError(f"{out / SWEEP}: not that of a comparison")
-        changed = changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code())
-        if changed:
+        if changed := changed_versions(dict.fromkeys(running_code(), "unknown") | before, running_code()):
             raise SlamError(f"{out}: begun with {changed[0]}: runs cannot be compared; give another --out")
         if not set(map(json.dumps, trials)) <= {json.dumps(asdict(trial)) for trial in plan.every}:
             raise SlamError(f"{out}: holds a comparison of more or other runs; give another --out, or --overwrite")
@@ -219,23 +211,18 @@ def read_run(trial: Trial, out: Path) -> Run:
     """A trial's outcome from its folder; raises SlamError where it is not there, or cannot be read."""
     folder = out / RUNS / trial.folder
     result = read_object(folder / RESULT)
-    if not isinstance(result.get("outcome"), str):
-        raise SlamError(f"{folder / RESULT}: does not say how the run ended")
-    trees: list[Any] = [result.get("metrics"), result.get("milliseconds")]
     try:
-        metrics, milliseconds = ({name: float(value) for name, value in tree.items()} for tree in trees)
-    except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise SlamError(f"{folder / RESULT}: its figures are no numbers by name") from error
-    return Run(trial, result["outcome"], metrics, milliseconds, folder)
+        metrics, milliseconds = (
+            {name: float(value) for name, value in result[key].items()} for key in ("metrics", "milliseconds")
+        )
+        return Run(trial, str(result["outcome"]), metrics, milliseconds, folder)
+    except (KeyError, AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise SlamError(f"{folder / RESULT}: does not say how the run ended: {error!r}") from error
 
 
 def is_done(trial: Trial, out: Path) -> bool:
-    """Whether the trial has ended before; raises SlamError where its folder holds one with other settings."""
-    path = out / RUNS / trial.folder / RESULT
+    """Whether the trial has ended before."""
     try:
-        before = read_object(path).get("trial") if path.exists() else None
+        return bool(read_run(trial, out))
     except SlamError:
         return False
-    if before is not None and before != json.loads(json.dumps(asdict(trial))):
-        raise SlamError(f"{path.parent}: holds a run with other settings; give another --out")
-    return before is not None

@@ -15,7 +15,7 @@ from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
 from slam.run.outputs import csv_rows
-from slam.run.results import COMPARED, COMPLETED, Metric
+from slam.run.results import COMPARED, Metric
 
 DIFFERENCE_COLUMNS = (
     "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
@@ -32,7 +32,9 @@ class Group:
     variant: Variant
     mode: str
     runs: dict[str, list[Run]]  # by back end, each in the order of seeds
-    compared: dict[str, dict[str, Difference]] = field(default_factory=dict)  # by key of the figure and by back end
+    # each other back end against the first, by key of the figure and by back end; p adjusted over all figures of all
+    # groups; none with one back end
+    compared: dict[str, dict[str, Difference]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -47,28 +49,24 @@ class Group:
 
     @property
     def metrics(self) -> list[Metric]:
-        """Share of the runs completed, then the figures that at least one run has."""
+        """The figures that at least one run has."""
         keys = {key for runs in self.runs.values() for run in runs for key in run.metrics}
-        return [COMPLETED, *(metric for metric in COMPARED if metric.key in keys)]
+        return [metric for metric in COMPARED if metric.key in keys]
 
     def values(self, backend: str, key: str) -> Array:
         """A figure by trial (N,), NaN where the run failed or has none."""
-        if key == COMPLETED.key:
-            return np.array([run.completed for run in self.runs[backend]], float)
         return np.array([run.metrics.get(key, np.nan) for run in self.runs[backend]], float)
 
-    def finite(self, backend: str, key: str) -> Array:
-        """A figure of the runs that have it."""
+    def mean_and_sd(self, backend: str, key: str) -> tuple[float, float]:
+        """Mean and standard deviation of a figure over the runs that have it; NaN where unknown."""
         values = self.values(backend, key)
-        return values[np.isfinite(values)]
+        values = values[np.isfinite(values)]
+        mean = float(values.mean()) if len(values) else float("nan")
+        return mean, float(values.std(ddof=1)) if len(values) > 1 else float("nan")
 
     def failures(self, backend: str) -> int:
         """Number of runs that failed."""
         return sum(not run.completed for run in self.runs[backend])
-
-    def differences(self, metric: Metric) -> dict[str, Difference]:
-        """Each other back end against the first, by name, p adjusted over all figures of all groups."""
-        return self.compared.get(metric.key, {})  # none with one back end
 
 
 def groups(plan: Plan, runs: Sequence[Run]) -> list[Group]:
@@ -92,7 +90,7 @@ def count_tests(every: Sequence[Group]) -> int:
 
 def most_tests(plan: Plan) -> int:
     """Tests of a plan if all figures that have a better are known, and vary: its trials should be enough for them."""
-    figures = sum(bool(metric.better) for metric in (COMPLETED, *COMPARED))
+    figures = sum(bool(metric.better) for metric in COMPARED)
     return len(plan.sequences) * len(plan.variants) * len(plan.modes) * (len(plan.backends) - 1) * figures
 
 
@@ -104,18 +102,13 @@ def write_tables(every: Sequence[Group], runs: Sequence[Run], out: Path) -> None
         lines.append((t.sequence, t.variant.name, t.variant.frontend, t.mode, t.seed, t.backend, run.outcome, *values))
     write_text(out / "runs.csv", csv_rows(lines))
     lines = [DIFFERENCE_COLUMNS]
-    for group, metric in ((one, metric) for one in every for metric in one.metrics):
-        for other, d in group.differences(metric).items():
-            head = group.sequence, group.variant.name, group.mode, metric.key, next(iter(group.runs)), other
-            numbers = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p, d.p_holm))
-            lines.append((*head, d.pairs, d.missing, *numbers, d.lower, d.higher, d.verdict.value))
+    for group in every:
+        for key, compared in group.compared.items():
+            for other, d in compared.items():
+                head = group.sequence, group.variant.name, group.mode, key, next(iter(group.runs)), other
+                numbers = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p, d.p_holm))
+                lines.append((*head, d.pairs, d.missing, *numbers, d.lower, d.higher, d.verdict.value))
     write_text(out / "differences.csv", csv_rows(lines))
-
-
-def mean_and_sd(values: Array) -> tuple[float, float]:
-    """Mean and standard deviation of values (N,); NaN where unknown."""
-    mean = float(values.mean()) if len(values) else float("nan")
-    return mean, float(values.std(ddof=1)) if len(values) > 1 else float("nan")
 
 
 def _number(value: float) -> str:

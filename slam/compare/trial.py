@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -17,25 +15,22 @@ from slam.data import FrameResult, StereoFeatures, StereoFrame
 from slam.errors import SlamError, text_of
 from slam.evaluation.association_truth import SurfacePoints
 from slam.evaluation.summary import with_truth
-from slam.files import read_text, remove_file
+from slam.files import remove_file
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.geometry.stamps import frame_range, pair
-from slam.geometry.trajectory import Trajectory
 from slam.run.options import RunOptions
 from slam.run.outputs import naming_folder, write_json
 from slam.run.recording import load_recording
 from slam.run.results import figures
+from slam.run.run_data import RunData
 from slam.run.runner import run, run_recording
 from slam.run.summary import RunRecord
 from slam.sequences import Sequence, open_sequence
-from slam.sequences.faults import said_before
+from slam.sequences.base import said_before
 from slam.worlds import WorldSequence
 
 RESULT, RECORDING = "result.json", "recording.npz"
 COMPLETED = "completed"
-
-#: Settings under which a front end has one thread; what it finds does not depend on it.
-_ONE_THREAD = {"surf": ["frontend.threads=1"]}
 
 _RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associated [px]
 _SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
@@ -67,20 +62,21 @@ def keep_result(
     """Write how a trial ended, also where an exception ended it, and its figures."""
     if isinstance(outcome, BaseException):
         outcome = f"failed: {type(outcome).__name__}: {' '.join(text_of(outcome).split())}"
-    result = {"trial": asdict(trial), "outcome": outcome, "metrics": metrics or {}, "milliseconds": milliseconds or {}}
+    found = {"completed": float(outcome == COMPLETED), **(metrics or {})}
     with naming_folder(folder):
         folder.mkdir(parents=True, exist_ok=True)
+    result = {"trial": asdict(trial), "outcome": outcome, "metrics": found, "milliseconds": milliseconds or {}}
     write_json(folder / RESULT, result)
 
 
 def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
     """All settings of a trial; raises ConfigurationError: a setting is unknown or out of range."""
-    name = trial.variant.frontend
-    first = _ONE_THREAD.get(name, [])
-    if name == SIMULATED and isinstance(sequence, WorldSequence):  # the noise of these features is known
-        first = [f"models.pixel_sigma={sequence.values['sigma']}"] if sequence.values["sigma"] else []
-    settings = [*first, *trial.variant.settings]
-    return SystemConfig.for_kind(sequence.kind, name).with_settings(settings)
+    name, first = trial.variant.frontend, []
+    if name == "surf":
+        first = ["frontend.threads=1"]  # what it finds does not depend on it
+    if name == SIMULATED and isinstance(sequence, WorldSequence) and sequence.values["sigma"]:
+        first = [f"models.pixel_sigma={sequence.values['sigma']}"]  # the noise of these features is known
+    return SystemConfig.for_kind(sequence.kind, name).with_settings([*first, *trial.variant.settings])
 
 
 class _Simulated:
@@ -129,12 +125,10 @@ def _run(trial: Trial, recording: Path | None, out: Path) -> tuple[dict[str, flo
         summary = run(sequence if simulated is None else simulated, options, collected.add, simulated, record=record)
     if not summary["frames"]:
         raise SlamError("the run has no frame")
-    metrics = figures(summary) | collected.figures(record, out)
-    metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
-    times = summary.get("milliseconds", {})
-    milliseconds = {stage: value for stage, value in times.get("median", {}).items() if value}
-    milliseconds |= {"total": times["median_total"]} if times else {}
-    return metrics, milliseconds
+    times = summary.get("milliseconds", {"median": {}})
+    milliseconds = {stage: value for stage, value in times["median"].items() if value}
+    milliseconds |= {"total": times["median_total"]} if milliseconds else {}
+    return figures(summary) | collected.figures(record, out), milliseconds
 
 
 # --------------------------------------------------------------------------------- what only a comparison measures
@@ -164,30 +158,25 @@ class MapRecord:
 
     def figures(self, record: RunRecord, out: Path) -> dict[str, float]:
         """The figures of a run that is finished and has left its files in `out`."""
-        errors = self._landmark_errors(record, out)
-        found = {
-            "association_precision": np.mean(self._right) if self._right else None,
-            "map_size": np.mean(self._sizes) if self._sizes else None,
-            "landmark_error_m": np.median(errors) if len(errors) else None,
-        }
-        return {key: float(value) for key, value in found.items() if value is not None}
+        found = {"map_size": np.mean(self._sizes)}
+        if self._right:
+            found["association_precision"] = np.mean(self._right)
+        if self._truth is not None and len(errors := self._landmark_errors(self._truth, record, out)):
+            found["landmark_error_m"] = np.median(errors)
+        return {key: float(value) for key, value in found.items()}
 
-    def _landmark_errors(self, record: RunRecord, out: Path) -> Array:
+    def _landmark_errors(self, truth: SurfacePoints, record: RunRecord, out: Path) -> Array:
         """Distances of the map's landmarks from the surface points they are, after the alignment of the poses.
 
         They are turned by the poses' orientations: positions of a camera that hardly moves leave the turn open, which
         moves what is far away.
         """
-        final = Trajectory.read_tum(out / "trajectory_final.txt")
-        tracked = record.trajectory.select(np.array(record.measured, bool))
-        pairs = with_truth(final.select(pair(final.stamps, tracked.stamps, _SAME) >= 0), self._sequence)
-        rows = list(csv.DictReader(io.StringIO(read_text(out / "landmarks.csv"), newline="")))
-        if self._truth is None or pairs is None or not rows:
+        run, tracked = RunData.read(out, ""), record.trajectory.select(np.array(record.measured, bool))
+        pairs = with_truth(run.final.select(pair(run.final.stamps, tracked.stamps, _SAME) >= 0), self._sequence)
+        if pairs is None:
             return np.zeros(0)
         own, true = pairs
         R = nearest_rotation((true.poses[:, :3, :3] @ np.swapaxes(own.poses[:, :3, :3], 1, 2)).mean(axis=0))
         t = (true.positions - own.positions @ R.T).mean(axis=0)
-        positions = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
-        ids = np.array([int(row["id"]) for row in rows], np.int64)
-        errors = np.linalg.norm(positions @ R.T + t - self._truth.positions(ids), axis=1)
+        errors = np.linalg.norm(run.positions @ R.T + t - truth.positions(run.ids), axis=1)
         return np.asarray(errors[np.isfinite(errors)])

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 
 from slam.compare.plan import REPLAY
 from slam.compare.statistics import ALPHA, Difference, Verdict, fewest
-from slam.compare.tables import Group, mean_and_sd
-from slam.run.results import COMPLETED, Metric, verdict
+from slam.compare.tables import Group
+from slam.run.results import Metric, verdict
 
 #: What a verdict means that says better or worse.
 STRENGTH = {
@@ -22,63 +19,66 @@ STRENGTH = {
 _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
 
 
-def row(group: Group, metric: Metric) -> tuple[str, list[dict[str, Any]]]:
-    """A row of a group's table: its label, and a cell for each back end, the reference first.
+def row(group: Group, metric: Metric) -> list[dict[str, str]]:
+    """A row of a group's table: a cell for each back end, the reference first.
 
     A cell has texts: ``mean`` and ``sd`` of its trials; ``verdict``, ``direction`` and ``badge``, how it lies against
-    the reference and how sure that is; ``difference``, ``interval``, ``p`` and ``p_holm``. ``failed`` counts runs.
+    the reference and how sure that is; ``difference``, ``interval``, ``p`` and ``p_holm``.
     """
-    cells: list[dict[str, Any]] = []
+    cells = []
     for backend in group.runs:
-        d = group.differences(metric).get(backend)
-        if metric is COMPLETED:
-            failed = group.failures(backend)
-            cell = {"mean": f"{group.trials - failed} of {group.trials}", "sd": "", "failed": failed}
-        else:
-            mean, sd = (metric.scale * value for value in mean_and_sd(group.finite(backend, metric.key)))
-            known = np.isfinite(mean + sd)
-            cell = {"mean": shown(mean), "sd": f"± {shown(sd, mean)}" if known else "", "failed": 0}
+        mean, sd = group.mean_and_sd(backend, metric.key)
+        known = np.isfinite(mean + sd)
+        cell = {"mean": metric.show(mean), "sd": f"± {metric.show(sd, mean)}" if known else ""}
+        d = group.compared.get(metric.key, {}).get(backend)
         cells.append(cell | ({"badge": "", "direction": ""} if d is None else _against(d)))
-    return metric.label if metric is COMPLETED else metric.title, cells
+    return cells
 
 
-def _against(d: Difference) -> dict[str, Any]:
-    """How a back end lies against the reference, in words."""
+def _against(d: Difference) -> dict[str, str]:
+    """How a back end lies against the reference, in words.
+
+    The mean difference has the digits that the wider bound of its interval needs. Of figures that should be one it is
+    the ratio of the factors by which they are off.
+    """
     direction = "" if d.better is None or d.verdict not in STRENGTH else "better" if d.better else "worse"
     word = d.verdict.value
     if direction and _is_trifle(d):
         word, direction = "less than 1 %", ""
-    badge = f"{direction}: {word}" if direction else word
+    known = bool(np.isfinite(d.low))
+    if d.metric.better == "one" and np.isfinite(d.mean):
+        mean, *bounds = (f"{10**value:.3f}" for value in (d.mean, d.low, d.high))
+        mean = f"× {mean}"
+    else:
+        widest = max(abs(d.low), abs(d.high)) if known else None
+        mean, *bounds = (d.metric.show(value, widest) for value in (d.mean, d.low, d.high))
     p, p_holm = (shown_p(p) if d.varies else "–" for p in (d.p, d.p_holm))
-    difference, interval = _difference(d)
     return {
-        "verdict": word, "direction": direction, "badge": badge, "difference": difference, "interval": interval,
-        "p": p, "p_holm": p_holm,
+        "verdict": word, "direction": direction, "badge": f"{direction}: {word}" if direction else word,
+        "difference": mean, "interval": " … ".join(bounds) if known else "–", "p": p, "p_holm": p_holm,
     }  # fmt: skip
 
 
 def sentences(group: Group) -> list[str]:
-    """`in_short` of each back end but the reference."""
-    first, *others = group.runs
-    return [in_short([group.differences(metric)[other] for metric in group.metrics], first, other) for other in others]
+    """Which back end is better than the first in what, a sentence for each other one.
 
-
-def in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
-    """Which of two back ends is better in what, in one sentence: in the main figures that can be told apart."""
-    sure = (Verdict.CERTAIN, Verdict.LIKELY)
-    told = [d for d in differences if d.metric.main and d.verdict in sure and not _is_trifle(d)]
-    parts = []
-    for better, first, second in ((True, other, reference), (False, reference, other)):
-        if names := [f"{_name(d.metric)} ({d.verdict.value})" for d in told if d.better is better]:
-            parts.append(f"{first} is better than {second} in {', '.join(names)}")
-    return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
-
-
-def failed(group: Group) -> str:
-    """Which runs failed; empty where none did."""
-    counts = [f"{n} of {group.trials} of {backend}" for backend in group.runs if (n := group.failures(backend))]
-    text = f"Runs failed, {', '.join(counts)}: a trial in which either failed is no pair, and is in no other figure."
-    return text if counts else ""
+    Said is what can be told apart, of the main figures. Then come the runs that failed, if any.
+    """
+    reference, *others = group.runs
+    sure, found = (Verdict.CERTAIN, Verdict.LIKELY), []
+    for other in others:
+        every = [group.compared[metric.key][other] for metric in group.metrics if metric.main]
+        told = [d for d in every if d.verdict in sure and not _is_trifle(d)]
+        parts = []
+        for better, first, second in ((True, other, reference), (False, reference, other)):
+            names = [f"{d.metric.label.partition(' (')[0]} ({d.verdict.value})" for d in told if d.better is better]
+            if names:
+                parts.append(f"{first} is better than {second} in {', '.join(names)}")
+        found.append(f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}.")
+    if counts := [f"{n} of {group.trials} of {backend}" for backend in group.runs if (n := group.failures(backend))]:
+        failed = "a trial in which either failed is no pair, and is in no other figure."
+        found.append(f"Runs failed, {', '.join(counts)}: {failed}")
+    return found
 
 
 def honesty(group: Group) -> list[str]:
@@ -86,7 +86,7 @@ def honesty(group: Group) -> list[str]:
     said = {}
     for backend in group.runs:
         keys = dict.fromkeys(key for run in group.runs[backend] for key in run.metrics)
-        means = {key: mean_and_sd(group.finite(backend, key))[0] for key in keys}
+        means = {key: group.mean_and_sd(backend, key)[0] for key in keys}
         said[backend] = verdict(means, group.trials - group.failures(backend))
     return [f"{backend}: {text}." for backend, text in said.items() if text]
 
@@ -96,7 +96,7 @@ def _is_trifle(d: Difference) -> bool:
 
     Of shares such as that of tracked frames what they lack counts: 99.2 % is not equal to 100 %.
     """
-    if shown(d.metric.scale * d.reference) == shown(d.metric.scale * d.other):
+    if d.metric.show(d.reference) == d.metric.show(d.other):
         return True
     limit = _TRIFLE * max(abs(d.reference), abs(d.other))
     if d.metric.better == "higher" and d.metric.unit == "%":
@@ -127,38 +127,8 @@ def measurements(mode: str, reference: str) -> str:
     return "Closed loop: each back end's predictions choose its matches"
 
 
-# ------------------------------------------------------------------------------------------- numbers for people
-
-
-def shown(value: float, like: float | None = None) -> str:
-    """A number with the digits that show three of `like`, or of itself, six behind the point at most; else a dash."""
-    if not np.isfinite(value):
-        return "–"
-    like = abs(value if like is None else like)
-    digits = min(6, max(0, 2 - int(np.floor(np.log10(like))))) if like else 0
-    return f"{value:.{digits}f}".replace("-", "−")
-
-
-def _difference(d: Difference) -> tuple[str, str]:
-    """The mean difference and its interval, with the digits that the wider bound needs; a dash for none.
-
-    Of figures that should be one it is the ratio of the factors by which they are off.
-    """
-    bounds = (d.low, d.high) if np.isfinite(d.low) else ()
-    if d.metric.better == "one" and np.isfinite(d.mean):
-        return f"× {10**d.mean:.3f}", " … ".join(f"{10**bound:.3f}" for bound in bounds) or "–"
-    widest = max((d.metric.scale * abs(bound) for bound in bounds), default=None)
-    mean = shown(d.metric.scale * d.mean, widest) if bounds else d.metric.show(d.mean)
-    return mean, " … ".join(shown(d.metric.scale * bound, widest) for bound in bounds) or "–"
-
-
 def shown_p(p: float) -> str:
     """A p-value for people; a dash where there is none."""
     if not np.isfinite(p):
         return "–"
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
-
-
-def _name(metric: Metric) -> str:
-    """A label that can stand in a list."""
-    return metric.label.replace(", ", " ").partition(" (")[0]

@@ -22,20 +22,6 @@ from slam.third_party import named_failures
 _ROWS = 1.5
 
 
-def as_frame(left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: float | None, index: int) -> StereoFrame:
-    """A frame, or two images (H, W) or (H, W, 3|4) with their time [s], as a frame of this index.
-
-    Raises MeasurementError for images without a stamp, or a frame with one.
-    """
-    if isinstance(left, StereoFrame):
-        if right is not None or stamp is not None:
-            raise MeasurementError("process: a frame has its right image and its stamp already")
-        return left
-    if stamp is None:
-        raise MeasurementError("process: two images need their time [s]: process(left, right, stamp)")
-    return StereoFrame(index, stamp, left, right)
-
-
 @dataclass(frozen=True, eq=False)
 class Extracted:
     """A frame and what the front end found in it."""

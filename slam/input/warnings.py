@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +34,7 @@ _INTERVALS = 5  # guard: times between frames whose median is tested: single fra
 _POOR = 5  # guard: successive frames that must show too little before a warning
 _LAST_LOOK = 1024  # guard: last frame at which the stereo pair is checked
 _ALIKE = 0.2  # guard: distance of descriptors of which there is hardly a pair in an image without repeated patterns
+_SHIFTS = 2  # guard: frames by which right images are tried to be late or early
 _FITS = 0.95  # guard: share of the matches that fit the rig, below which other frames' images are looked at again
 
 Checksum = tuple[int, int]  # of the bytes of the left and the right image
@@ -58,8 +60,8 @@ class InputWarnings:
         self._two_images = self._copy_warned = False  # a pair of different images was seen, a copy was named
         self._last: Checksum | None = None  # of the frame before
         self._last_copy = ""  # why its right image was a copy
-        self._before: _Images | None = None
-        self._fits = np.zeros(3, int)  # matches with the right image of this frame, the next one and the one before
+        self._before: deque[_Images] = deque(maxlen=_SHIFTS)  # the frames before, the last one first
+        self._fits = np.zeros(1 + 2 * _SHIFTS, int)  # matches if right images are a frame late, early, two late, …
         for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig.left, rig.right))):
             self._warn(unlikely)
             self._pair_warned = self._partners_explained = True  # and what follows from it is not
@@ -86,7 +88,7 @@ class InputWarnings:
             self._check_pair(images, own)
         if not self._partners_explained and frame.right is not None:
             self._check_partners(features)
-        self._before = images
+        self._before.appendleft(images)
         self._count += 1
 
     def _check_intervals(self, interval: float) -> None:
@@ -148,34 +150,37 @@ class InputWarnings:
                 f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
             )
             self._warn(_swapped(own) if own.swapped else same)
-        elif not self._pair_is_right and self._before is not None and own.shown < 1:
-            self._pair_warned = True  # hardly a feature fits then, and of another moment's some may by chance
-            self._warn(_rows_differ(own, self._rig))
-        elif self._before is not None and (not self._moment_is_right or own.as_given < _FITS * own.matches):
+        elif not self._pair_is_right and self._before and own.shown < 1:
+            if len(self._before) == _SHIFTS:  # hardly a feature fits then, and of another moment's some may by chance
+                self._pair_warned = True
+                self._warn(_rows_differ(own, self._rig))
+        elif self._before and (not self._moment_is_right or own.as_given < _FITS * own.matches):
             self._check_moment(images, own)
         self._partners_explained |= self._pair_warned  # the reason is known then
 
     def _check_moment(self, images: _Images, own: PairGeometry) -> None:
         """Warn if left images fit the right ones of other frames, or else if rows do not match."""
-        assert self._before is not None
-        neighbours = self._geometry(self._before, images), self._geometry(images, self._before)
-        if neighbours[0] is not None and neighbours[1] is not None:
-            self._fits += [own.as_given, neighbours[0].as_given, neighbours[1].as_given]
+        others = [self._geometry(*pair) for other in self._before for pair in ((other, images), (images, other))]
+        fits = [other.as_given for other in others if other is not None]
+        if len(fits) == len(others):
+            self._fits[: 1 + len(fits)] += [own.as_given, *fits]
         fit, *shifted = self._fits.tolist()
         if most(max(shifted), fit):
             self._pair_warned = True
-            which, wrong = ("before", "late") if shifted[0] >= shifted[1] else ("after", "early")
+            at = int(np.argmax(shifted))
+            which, wrong = ("after", "early") if at % 2 else ("before", "late")
+            frames, number = ("a frame", "one") if at < 2 else ("two frames", "two")
             since = "left and right image are not of one moment" + ", though they were" * self._moment_is_right
             self._warn(
-                f"{since}: {max(shifted)} features fit the rig with the left image of the frame {which}, {fit} with "
-                f"that of the same frame, {self._count}; the right images are a frame too {wrong}: pair them by their "
-                "times, or shift their numbers by one"
+                f"{since}: {max(shifted)} features fit the rig with the left image {frames} {which}, {fit} with that "
+                f"of the same frame, {self._count}; the right images are {frames} too {wrong}: pair them by their "
+                f"times, or shift their numbers by {number}"
             )
             return
         if all(most(fit, other) for other in shifted):
             self._moment_is_right = True
             self._fits[:] = 0  # what comes later is counted anew
-        if own.conclusive and not self._pair_is_right:
+        if own.conclusive and not self._pair_is_right and (not own.rows_differ or len(self._before) == _SHIFTS):
             self._pair_is_right = True
             if own.rows_differ:
                 self._pair_warned = True

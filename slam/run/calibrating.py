@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from slam.calibration import RigModel, RigPosterior, SavedCalibration
+from slam.calibration import RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
 from slam.calibration.posterior import RigEvidence, factory_prior
 from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
-from slam.files import write_text
 from slam.geometry.rig_numbers import rig_difference, rig_numbers
 from slam.geometry.se3 import Array
 from slam.outputs import Output, require_outputs
+from slam.run.outputs import write_json
 from slam.runtime.threads import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live
@@ -28,53 +27,15 @@ from slam.sequences.rigs import write_opencv
 from slam.system import StereoSlam
 
 _BACKEND, _FRONTEND = "ekf", "surf"  # poses are a first guess alone
-_SETTINGS = ("objects.mode=off",)
-
-#: What a parameter of each unit is multiplied by in the table, and its unit there; of pure numbers by name.
-_SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}
-_SHARES = "f", "aspect", "down", "forward"  # shown in per cent
 
 _NO_PAIRS = (
     "no two views far enough apart were compared: rows alone say next to nothing of disparities; "
     "take longer recordings in which the camera moves on"
 )
-_UNSOLVED = (
-    "{unsolved} of {every} pairs of views agree on no motion: is the calibration of these cameras, and of images of "
-    "this size?"
-)
-
 _AWAY = 50.0  # baselines at which the error of the depth is said
 
 #: Shows the progress of a recording of so many frames: gives what is called after each.
 Show = Callable[[StereoSequence, int], AbstractContextManager[Callable[[FrameResult], None]]]
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What one recording says."""
-
-    name: str
-    frames: int  # how many there were
-    pairs: int  # of views that show motion
-    unsolved: int  # pairs of views for which no motion was found
-    matched: float  # number of landmarks found again in a frame, the median
-    posterior: RigPosterior  # from this recording alone
-    evidence: RigEvidence | None  # without any prior; None where no motion was seen
-
-
-@dataclass(frozen=True, eq=False)
-class Calibrated:
-    """What all recordings say."""
-
-    found: Sequence[Found]  # by each
-    kept: SavedCalibration  # by all together
-    apart: Array | None  # how far two differ at most, see `agreement`; None where one alone shows motion
-    agreed: str  # the same in a line; empty for None
-    judgement: str  # how good the calibration was, in a line; empty where that cannot be said
-    worth: bool  # whether correcting is expected to help
-    off: float  # RMS distance [px] of the corrected calibration's pixels from the corrected pixels
-    warning: str  # why little can be expected of it; empty for none
-    units: Sequence[tuple[float, str]]  # of each parameter, a factor for people, and the unit that it then has
 
 
 @one_blas_thread
@@ -87,50 +48,78 @@ def calibrate(
     inputs: Sequence[Path] = (),
     opencv: Path | None = None,
     overwrite: bool = False,
-) -> Calibrated:
-    """Run a range of frames of recordings of one rig, and write what they say of it to `out`, with its covariance.
+) -> dict[str, Any]:
+    """Run a range of frames of recordings of one rig; returns what they say of it, which is also written to `out`.
 
-    `opencv` is a file for the corrected calibration in that form; `inputs` are never replaced. Raises
-    SlamError on bad input, before anything is run.
+    Besides the keys of `slam.calibration.SavedCalibration` it has ``recordings``, what each says alone; ``apart``, by
+    how many standard deviations two differ at most in each parameter (null for a single recording); ``agreement`` and
+    ``judgement``, the same and how good the calibration was, in words; ``worth_correcting``, whether correcting is
+    expected to help; and ``warnings``. `opencv` is a file for the corrected calibration in that form, which is off by
+    ``opencv_off_px`` (RMS). `inputs` are never replaced. Raises SlamError on bad input, before anything is run.
     """
     rig = sequences[0].rig
     for sequence in sequences:
         if is_live(sequence):
             raise ConfigurationError(f"{sequence.name}: a recording is needed, not a camera")
-        difference = rig_difference(rig_numbers(rig), rig_numbers(sequence.rig))
-        if difference:
+        if difference := rig_difference(rig_numbers(rig), rig_numbers(sequence.rig)):
             raise CalibrationError(f"{sequence.name}: not the rig of {sequences[0].name}: {difference}")
     files = ((out, "--out"), (opencv, "--opencv"))
     require_outputs([Output(file, option) for file, option in files if file is not None], inputs, overwrite)
-    configs = [_config(sequence, settings) for sequence in sequences]
-    found = [_run(sequence, config, frames, show) for sequence, config in zip(sequences, configs)]
-    model = RigModel(rig)
-    evidence = [one.evidence for one in found if one.evidence is not None]
-    kept = joint_calibration(model, factory_prior(model), evidence)
-    apart = agreement(model, evidence)
-    agreed = "" if apart is None else agreement_in_words(apart)
+    configs = [
+        SystemConfig.for_kind(sequence.kind, _FRONTEND).with_settings(["objects.mode=off", *settings])
+        for sequence in sequences
+    ]
+    if not all(config.self_calibration.enabled for config in configs):
+        raise ConfigurationError("slam calibrate needs self_calibration.enabled=true")
+    recordings, evidence = zip(*(_run(*each, frames, show) for each in zip(sequences, configs)))
+    model, known = RigModel(rig), [one for one in evidence if one is not None]
+    kept = joint_calibration(model, factory_prior(model), known)
+    apart = agreement(model, known)
     corrected = corrected_rig(model, kept.posterior.mean)
-    pairs, unsolved = sum(one.pairs for one in found), sum(one.unsolved for one in found)
-    warning = "" if pairs else _NO_PAIRS
+    pairs, unsolved = (sum(one[key] for one in recordings) for key in ("pairs", "unsolved_pairs"))
+    warning, judgement, worth = "" if pairs else _NO_PAIRS, "", False
     if unsolved > pairs:
-        warning = _UNSOLVED.format(unsolved=unsolved, every=pairs + unsolved)
-    matched = float(np.median([one.matched for one in found]))
-    noise = configs[0].models.pixel_sigma
-    judgement, worth = ("", False) if unsolved > pairs else _judged(model, kept.posterior, noise, matched, apart)
-    tree = kept.to_json() | {
-        "recordings": [
-            {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
-        ],
-        "agreement": agreed or None,
+        warning = (
+            f"{unsolved} of {pairs + unsolved} pairs of views agree on no motion: is the calibration of these cameras, "
+            "and of images of this size?"
+        )
+    else:
+        matched = float(np.median([one["matched"] for one in recordings]))
+        judgement, worth = _judged(model, kept.posterior, configs[0].models.pixel_sigma, matched, apart)
+    found = kept.to_json() | {
+        "recordings": recordings,
+        "apart": None if apart is None else apart.tolist(),
+        "agreement": None if apart is None else agreement_in_words(apart),
         "judgement": judgement,
+        "worth_correcting": worth,
+        "opencv_off_px": float(np.hypot(corrected.left_off, corrected.right_off)),
         "warnings": [warning] if warning else [],
     }
-    write_text(out, json.dumps(tree, indent=1) + "\n")
+    write_json(out, found)
     if opencv is not None:
         write_opencv(opencv, corrected.rig)
-    off = float(np.hypot(corrected.left_off, corrected.right_off))
-    units = [_unit(name, unit, model.focal) for name, unit in zip(model.names, model.units)]
-    return Calibrated(found, kept, apart, agreed, judgement, worth, off, warning, units)
+    return found
+
+
+def _run(
+    sequence: StereoSequence, config: SystemConfig, frames: tuple[int, int | None], show: Show
+) -> tuple[dict[str, Any], RigEvidence | None]:
+    """What one recording says alone, and its evidence without any prior; None where no motion was seen."""
+    system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=config)
+    matched = []
+    with show(sequence, len(range(len(sequence))[slice(*frames)])) as on_frame:
+        for _, result in system.run(sequence.frames(*frames)):
+            on_frame(result)
+            matched.append(len(result.matched))
+    own = system.calibration
+    found = {
+        "sequence": sequence.name,
+        "frames": len(matched),
+        "matched": float(np.median(matched)) if matched else 0.0,  # landmarks found again in a frame
+        "pairs": own.pairs,
+        "unsolved_pairs": own.unsolved,
+    }
+    return found | own.kept().posterior.to_json(), own.evidence()
 
 
 def _judged(
@@ -171,31 +160,3 @@ def _judged(
         f"{100 * off[0] * _AWAY / model.focal:.1f} % wrong. {word}"
     )
     return text, worth
-
-
-def _unit(name: str, unit: str, focal: float) -> tuple[float, str]:
-    """What a parameter is multiplied by to be shown, and the unit that it then has."""
-    if unit == "focal lengths":
-        return focal, "px"
-    return (100.0, "%") if name.removeprefix("left_").removeprefix("right_") in _SHARES else _SHOWN[unit]
-
-
-def _config(sequence: StereoSequence, settings: Sequence[str]) -> SystemConfig:
-    """The settings for a recording."""
-    config = SystemConfig.for_kind(sequence.kind, _FRONTEND).with_settings([*_SETTINGS, *settings])
-    if not config.self_calibration.enabled:
-        raise ConfigurationError("slam calibrate needs self_calibration.enabled=true")
-    return config
-
-
-def _run(sequence: StereoSequence, config: SystemConfig, frames: tuple[int, int | None], show: Show) -> Found:
-    """What one recording says."""
-    system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=config)
-    matched = []
-    with show(sequence, len(range(len(sequence))[slice(*frames)])) as on_frame:
-        for _, result in system.run(sequence.frames(*frames)):
-            on_frame(result)
-            matched.append(len(result.matched))
-    own = system.calibration
-    middle = float(np.median(matched)) if matched else 0.0
-    return Found(sequence.name, len(matched), own.pairs, own.unsolved, middle, own.kept().posterior, own.evidence())

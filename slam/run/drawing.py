@@ -25,6 +25,9 @@ from slam.run.schema import body_colour
 _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR, as all colours here
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
 _OLD, _NOW, _PATH, _INK = (200, 200, 200), (200, 130, 30), (0, 110, 240), (90, 90, 90)  # of the map
+#: What is drawn into images, and into the map beside them: colour, name and shape.
+_IN_IMAGES = ((_BEACON, "landmark", "ring"), (_NEW, "new landmark", "ring"), (_MOVING, "feature that moves", "ring"))
+_IN_MAP = ((_PATH, "path", "line"), (_NOW, "landmark now", "dot"), (_OLD, "earlier one", "dot"))
 _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
 _FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size
 _LEAST_RADIUS = 4  # of a feature's circle [px]
@@ -76,24 +79,28 @@ def with_legend(picture: np.ndarray, bodies: Sequence[MovingObject] = ()) -> np.
 
     Bodies are named by their numbers, in their colours; where there are none, what one would look like is said.
     """
+    own = [(_bgr(body.id), f"body {body.id}", "box") for body in bodies] or [(_bgr(1), "body", "box")]
+    return _above(picture, [*_IN_IMAGES, *own, (own[-1][0], "body, not seen", "dashes")])
+
+
+def _above(picture: np.ndarray, marks: Sequence[tuple[tuple[int, int, int], str, str]]) -> np.ndarray:
+    """A picture above a bar of marks, each with its colour, its name and its shape, as many as there is room for."""
     import cv2
 
     bar = np.full((_LEGEND, picture.shape[1], 3), 255, np.uint8)
-    marks = [(_BEACON, "landmark", 0), (_NEW, "new landmark", 0), (_MOVING, "feature that moves", 0)]
-    marks += [(_bgr(body.id), f"body {body.id}", 2) for body in bodies] or [(_bgr(1), "body", 2)]
-    at, middle = 12, _LEGEND // 2
-    for colour, text, width in [*marks, (marks[-1][0], "body, not seen", 1)]:
+    at, y = 12, _LEGEND // 2
+    for colour, text, shape in marks:
         (room, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
-        if at + 20 + room > bar.shape[1]:
+        if at + 12 + room > bar.shape[1]:
             break
-        if width:  # a box, of thin dashes where it is not seen
-            for left, right in ((-6, 6),) if width > 1 else ((-6, -1), (2, 7)):
-                for edge in (-5, 5):
-                    cv2.line(bar, (at + left, middle + edge), (at + right, middle + edge), colour, width)
+        if shape in ("dot", "ring"):
+            cv2.circle(bar, (at, y), 5 if shape == "ring" else 3, colour, 2 if shape == "ring" else -1, cv2.LINE_AA)
         else:
-            cv2.circle(bar, (at, middle), 5, colour, 2, cv2.LINE_AA)
-        cv2.putText(bar, text, (at + 12, middle + height // 2), _FONT, 0.8 * _TEXT, _MOVING, 1, cv2.LINE_AA)
-        at += room + 36
+            lines = {"line": [(-6, 6, 0)], "box": [(-6, 6, -5), (-6, 6, 5)]}
+            for left, right, down in lines.get(shape, [(x, x + 5, z) for x in (-6, 2) for z in (-5, 5)]):
+                cv2.line(bar, (at + left, y + down), (at + right, y + down), colour, 1 if shape == "dashes" else 2)
+        cv2.putText(bar, text, (at + 12, y + height // 2), _FONT, 0.8 * _TEXT, _MOVING, 1, cv2.LINE_AA)
+        at += room + 30
     return np.concatenate([picture, bar])
 
 
@@ -142,12 +149,11 @@ def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
 class GrowingMap:
     """Draws the map from above, frame by frame: old landmarks, those in the map, the path, and moving bodies.
 
-    The camera's first direction is upwards. So many `metres` are shown; None for as many as suit the distance of the
-    first landmarks.
+    The camera's first direction is upwards. As many metres are shown as suit the distance of the first landmarks.
     """
 
-    def __init__(self, metres: float | None = None) -> None:
-        self._metres = metres
+    def __init__(self) -> None:
+        self._metres: float | None = None
         self._seen: dict[int, Array] = {}
         self._path: list[Array] = []
 
@@ -223,35 +229,36 @@ class FramePictures(ExitStack):
 
     def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
         """Append a step's picture; a `slam.run.runner.Watch`."""
-        picture = draw_objects(frame.left, result, system.rig)
+        image = draw_objects(frame.left, result, system.rig)
+        picture = with_legend(image, result.objects)
         if self._map is not None:
             estimate = system.estimate()
             self._map.add(estimate)
-            picture = np.hstack([picture, self._map.draw(estimate, result, len(picture))])
-        picture = with_legend(picture, result.objects)
+            picture = np.hstack([picture, _above(self._map.draw(estimate, result, len(image)), _IN_MAP)])
         if not self._film:
             file = self.path / f"{frame.index:0{_DIGITS}d}.png"
             with naming_folder(file):
                 write_png(file, picture)
         elif self._first is None:
-            self._first = (frame.stamp, picture)
+            self._first = frame.stamp, picture
         else:
             if self._video is None:
-                self._open(1.0 / (frame.stamp - self._first[0]), self._first[1])
+                self._open(1.0 / (frame.stamp - self._first[0]))
             self._video.write(picture)
 
-    def _open(self, rate: float, picture: np.ndarray) -> None:
+    def _open(self, rate: float) -> None:
         """Begin the video with the first picture."""
         import cv2
 
-        size = (picture.shape[1], picture.shape[0])
-        self._video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        assert self._first is not None
+        height, width = self._first[1].shape[:2]
+        self._video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
         if not self._video.isOpened():
             raise SlamError(f"{self.path}: cannot be written")
-        self._video.write(picture)
+        self._video.write(self._first[1])
 
     def _end(self) -> None:
         if self._video is None and self._first is not None:
-            self._open(1.0, self._first[1])
+            self._open(1.0)
         if self._video is not None:
             self._video.release()

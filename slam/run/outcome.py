@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -63,17 +62,13 @@ def outcome(
         were = "a frame was" if dropped == 1 else f"{dropped} frames were"
         cheaper = "make a frame cheaper (smaller images, --set objects.mode=off), or move more slowly"
         causes.append(f"{were} dropped, and the frames about them are far apart: {cheaper}")
-    return f"{_counted(record.statuses, missed)}; likely cause: {'; and '.join(causes)}"
-
-
-def _counted(statuses: Sequence[str], missed: int) -> str:
-    """How many frames were tracked, counted as in a run's table: the first one is one of them where it began a map."""
-    every, first = len(statuses), statuses[0] == _STARTED
-    if missed == every - 1:
-        return "no frame after the first was tracked" if first else "no frame was tracked"
-    few, of_all = 2 * missed > every - 1, missed + (not first)
+    every, first = len(record.statuses), record.statuses[0] == _STARTED
+    few, of_all = 2 * missed > frames, missed + (not first)  # counted as in a run's table
     count, word = (every - of_all, "tracked") if few else (of_all, "not tracked")
-    return f"{'only ' if few else ''}{count} of {every} frames {'was' if count == 1 else 'were'} {word}"
+    said = f"{'only ' if few else ''}{count} of {every} frames {'was' if count == 1 else 'were'} {word}"
+    if missed == frames:
+        said = f"no frame {'after the first ' if first else ''}was tracked"
+    return f"{said}; likely cause: {'; and '.join(causes)}"
 
 
 def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:
@@ -174,11 +169,6 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
         f"from frame to frame the velocity changes {ratio:.0f} times as much as expected: check the times of the "
         f"images (fps=…, or seconds in times=…){'' if driving else ', and whether this is a vehicle (--kind driving)'}"
     )
-
-
-def nothing_tracked(summary: dict[str, Any]) -> bool:
-    """Whether a run of several frames tracked none, by its summary."""
-    return summary["frames"] > 1 and not summary["status"].get(_TRACKED)
 
 
 def median_depth(features: StereoFeatures, rig: StereoRig) -> float:

@@ -7,7 +7,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -15,25 +15,20 @@ from typing import Any
 import numpy as np
 
 from slam.atlas.atlas import Atlas
-from slam.data import Estimate, FrameResult, IdArray
+from slam.data import Estimate, FrameResult
 from slam.errors import SlamError
 from slam.files import RowFile, lock_folder, reason, remove_file, write_text
 from slam.geometry.se3 import Array, angles, transform
 from slam.geometry.trajectory import Trajectory, tum_line
 from slam.object_data import MovingObject
-from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
-from slam.tracks.table import LandmarkTable
+from slam.run.schema import FILES, FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
 
 FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
 
 _ROWS = ("trajectory.txt", "frames.csv", "objects.csv")  # grow frame by frame
-_WHOLE = (
-    "config.json", "schema.json", "trajectory_final.txt", "truth.txt", "landmarks.csv", OLD_LANDMARKS,
-    "summary.json", "summary.png",
-)  # fmt: skip
 
 #: All files that a run leaves in its folder.
-NAMES = (*_ROWS, *_WHOLE)
+NAMES = tuple(FILES)
 
 _NUMBER = r"\s+(?:-?\d[-+.\deE]*|null)"
 _NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\s+\]")  # as json indents them; no text holds a line break
@@ -57,7 +52,7 @@ class RunFiles(ExitStack):
             lock = lock_folder(folder)
             if lock is not None:
                 opened.callback(os.close, lock)
-            for name in _WHOLE:
+            for name in set(NAMES).difference(_ROWS):
                 remove_file(folder / name)
             self._trajectory, self._frames, self._objects = (
                 opened.enter_context(closing(RowFile(folder / name))) for name in _ROWS
@@ -102,26 +97,26 @@ class RunFiles(ExitStack):
             self._objects.write(things)
             self._trajectory.write(tum_line(e.stamp, e.T_world_left) if result.located else "")
 
-    def write_landmarks(self, estimate: Estimate, landmarks: LandmarkTable | None, numbers: list[int]) -> None:
-        """Write landmarks.csv; `numbers` are the frames' numbers by step."""
+    def write_landmarks(
+        self, estimate: Estimate, seen: Mapping[int, int], last_seen: Mapping[int, int], atlas: Atlas | None
+    ) -> None:
+        """Write landmarks.csv, and landmarks_old.csv where there is an `atlas`.
+
+        `seen` and `last_seen` say by id in how many frames each was measured, and in which the last time.
+        """
         rows: list[Sequence[Any]] = [LANDMARK_COLUMNS]
         upper = np.triu_indices(3)
-        for i, position, covariance in zip(estimate.ids, estimate.positions, estimate.covariances):
-            if landmarks is not None:
-                at = int(landmarks.rows(np.array([i]))[0])
-                step = int(landmarks.last_seen[at])
-                last = numbers[step] if step >= 0 else ""  # empty: known from the start, and not seen yet
-                values = (f"{x:.9g}" for x in (*position, *covariance[upper]))
-                rows.append([int(i), *values, int(landmarks.seen[at]), last])
+        for i, position, covariance in zip(estimate.ids.tolist(), estimate.positions, estimate.covariances):
+            values = (f"{x:.9g}" for x in (*position, *covariance[upper]))
+            rows.append([i, *values, seen.get(i, 0), last_seen.get(i, "")])
         write_text(self.folder / "landmarks.csv", csv_rows(rows))
-
-    def write_old_landmarks(self, atlas: Atlas, present: IdArray) -> None:
-        """Write landmarks_old.csv: of this run's keyframes, without those `present`."""
-        found: dict[int, Array] = {}
+        if atlas is None:
+            return
+        found: dict[int, Array] = {}  # as the last keyframe of this run has them
         for keyframe, T in zip(atlas.keyframes[atlas.prior_count :], atlas.poses_in_map[atlas.prior_count :]):
-            rows = np.flatnonzero(~np.isin(keyframe.landmarks, [-1, *present]))
-            at = transform(T, np.asarray(keyframe.points, float)[rows])
-            found.update(zip(np.asarray(keyframe.landmarks)[rows].tolist(), at))
+            left = np.flatnonzero(~np.isin(keyframe.landmarks, [-1, *estimate.ids]))
+            at = transform(T, np.asarray(keyframe.points, float)[left])
+            found.update(zip(np.asarray(keyframe.landmarks)[left].tolist(), at))
         lines = ([i, *(f"{x:.9g}" for x in found[i])] for i in sorted(found))
         write_text(self.folder / OLD_LANDMARKS, csv_rows([header(OLD_TABLE), *lines]))
 

@@ -22,7 +22,7 @@ from slam.geometry.se3 import Array, inverse, transform
 from slam.naming import unknown
 from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder
-from slam.run.results import facts
+from slam.run.results import facts, number
 from slam.run.run_data import RunData, place_of_truth, pose_errors, well_known
 from slam.run.schema import STAGE_NAMES, body_colour
 
@@ -55,7 +55,6 @@ _BACKENDS = {"ekf": "#0d47a1", "smoother": "#ef6c00", "batch": "#6a1b9a", "windo
 _OTHERS = ("#2e7d32", "#c62828", "#5d4037", "#9e9d24")
 _TRUTH, _BEFORE, _NOT_NOW, _NOW = "0.3", "0.8", "#9fa8da", "#283593"
 _LOOPS = ("o", "k", "loops closed"), ("x", "#c62828", "loops refused")
-_STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _NAME = 2.0  # [in] room for a mark and its name
 _SIGMAS = 2.0  # size of ellipses
 _DECADES = 2.5  # of errors, at most: smaller ones are where an error changes its sign
@@ -125,7 +124,18 @@ def drawn(runs: Sequence[RunData], kind: str) -> Figure:
     from matplotlib.figure import Figure
 
     maps = [f"map {k}" for k in range(len(runs[:_MOST_MAPS] if kind == "summary" else runs))]
-    wide, rows, heights = _layout(kind, maps)
+    wide = max(10.0, 4.4 * (1 + len(maps))) if kind == "summary" else 5.0 * len(maps) if kind == "map" else 5.2
+    below: list[Any] = [["position", "time"], ["rotation", "time"]]
+    layouts: dict[
+        str, tuple[list[Any], list[float]]
+    ] = {  # names of panels, nested ones with margins of their own, and heights of the rows [in]
+        "summary": ([[[["path", *maps]]], ["key"], [below]], [wide / (1 + len(maps)), 0.5, 4.2]),
+        "map": ([maps, ["key"] * len(maps)], [5.0, 0.5]),
+        "path": ([["path"]], [4.8]),
+        "errors": ([["position"], ["rotation"]], [1.8, 1.8]),
+        "time": ([["time"]], [2.6]),
+    }
+    rows, heights = layouts[kind]
     lines = [_title(runs), *(f"{run.name}: {text}" for run in runs if (text := facts(run.summary)))]
     head = "\n".join(textwrap.fill(line, int(_LETTERS * wide)) for line in lines) if kind == "summary" else ""
     with rc_context(_STYLE):
@@ -143,21 +153,6 @@ def drawn(runs: Sequence[RunData], kind: str) -> Figure:
         if head:
             figure.suptitle(head, x=0.01, ha="left")
     return figure
-
-
-def _layout(kind: str, maps: list[str]) -> tuple[float, list[list[Any]], list[float]]:
-    """Width of a picture [in], names of its panels in rows, and heights of the rows [in].
-
-    Nested rows have margins of their own.
-    """
-    if kind == "summary":
-        wide, below = max(10.0, 4.4 * (1 + len(maps))), [["position", "time"], ["rotation", "time"]]
-        return wide, [[[["path", *maps]]], ["key"], [below]], [wide / (1 + len(maps)), 0.5, 4.2]
-    if kind == "map":
-        return 5.0 * len(maps), [maps, ["key"] * len(maps)], [5.0, 0.5]
-    if kind == "path":
-        return 5.2, [["path"]], [4.8]
-    return 5.2, *(([["position"], ["rotation"]], [1.8, 1.8]) if kind == "errors" else ([["time"]], [2.6]))
 
 
 def _title(runs: Sequence[RunData]) -> str:
@@ -211,8 +206,7 @@ def draw_paths(axis: Axes, runs: Sequence[RunData]) -> None:
         if not (len(final) == len(online) and np.allclose(final, online, rtol=0, atol=1e-6 * factor)):
             axis.plot(*final.T, ":", color=colour, lw=1.5, label=f"{run.name}, final")
     axis.set(title="Path from above, online (dot: start)", xlabel=f"right [{unit}]", ylabel=f"forward [{unit}]")
-    if not _stretch(axis, factor * every):
-        axis.set_aspect("equal", adjustable="datalim")
+    axis.set_aspect("equal", adjustable="datalim")
     axis.legend(framealpha=0.8)
     axis.locator_params(axis="x", nbins=6)
     axis.grid(color="0.9", lw=0.5)
@@ -276,19 +270,6 @@ def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
     axis.set_ylim(bottom, top)
 
 
-def _stretch(axis: Axes, points: Array) -> bool:
-    """Give each axis a scale of its own where points (N, 2) lie nearly in a line along one; whether it did."""
-    extent = np.ptp(points, axis=0)
-    narrow = int(np.argmin(extent))
-    if not extent[narrow] * _STRAIGHT < extent[1 - narrow]:
-        return False
-    half = 0.6 * max(float(extent[narrow]), 0.01 * float(extent[1 - narrow]))  # what is straight is not blown up
-    middle = float(points[:, narrow].max() + points[:, narrow].min()) / 2
-    name, label = "xy"[narrow], (axis.get_xlabel, axis.get_ylabel)[narrow]()
-    axis.set(**{f"{name}lim": (middle - half, middle + half), f"{name}label": f"{label}, on a scale of its own"})
-    return True
-
-
 # --------------------------------------------------------------------------------------------- errors and times
 
 
@@ -299,23 +280,20 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
 
     series = [pose_errors(run) for run in runs]
     known = any(run.truth is not None for run in runs)
-    largest = max(float(np.nanmax(both[:, 0], initial=0.0)) for _, *pair in series for both in pair)
-    factor, unit = _unit(largest)
+    factor, unit = _unit(max(float(np.nanmax(both[:, 0], initial=0.0)) for _, *pair in series for both in pair))
     for k, (axis, name, times) in enumerate(zip(axes, (f"position [{unit}]", "rotation [deg]"), (factor, 1.0))):
-        tops = [0.0]
         for (run, colour, width), (time, error, sigma) in zip(_coloured(runs), series):
-            for values, style in ((error if run.truth is not None else None, "-"), (sigma, "--")):
-                if values is not None:
-                    axis.plot(time, times * values[:, k], style, color=colour, lw=0.7 * width)
-                    tops.append(float(np.nanmax(times * values[:, k], initial=0.0)))
-            lost = (run.online.stamps - run.online.stamps[:1])[~run.measured]
-            for start in lost:
+            if run.truth is not None:
+                axis.plot(time, times * error[:, k], color=colour, lw=0.7 * width)
+            axis.plot(time, times * sigma[:, k], "--", color=colour, lw=0.7 * width)
+            for start in (run.online.stamps - run.online.stamps[:1])[~run.measured]:
                 axis.axvspan(start, start, color=colour, alpha=0.2)
-        if max(tops) > 0:
+        values = np.concatenate([line.get_ydata() for line in axis.lines])
+        values = values[values > 0]
+        if len(values):
             axis.set_yscale("log")
-            values = np.concatenate([line.get_ydata() for line in axis.lines])
-            top = (2.0 if k or len(runs) == 1 else 6.0) * max(tops)
-            bottom = max(0.7 * float(values[values > 0].min()), top * 10.0**-_DECADES)
+            top = (2.0 if k or len(runs) == 1 else 6.0) * float(values.max())  # room for a legend
+            bottom = max(0.7 * float(values.min()), top * 10.0**-_DECADES)
             axis.set_ylim(bottom, top)
             axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top < 100 * bottom else (1,)))
             axis.yaxis.set_major_formatter("{x:g}")
@@ -325,10 +303,10 @@ def draw_errors(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         end = max(float(np.ptp(run.online.stamps)) for run in runs)  # also where the truth begins later
         axis.set_xlim(-0.01 * end, 1.01 * end or 1.0)
     axes[0].tick_params(labelbottom=False)
-    title = "Error of the online pose (solid), claimed σ (dashed)"
+    title = "Online error since the start (solid), claimed σ (dashed)"
     axes[0].set_title(title if known else "Claimed σ of the online pose; no true path is known")
     axes[-1].set_xlabel("time [s]")
-    if len(runs) > 1:  # in the room above all lines
+    if len(runs) > 1:
         colours = [Line2D([], [], color=colour) for _, colour, _ in _coloured(runs)]
         axes[0].legend(colours, [run.name for run in runs], framealpha=0.8, ncols=3, loc="upper left")
 
@@ -342,8 +320,8 @@ def draw_times(axis: Axes, runs: Sequence[RunData]) -> None:
     high = 0.8 / len(runs)
     for i, ((run, colour, _), total) in enumerate(zip(_coloured(runs), totals)):
         at = np.arange(len(stages)) + (i - (len(runs) - 1) / 2) * high
-        name = f"{run.name}: {total:.0f} ms" if total >= 100 else f"{run.name}: {total:.3g} ms"
-        axis.barh(at, [medians[stage][i] for stage in stages], height=high, color=colour, label=name)
+        label = f"{run.name}: {number(total)} ms"
+        axis.barh(at, [medians[stage][i] for stage in stages], height=high, color=colour, label=label)
     axis.set_yticks(range(len(stages)), [STAGE_NAMES[stage] for stage in stages])
     axis.invert_yaxis()
     axis.set(title="Median time of a frame", xlabel="time [ms]")

@@ -12,7 +12,6 @@ path is known, ``truth_stamps`` and ``truth_poses``. Meanings: `Recording`.
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -31,7 +30,6 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels, MotionModel, ObjectModels, models_for
-from slam.tracks.table import LandmarkTable
 
 _HEADER = {"format": "surf-stereo-slam recording", "version": 3}
 _LARGEST = 2**32  # bytes of a file
@@ -48,10 +46,13 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         SequenceError: the file cannot be written.
     """
     r, rows, pixels = recording, [np.zeros((0, 3), np.int64)], [np.zeros((0, 4))]
-    for k, frame in enumerate(r.frames):
-        for what, (ids, *uv) in enumerate((_cells(frame.observed), _cells(frame.added), (frame.removed,))):
-            rows.append(np.column_stack([np.full(len(ids), k), np.full(len(ids), what), np.asarray(ids, np.int64)]))
-            pixels.append(np.column_stack(uv) if uv else np.full((len(ids), 4), np.nan))
+    for k, frame in enumerate(r):
+        for what, given in enumerate((frame.observed, frame.added)):
+            rows.append(np.column_stack([np.full((len(given), 2), (k, what)), given.ids]))
+            pixels.append(np.column_stack([given.uv_left, given.uv_right]))
+        gone = len(frame.removed)
+        rows.append(np.column_stack([np.full((gone, 2), (k, 2)), frame.removed]))
+        pixels.append(np.full((gone, 4), np.nan))
     rig = {"left": asdict(r.rig.left), "right": asdict(r.rig.right), "R": r.rig.R.tolist(), "b": r.rig.b.tolist()}
     header = _HEADER | {"name": r.name, "kind": r.kind, "rig": rig, "models": asdict(r.models)}
     arrays: dict[str, Any] = {"header": json.dumps(header), "numbers": np.array([f.number for f in r], np.int64)}
@@ -66,10 +67,6 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         arrays.update(truth_stamps=r.ground_truth.stamps, truth_poses=r.ground_truth.poses)
     with whole_file(path, SequenceError) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
-
-
-def _cells(observations: Observations) -> tuple[np.ndarray, ...]:
-    return observations.ids, observations.uv_left, observations.uv_right
 
 
 def load_recording(path: str | Path) -> Recording:
@@ -118,36 +115,29 @@ def _recording(arrays: dict[str, np.ndarray]) -> Recording:
 def _frames(arrays: Mapping[str, np.ndarray], rig: StereoRig) -> tuple[RecordedFrame, ...]:
     """What was given in each frame."""
     numbers, stamps, rows, pixels = (arrays[key] for key in ("numbers", "stamps", "rows", "pixels"))
-    if len(numbers) != len(stamps):
+    count = len(stamps)
+    if len(numbers) != count:
         raise SequenceError("stamps must be finite and increase, with a number each")
     if rows.shape[1:] != (3,) or pixels.shape != (len(rows), 4):
         raise SequenceError("rows and pixels differ in length")
     place = 3 * rows[:, 0] + rows[:, 1]
-    inside = (rows[:, :2] >= 0).all() and (rows[:, 1] <= 2).all() and (place < 3 * len(stamps)).all()
+    inside = (rows[:, :2] >= 0).all() and (rows[:, 1] <= 2).all() and (place < 3 * count).all()
     if not inside or (np.diff(place) < 0).any():
-        raise SequenceError(f"frames of rows must ascend from 0 to {len(stamps) - 1}")
-    revisions = _revisions(arrays, len(stamps), rig)
-    ends = np.searchsorted(place, np.arange(3 * len(stamps) + 1)).tolist()
-    ids, none, frames = rows[:, 2], Observations.empty(), []
+        raise SequenceError(f"frames of rows must ascend from 0 to {count - 1}")
+    revisions: list[Revision | None] = [None] * count
+    if "corrections" in arrays:
+        corrections, model = arrays["corrections"], RigModel(rig)
+        if corrections.shape != (count, len(model.names)) or not np.isfinite(corrections).all():
+            raise SequenceError("corrections must be finite, with a row for each stamp")
+        every = [RigCorrection(model, row) for row in corrections]
+        for k in np.flatnonzero((corrections[1:] != corrections[:-1]).any(axis=1)).tolist():
+            revisions[k + 1] = Revision(every[k], every[k + 1])
+    ends = np.searchsorted(place, np.arange(3 * count + 1)).tolist()
+    frames = []
     for k, (a, b, c, d) in enumerate(zip(ends[:-1:3], ends[1::3], ends[2::3], ends[3::3])):
-        given = [
-            Observations(ids[i:j], pixels[i:j, :2], pixels[i:j, 2:]) if j > i else none for i, j in ((a, b), (b, c))
-        ]
-        seen, new = given
-        frames.append(RecordedFrame(int(numbers[k]), float(stamps[k]), seen, new, ids[c:d], revisions[k]))
+        seen, new = (Observations(rows[i:j, 2], pixels[i:j, :2], pixels[i:j, 2:]) for i, j in ((a, b), (b, c)))
+        frames.append(RecordedFrame(int(numbers[k]), float(stamps[k]), seen, new, rows[c:d, 2], revisions[k]))
     return tuple(frames)
-
-
-def _revisions(arrays: Mapping[str, np.ndarray], count: int, rig: StereoRig) -> list[Revision | None]:
-    """How frames before each one are corrected again; None where they are not."""
-    if "corrections" not in arrays:
-        return [None] * count
-    rows, model = arrays["corrections"], RigModel(rig)
-    if rows.shape != (count, len(model.names)) or not np.isfinite(rows).all():
-        raise SequenceError("corrections must be finite, with a row for each stamp")
-    every = [RigCorrection(model, row) for row in rows]
-    changed = [False, *(rows[1:] != rows[:-1]).any(axis=1).tolist()][:count]
-    return [Revision(every[k - 1], every[k]) if new else None for k, new in enumerate(changed)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,29 +222,6 @@ class Recording:
         """Times of the frames (F,) [s]."""
         return np.array([frame.stamp for frame in self.frames], float)
 
-    @cached_property
-    def map_sizes(self) -> IdArray:
-        """Number of landmarks in the map after each frame (F,)."""
-        return np.cumsum([len(f.added) - len(f.removed) for f in self.frames], dtype=np.int64)
-
-    @cached_property
-    def first(self) -> int | None:
-        """The first frame that adds landmarks; None where none does."""
-        return next((k for k, frame in enumerate(self.frames) if len(frame.added)), None)
-
-    def landmarks(self, frames: int) -> LandmarkTable:
-        """The map after the first so many frames: how often each landmark was given, and when; no appearance."""
-        seen, last, known = Counter[int](), dict[int, int](), set[int]()
-        for k, frame in enumerate(self.frames[:frames]):
-            given = [*frame.observed.ids.tolist(), *frame.added.ids.tolist()]
-            seen.update(given)
-            last.update(dict.fromkeys(given, k))
-            known = (known | set(frame.added.ids.tolist())) - set(frame.removed.tolist())
-        ids = np.array(sorted(known), np.int64)
-        counts, latest = (np.array([by_id[i] for i in ids.tolist()], np.int64) for by_id in (seen, last))
-        none, descriptors = np.zeros(len(ids), np.int64), np.zeros((len(ids), 0), np.float32)
-        return LandmarkTable(ids, descriptors, none.astype(np.int8), counts, counts, none, latest)
-
 
 def _require_fits(frame: RecordedFrame, known: set[int]) -> set[int]:
     """Raise where pixels or ids are none, or a frame does not fit the map before it; the map after it."""
@@ -265,11 +232,9 @@ def _require_fits(frame: RecordedFrame, known: set[int]) -> set[int]:
             raise MeasurementError(f"recording: a pixel of {what} is far outside of any image")
         if len(rows) and (rows.ids.min() < 0 or rows.ids.max() > MOST_ID):
             raise MeasurementError(f"recording: ids of landmarks must go from 0 to {MOST_ID}")
-    every = [ids.tolist() for ids in (frame.observed.ids, frame.added.ids, frame.removed)]
-    seen, new, gone = map(set, every)
-    for ids, own, what in zip(every, (seen, new, gone), ("observed", "added", "removed")):
-        if len(own) < len(ids):
-            raise MeasurementError(f"frame {frame.number}: a landmark stands twice in {what}")
+    seen, new, gone = (set(ids.tolist()) for ids in (frame.observed.ids, frame.added.ids, frame.removed))
+    if len(seen) + len(new) + len(gone) < len(frame.observed) + len(frame.added) + len(frame.removed):
+        raise MeasurementError(f"frame {frame.number}: a landmark stands twice in observed, added or removed")
     for wrong, words in (
         (seen - known, "is observed but not in the map"),
         (new & known, "is added but in the map already"),

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
+from slam.data import FrameResult, FrameStatus, StereoFeatures, UpdateStatus
 from slam.geometry.rig import MINIMAL_POINTS, measurement_rows
 from slam.input.features import Rectification
 from slam.interfaces import Backend, RevisingBackend
@@ -45,17 +45,18 @@ def replay(
     """
     config, inside = association or AssociationConfig(), Rectification(recording.rig)
     inside.require_fits(backend)
+    threshold, size = config.consistency_sigmas * inside.models(recording.models).pixel_sigma, 0
     for k, frame in enumerate(recording):
         with named_failures(f"frame {frame.number}", backend):
-            result = _step(recording, inside, backend, k, frame, config)
+            result = _step(inside, backend, k, frame, size, threshold, config.hypotheses)
+        size = result.map_size
         yield result
 
 
 def _step(
-    recording: Recording, inside: Rectification, backend: Backend, k: int, frame: RecordedFrame,
-    config: AssociationConfig,
-) -> FrameResult:  # fmt: skip
-    """One frame."""
+    inside: Rectification, backend: Backend, k: int, frame: RecordedFrame, size: int, threshold: float, hypotheses: int
+) -> FrameResult:
+    """One frame, before which there are so many landmarks (`size`) in the map."""
     times, guess = [time.perf_counter()], None
     seen, added = inside.observations_in(frame.observed), inside.observations_in(frame.added)
     if frame.revision is not None and isinstance(backend, RevisingBackend):
@@ -64,9 +65,8 @@ def _step(
     times.append(time.perf_counter())
     if len(seen):
         points, measured = backend.positions(seen.ids), measurement_rows(seen.uv_left, seen.uv_right)
-        threshold = config.consistency_sigmas * inside.models(recording.models).pixel_sigma
-        expected, tries = prediction.T_world_left, config.hypotheses
-        guess = find_consensus(inside.rig, points, measured, expected, threshold, tries, seed=k).T_world_left
+        expected = prediction.T_world_left
+        guess = find_consensus(inside.rig, points, measured, expected, threshold, hypotheses, seed=k).T_world_left
     times.append(time.perf_counter())
     report = checked(backend, "update", backend.update(seen, guess))
     times.append(time.perf_counter())
@@ -80,7 +80,14 @@ def _step(
     times.append(time.perf_counter())
     estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
     times.append(time.perf_counter())
-    status, reason = _status(report, k == recording.first)
+    status, reason = FrameStatus.TRACKED, ""
+    if report.status is UpdateStatus.FAILED:
+        status, reason = FrameStatus.FAILED, report.reason
+    elif not size and len(added):
+        status = FrameStatus.STARTED
+    elif len(report.used) < MINIMAL_POINTS:
+        status = FrameStatus.PREDICTED
+        reason = report.reason or f"only {len(report.used)} landmarks matched"
     count, every = len(seen), len(seen) + len(frame.added)
     nothing = np.full(every, np.nan)
     features = StereoFeatures(
@@ -104,17 +111,7 @@ def _step(
         added=frame.added.ids,
         added_features=np.arange(count, every),
         erased=frame.removed,
-        map_size=int(recording.map_sizes[k]),
+        map_size=size + len(frame.added) - len(frame.removed),
         revision=frame.revision,
         milliseconds=dict(zip(_STAGES, 1e3 * np.diff(times))),
     )
-
-
-def _status(report: UpdateReport, first: bool) -> tuple[FrameStatus, str]:
-    if report.status is UpdateStatus.FAILED:
-        return FrameStatus.FAILED, report.reason
-    if len(report.used) >= MINIMAL_POINTS:
-        return FrameStatus.TRACKED, ""
-    if first:
-        return FrameStatus.STARTED, ""
-    return FrameStatus.PREDICTED, report.reason or f"only {len(report.used)} landmarks matched"

@@ -6,7 +6,6 @@ and how, is in `slam.evaluation`. Whether covariances hold is judged here, for o
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +25,7 @@ class Metric:
     key: str  # column of the tables; its end says the unit of the values, if that is another one than `unit`
     label: str  # for people
     unit: str = ""  # in which people see it
-    place: str = ""  # keys of a summary one below the other, apart by "/"; empty where it is not simply there
+    place: str = ""  # keys of a summary one below the other; "*": the mean over bodies in view; empty: computed
     better: str = ""  # "lower", "higher", "one" (1 is honest; both ways off is worse), or "" (neither)
     shown: str = "compared"  # where: some of "compared", "main" (in a comparison's conclusions), "run", "picture"
 
@@ -45,23 +44,25 @@ class Metric:
         """Label with unit."""
         return f"{self.label} [{self.unit}]" if self.unit else self.label
 
-    def show(self, value: float) -> str:
-        """A value for people."""
-        return number(self.scale * value)
+    def show(self, value: float, like: float | None = None) -> str:
+        """A value for people, see `number`."""
+        return number(self.scale * value, None if like is None else self.scale * like)
 
 
-def number(value: float) -> str:
-    """Three digits, with a minus sign that is one; a dash where there is no number."""
+def number(value: float, like: float | None = None) -> str:
+    """Three digits, or as many behind the point as show three of `like`, six at most; a dash for no number."""
     if not np.isfinite(value):
         return "–"
-    return (f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}").replace("-", "−")
+    if not like:
+        text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    else:
+        text = f"{value:.{min(6, max(0, 2 - int(np.floor(np.log10(abs(like))))))}f}"
+    return text.replace("-", "−")
 
 
-#: Share of the runs that came to their end: known of every run, also of those that have no other figure.
-COMPLETED = Metric("completed", "runs completed", "%", "", "higher", "compared main")
-
-#: All others, in the order of all tables. Times are not compared: they differ from run to run.
+#: In the order of all tables. Times are not compared: they differ from run to run.
 METRICS = (
+    Metric("completed", "runs completed", "%", "", "higher", "compared main"),
     Metric("tracked", "frames tracked", "%", "", "higher", "compared main"),
     Metric("path_m", "path length", "m", "path_length_m", shown="run picture"),
     Metric("speed", "speed, median", "m/s", "speed_m_per_s", shown="run picture"),
@@ -69,16 +70,19 @@ METRICS = (
     Metric("bodies", "moving bodies found", "", "bodies", shown="run picture"),
     Metric("moving_precision", "moving features, precision", "%", "objects/features/precision", "higher"),
     Metric("moving_recall", "moving features, recall", "%", "objects/features/recall", "higher"),
-    Metric("body_coverage", "moving bodies, frames found", "%", "", "higher", "compared run"),
-    Metric("body_error_m", "motion of a body, error", "mm", "", "lower", "compared run"),
-    Metric("body_error_deg", "motion of a body, rotation error", "deg", "", "lower"),
-    Metric("body_nees_per_dof", "NEES / 6 of bodies (1 is right)", "", "", "one"),
+    Metric("body_coverage", "moving bodies, frames found", "%", "objects/bodies/*/coverage", "higher", "compared run"),
+    Metric("body_error_m", "motion of a body, error", "mm", "objects/bodies/*/ME/translation median [m]", "lower",
+           "compared run"),
+    Metric("body_error_deg", "motion of a body, rotation error", "deg", "objects/bodies/*/ME/rotation median [deg]",
+           "lower"),
+    Metric("body_nees_per_dof", "NEES / 6 of bodies (1 is right)", "", "objects/bodies/*/mean NEES", "one"),
     Metric("loops_closed", "loops closed", "", "loops/closed", shown="compared run picture"),
     Metric("loops_refused", "loops refused", "", "loops/refused"),
-    Metric("ate_online_m", "online path error (ATE)", "mm", "accuracy/online/ATE RMSE [m]", "lower",
+    Metric("ate_online_m", "online path error (ATE, aligned)", "mm", "accuracy/online/ATE RMSE [m]", "lower",
            "compared main run picture"),
-    Metric("ate_final_m", "final path error (ATE)", "mm", "accuracy/final/ATE RMSE [m]", "lower", "compared main run"),
-    Metric("ate_without_loops_m", "path error without loops (ATE)", "mm",
+    Metric("ate_final_m", "final path error (ATE, aligned)", "mm", "accuracy/final/ATE RMSE [m]", "lower",
+           "compared main run"),
+    Metric("ate_without_loops_m", "path error without loops (ATE, aligned)", "mm",
            "accuracy/online without loops/ATE RMSE [m]", "lower"),
     Metric("rpe_1s_m", "drift in 1 s (RPE)", "mm", "accuracy/online/RPE RMSE over 1 s [m]", "lower", "compared run"),
     Metric("rpe_1s_deg", "drift in 1 s, rotation (RPE)", "deg", "accuracy/online/RPE rotation RMSE over 1 s [deg]",
@@ -121,48 +125,27 @@ _NEES = {
 }
 _FEW = 0.5  # a NEES over less than this share of the stretches is no figure: they are hardly a fair choice
 
-#: Figures of moving bodies, which are means over these, by their place in what is said of one.
-_OF_BODIES = {
-    "body_coverage": "coverage",
-    "body_error_m": "ME/translation median [m]",
-    "body_error_deg": "ME/rotation median [deg]",
-    "body_nees_per_dof": "mean NEES",
-}
-
-#: Why no NEES is known: in the map of an earlier run, and elsewhere.
-_IN_MAP = (
-    "covariances are not judged in a prior map: all poses share its errors, which the truth of this run does not tell"
-)
-_NOT_JUDGED = (
-    "covariances cannot be judged: they leave none for the motion between two poses, as where a back end claims the "
-    "same one for every frame"
-)
-_DOUBTFUL = "covariances cannot be judged: the true path is doubtful, as where it was interpolated over a gap"
-
 
 def figures(summary: Mapping[str, Any]) -> dict[str, float]:
     """What a run's summary says, by key of `METRICS`; what it does not say is left out."""
-    found = {m.key: value for m in METRICS if m.place and (value := _at(summary, m.place)) is not None}
-    for key, over in _NEES.items():
-        if key in found:
-            found[key] /= 6
-        if (_at(summary, f"consistency/no covariance {over}") or 0.0) > _FEW:
-            found.pop(key, None)
+    bodies = [body for body in _at(summary, "objects/bodies", {}).values() if body["frames in view"]]
+    honest, found = summary.get("consistency") or {}, {}
+    for m in METRICS:
+        before, each, own = m.place.partition("/*/")
+        values = [_at(body, own) for body in bodies] if each else [_at(summary, before)] if before else []
+        known = [float(value) for value in values if value is not None]
+        few = (honest.get(f"no covariance {_NEES.get(m.key)}") or 0.0) > _FEW
+        if known and not few and (bodies or "moving" not in m.key):  # what is found of nothing is no figure
+            found[m.key] = float(np.mean(known)) / (6 if "nees" in m.key else 1)
     if "scale_error_percent" in found:
         found["scale_error_percent"] = abs(found["scale_error_percent"])
     if frames := summary.get("frames", 0):
         found["tracked"] = _measured(summary) / frames
     if ratios := _ratios(found):
         found["ratio"] = next(iter(ratios.values()))
-    left_out = [] if found.get("loops_closed", 0) + found.get("loops_refused", 0) else ["loops"]
-    moved = [body for body in summary.get("objects", {}).get("bodies", {}).values() if body["frames in view"]]
-    if not moved:  # what is found of nothing is no figure
-        left_out.append("moving")
-    for key, place in _OF_BODIES.items():
-        values = [value for body in moved if (value := _at(body, place)) is not None]
-        if values:
-            found[key] = float(np.mean(values)) / (6 if key.startswith("body_nees") else 1)
-    return {key: value for key, value in found.items() if key.partition("_")[0] not in left_out}
+    if not found.get("loops_closed") and not found.get("loops_refused"):
+        found = {key: value for key, value in found.items() if not key.startswith("loops")}
+    return found
 
 
 def rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[str]]]:
@@ -186,8 +169,7 @@ def facts(summary: Mapping[str, Any]) -> str:
     found = figures(summary)
     shown = [m for m in METRICS if "picture" in m.shown and found.get(m.key)]
     words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
-    judged = re.sub(r" \([^)]*\)| of the pose", "", verdict_of_run(summary))
-    return "; ".join([*words, *filter(None, [judged])])
+    return "; ".join(filter(None, [*words, verdict_of_run(summary)]))
 
 
 def _measured(summary: Mapping[str, Any]) -> int:
@@ -195,11 +177,11 @@ def _measured(summary: Mapping[str, Any]) -> int:
     return int(status.get("tracked", 0) + status.get("started", 0))
 
 
-def _at(tree: Any, place: str) -> float | None:
-    """The number at a place of a summary; None where there is none."""
+def _at(tree: Any, place: str, default: Any = None) -> Any:
+    """What is at a place of a summary."""
     for key in place.split("/"):
         tree = tree.get(key) if isinstance(tree, Mapping) else None
-    return None if tree is None or isinstance(tree, Mapping) else float(tree)
+    return default if tree is None else tree
 
 
 def _ratios(found: Mapping[str, float]) -> dict[str, float]:
@@ -233,12 +215,22 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
 def verdict_of_run(summary: Mapping[str, Any]) -> str:
     """`verdict` on a run by its summary, with what it leaves out; empty where no true path is known."""
     text, honest = verdict(figures(summary)), summary.get("consistency") or {}
-    doubtful = {over: honest.get(f"doubtful truth {over}", 0.0) for over in _NEES.values()}
-    doubtful = {over: share for over, share in doubtful.items() if share}
+    doubtful = {over: share for over in _NEES.values() if (share := honest.get(f"doubtful truth {over}"))}
+    if not text and not honest.get("dof"):
+        return ""
+    if not text and _at(summary, "loops/known"):
+        return (
+            "covariances are not judged in a prior map: all poses share its errors, which the truth of this run does "
+            "not tell"
+        )
     if not text:
-        if not honest.get("dof"):
-            return ""
-        return _IN_MAP if _at(summary, "loops/known") else _DOUBTFUL if doubtful else _NOT_JUDGED
+        why = (
+            "the true path is doubtful, as where it was interpolated over a gap"
+            if doubtful
+            else "they leave none for the motion between two poses, as where a back end claims the same one for every "
+            "frame"
+        )
+        return f"covariances cannot be judged: {why}"
     if doubtful:
         over, share = next(iter(doubtful.items()))
         text += f"; not judged: {100 * share:.0f} % of the stretches {over}, where the true path is doubtful"

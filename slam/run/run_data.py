@@ -31,6 +31,7 @@ class RunData:
     name: str  # shown in the pictures
     online: Trajectory
     final: Trajectory
+    ids: np.ndarray  # of landmarks (N,)
     positions: Array  # of landmarks (N, 3) [m]
     covariances: Array  # of these (N, 3, 3) [m²]
     seen_last: np.ndarray  # which landmarks were measured in the last frame (N,)
@@ -65,32 +66,32 @@ class RunData:
     @classmethod
     def _read(cls, folder: Path, name: str) -> RunData:
         landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
-        upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
-        last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
-        final = Trajectory.read_tum(folder / "trajectory_final.txt")
+        old = _rows(folder / OLD_LANDMARKS) if (folder / OLD_LANDMARKS).exists() else []
+        upper = _numbers(landmarks, "cxx", "cxy", "cxz", "cyy", "cyz", "czz")
         located = [row for row in frames if row["sd_x"]]
-        sd = _numbers(located, ("sd_x", "sd_y", "sd_z", "sd_rotation"))
+        sd = _numbers(located, "sd_x", "sd_y", "sd_z", "sd_rotation")
         config, stamps = read_object(folder / "config.json"), {row["frame"]: float(row["stamp"]) for row in frames}
+        final, truth = Trajectory.read_tum(folder / "trajectory_final.txt"), folder / "truth.txt"
 
         def pairs(column: str) -> np.ndarray:
             found = [(stamps[row["frame"]], stamps[row[column]]) for row in frames if (row[column] or "").isdigit()]
             rows = np.searchsorted(final.stamps, np.array(found, float).reshape(-1, 2) - 1e-9)
             return rows.clip(0, max(len(final) - 1, 0))
 
-        truth, old, path = folder / "truth.txt", folder / OLD_LANDMARKS, folder / "summary.json"
-        summary = read_object(path) if path.exists() else {}
+        summary = read_object(folder / "summary.json") if (folder / "summary.json").exists() else {}
         noise: dict[str, Any] = {key: float(value) for key, value in summary.get("truth", {}).items()}
         return cls(
             name=printable(name),
             online=Trajectory.read_tum(folder / "trajectory.txt"),
             final=final,
-            positions=_numbers(landmarks, ("x", "y", "z")),
+            ids=_numbers(landmarks, "id")[:, 0].astype(np.int64),
+            positions=_numbers(landmarks, *"xyz"),
             covariances=upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
-            seen_last=last_seen == int(frames[-1]["frame"]),
+            seen_last=_numbers(landmarks, "last_seen")[:, 0] == int(frames[-1]["frame"]),
             deviations=np.column_stack([np.linalg.norm(sd[:, :3], axis=1), np.degrees(sd[:, 3])]),
             measured=np.array([row["status"] in ("started", "tracked") for row in located], bool),
             status=[row["status"] for row in frames],
-            milliseconds={stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},
+            milliseconds={stage: _numbers(frames, f"ms_{stage}")[:, 0] for stage in STAGES},
             truth=Trajectory.read_tum(truth) if truth.exists() else None,
             sequence=printable(str(config["sequence"])),
             backend=printable(str(config["backend"])),
@@ -99,7 +100,7 @@ class RunData:
             truth_is_exact=config["format"] == "synthetic",
             loops=pairs("loop"),
             refused=pairs("refused"),
-            old=_numbers(_rows(old) if old.exists() else [], ("x", "y", "z")),
+            old=_numbers(old, *"xyz"),
             objects=[
                 (float(row["stamp"]), row["id"], np.array([float(row[axis]) for axis in "xyz"]))
                 for row in _rows(folder / "objects.csv")
@@ -135,7 +136,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(read_text(path), newline="")))
 
 
-def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
+def _numbers(rows: list[dict[str, str]], *columns: str) -> Array:
     """Columns of a table as numbers (N, C); NaN for an empty cell."""
     return np.array([[float(row[c] or "nan") for c in columns] for row in rows]).reshape(-1, len(columns))
 

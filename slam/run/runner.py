@@ -6,8 +6,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from slam import registry
@@ -56,8 +56,8 @@ def run(
 
     The files are completed however the run ends: on an error or an interrupt the frames done so far are kept, the
     summary says how it ended, recording and map are written, and the exception goes on; before the first frame is done
-    it leaves no file. Where a file cannot be written
-    the others are; of several errors the first one is raised. Files of an earlier run in the folder are replaced.
+    it leaves no file. Where a file cannot be written the others are; of several errors the first one is raised. Files
+    of an earlier run in the folder are replaced.
 
     Args:
         sequence: what to run.
@@ -72,11 +72,11 @@ def run(
         SlamError: bad input; one line says what and where.
     """
     require_outputs(options.outputs, overwrite=True)
-    if options.prior_map is not None and options.record is not None:
-        raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
-    if options.config.map.monocular and options.record is not None:
-        raise SlamError("a run with map.monocular cannot be recorded: a recording holds stereo observations alone")
     if options.record is not None:
+        if options.prior_map is not None:
+            raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
+        if options.config.map.monocular:
+            raise SlamError("a run with map.monocular cannot be recorded: a recording holds stereo observations alone")
         config = replace(options.config, map=replace(options.config.map, monocular=False))
         options = replace(options, config=config)
     frames, live = sequence.frames(options.start, options.stop), None
@@ -95,9 +95,8 @@ def run(
     )
     if live is not None:  # before its clock starts, with its first frame
         warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
-    record = RunRecord() if record is None else record
-    results = _processed(system, frames, live, tuple(watches), record)
-    return _Run(sequence, options, system, record, live).drive(results, on_frame)
+    way = _Run(sequence, options, system, record or RunRecord(), live)
+    return way.drive(way.processed(frames, tuple(watches)), on_frame)
 
 
 @one_blas_thread
@@ -107,54 +106,15 @@ def run_recording(
     on_frame: Callable[[FrameResult], None] | None = None,
     record: RunRecord | None = None,
 ) -> dict[str, Any]:
-    """Replay a recording through a back end; leaves the files of a run and returns its summary, as `run` does.
+    """Replay a recording through a back end; leaves the files of a run and returns its summary.
 
-    Args:
-        recording: what the back end is given.
-        options: back end, settings and folder; there is no front end and no range of frames.
-        on_frame: called after every frame, for a progress display.
-        record: gathers what the run gives, for whom the files are not enough.
-
-    Raises:
-        SlamError: bad input; one line says what and where.
+    As `run`, but the `options` need no front end and no range of frames. Raises SlamError on bad input.
     """
     config, inside = options.config, Rectification(recording.rig)
     models = inside.models(config.models)
     backend = registry.create("backends", options.backend, inside.rig, models=models, **config.backend)
     results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
-    record = RunRecord() if record is None else record
-    return _Run(recording, options, Replayed(recording, backend, record), record).drive(results, on_frame)
-
-
-def _processed(
-    system: StereoSlam,
-    frames: Iterator[StereoFrame],
-    live: LiveFrames | None,
-    watches: tuple[Watch, ...],
-    record: RunRecord,
-) -> Iterator[tuple[int, FrameResult]]:
-    """Each frame's number and what the system did with it; a live run's time of reading is one of waiting, and 0."""
-    reading: dict[int, float] = {}  # wall time [ms] by number of the frame
-
-    def timed() -> Iterator[StereoFrame]:
-        while True:
-            start = time.perf_counter()
-            frame = next(frames, None)
-            if frame is None:
-                return
-            reading[frame.index] = 1e3 * (time.perf_counter() - start) if live is None else 0.0
-            yield frame
-
-    for frame, result in system.run(timed()):
-        result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
-        if live is not None:
-            record.ages.append(live.age(frame))
-        if frame.right is None:
-            record.without_right.append(len(record.statuses))
-        record.depths.append(median_depth(result.features, system.rig))
-        yield frame.index, result
-        for watch in watches:
-            watch(frame, result, system)
+    return _Run(recording, options, Replayed(recording, backend), record or RunRecord()).drive(results, on_frame)
 
 
 @dataclass(eq=False)
@@ -169,6 +129,34 @@ class _Run:
     tape: list[RecordedFrame] = field(default_factory=list)
     failures: list[Exception] = field(default_factory=list)  # of the last files
 
+    def processed(self, frames: Iterator[StereoFrame], watches: tuple[Watch, ...]) -> Iterator[tuple[int, FrameResult]]:
+        """Each frame's number and what the system did with it.
+
+        A live run's time of reading is one of waiting, and 0.
+        """
+        system, record, reading = self.system, self.record, dict[int, float]()  # [ms] by number of the frame
+        assert isinstance(system, StereoSlam)
+
+        def timed() -> Iterator[StereoFrame]:
+            while True:
+                start = time.perf_counter()
+                frame = next(frames, None)
+                if frame is None:
+                    return
+                reading[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
+                yield frame
+
+        for frame, result in system.run(timed()):
+            result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
+            if self.live is not None:
+                record.ages.append(self.live.age(frame))
+            if frame.right is None:
+                record.without_right.append(len(record.statuses))
+            record.depths.append(median_depth(result.features, system.rig))
+            yield frame.index, result
+            for watch in watches:
+                watch(frame, result, system)
+
     def drive(
         self, results: Iterable[tuple[int, FrameResult]], on_frame: Callable[[FrameResult], None] | None
     ) -> dict[str, Any]:
@@ -177,14 +165,13 @@ class _Run:
         Raises:
             SlamError: a file cannot be written; all others are.
         """
-        record, out, options, score = self.record, self.options.out, self.options, score_for(self.sequence)
+        record, options, score = self.record, self.options, score_for(self.sequence)
         names = {"sequence": self.sequence.name, "format": self.sequence.format}
         names |= {"frontend": options.frontend, "backend": options.backend}
         ended, stopped_by = "completed", None
-        with RunFiles(out) as files:
-            write_json(out / "config.json", origin(options) | names | self._config())
-            with self._each():
-                write_json(out / "schema.json", schema())
+        with RunFiles(options.out) as files:
+            write_json(options.out / "config.json", origin(options) | names | self._config())
+            self._attempt(write_json, options.out / "schema.json", schema())
             try:
                 for number, result in results:
                     record.add(number, result)
@@ -224,11 +211,10 @@ class _Run:
         """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
         return "" if step is None else self.record.numbers[step] if step >= 0 else "map"
 
-    @contextmanager
-    def _each(self) -> Iterator[None]:
-        """One of the last files: it is written although another one failed."""
+    def _attempt(self, write: Callable[..., Any], *given: Any) -> Any:
+        """What a function gives; where it fails the other files are written all the same."""
         try:
-            yield
+            return write(*given)
         except Exception as error:  # noqa: BLE001 `_raise_failures` raises it
             self.failures.append(error)
 
@@ -252,52 +238,43 @@ class _Run:
     def _write_last(self, files: RunFiles, summary: dict[str, Any], score: Any) -> None:
         """Write the files that are made at the end; the summary says how good the run was."""
         system, record, sequence, options = self.system, self.record, self.sequence, self.options
-        out, final = options.out, Trajectory.empty()
+        out, attempt, whole = options.out, self._attempt, isinstance(system, StereoSlam)
         if record.stamps:
-            with self._each():
-                final = system.trajectory()
-                write_trajectory(out / "trajectory_final.txt", final)
-            with self._each():
-                if (pairs := with_truth(record.trajectory, sequence)) is not None:
-                    write_trajectory(out / "truth.txt", pairs[1])
-            with self._each():
-                files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
-            with self._each():
-                if isinstance(system, StereoSlam) and system.landmarks is not None:
-                    files.write_old_landmarks(system.atlas, system.landmarks.ids)
-            with self._each():
-                summary |= results_of(sequence, system, record, final, score)
+            final = attempt(system.trajectory)
+            if final is not None:
+                attempt(write_trajectory, out / "trajectory_final.txt", final)
+            if pairs := attempt(with_truth, record.trajectory, sequence):
+                attempt(write_trajectory, out / "truth.txt", pairs[1])
+            if (estimate := attempt(system.estimate)) is not None:
+                attempt(files.write_landmarks, estimate, record.seen, record.last_seen, getattr(system, "atlas", None))
+            found = attempt(results_of, sequence, system, record, final or Trajectory.empty(), score)
+            summary |= found or {}
         summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # nothing else is random
         summary["versions"] = versions()
-        with self._each():
-            write_json(out / "summary.json", summary)
-        with self._each():
-            if options.record is not None:
-                save_recording(self._recording(), options.record)
-        with self._each():
-            if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
-                save_map(options.save_map, system)
+        attempt(write_json, out / "summary.json", summary)
+        if options.record is not None:
+            attempt(self._save_recording, options.record)
+        if options.save_map is not None and record.stamps and whole:
+            attempt(save_map, options.save_map, system)
         if self.failures:
             summary["failures"] = list(map(_said, self.failures))
-            with self._each():
-                write_json(out / "summary.json", summary)
+            attempt(write_json, out / "summary.json", summary)
 
-    def _recording(self) -> Recording:
-        """What was given to the back end of a run; raises SlamError where it was given to more than one."""
-        options, sequence = self.options, self.sequence
+    def _save_recording(self, path: Path) -> None:
+        """Write what was given to the back end of a run; raises SlamError where it was given to more than one."""
+        sequence, models = self.sequence, self.options.config.models
         if isinstance(self.system, StereoSlam) and self.system.restarted:
             raise SlamError(
-                f"{options.record}: not written: the camera was lost, and a new back end took over in frame "
+                f"{path}: not written: the camera was lost, and a new back end took over in frame "
                 f"{self.system.restarted[0]}; what is recorded is for one"
             )
-        models, truth = options.config.models, sequence.ground_truth
-        return Recording(sequence.name, sequence.rig, models, tuple(self.tape), truth, kind=sequence.kind)
+        truth, frames = sequence.ground_truth, tuple(self.tape)
+        save_recording(Recording(sequence.name, sequence.rig, models, frames, truth, kind=sequence.kind), path)
 
     def _tracking(self) -> dict[str, Any]:
         """The part of the summary on the tracking, which is known of every run."""
         options, record, rig = self.options, self.record, self.sequence.rig
-        warnings = getattr(self.system, "warnings", ())
-        driving = options.kind == "driving"
+        warnings, driving = getattr(self.system, "warnings", ()), options.kind == "driving"
         calibration = getattr(self.system, "calibration", None)
         doubt = scale_doubt(record, rig, driving) or getattr(calibration, "doubt", "")
         doubt = doubt or motion_doubt(record, options.config.models.motion, driving)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
+from functools import reduce
 from inspect import cleandoc
 from textwrap import wrap
 from typing import Any
@@ -16,11 +17,12 @@ from slam.errors import UnknownNameError
 from slam.geometry.rig import StereoRig
 from slam.models import KINDS
 from slam.naming import unknown
-from slam.settings import can_be_set
+from slam.settings import can_be_set, leaves
 
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
 _UNIT = re.compile(r"\[((?:px|m|rad|s|degrees|grey levels)(?:[²³]|/s²?|/√s)*(?: / √s)?)\]")
 _RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
+_FIRST = next(iter(KINDS))
 _PARTS = ("frontend", "backend")  # sections whose settings are those of a class chosen by name
 
 
@@ -38,10 +40,12 @@ class Setting:
 def settings() -> Iterator[Setting]:
     """All that a user can set: in every run, and of each front end and back end that can be loaded."""
     configs = {kind: SystemConfig.for_kind(kind) for kind in KINDS}
-    for f in fields(SystemConfig):
-        if f.name not in _PARTS:
-            parts = {kind: getattr(config, f.name) for kind, config in configs.items()}
-            yield from (s for s in _of_class(parts, f.name) if can_be_set(s.key))
+    for key in leaves(configs[_FIRST].to_json()):
+        *path, name = key.split(".")
+        if path[0] not in _PARTS and can_be_set(key):
+            parts = {kind: reduce(getattr, path, config) for kind, config in configs.items()}
+            defaults = {kind: getattr(part, name) for kind, part in parts.items()}
+            yield Setting(key, "", defaults, *documented(type(parts[_FIRST])).get(name, ("", "")))
     for section in _PARTS:
         for name in registry.names(f"{section}s"):
             yield from _options_of(section, name)
@@ -56,18 +60,6 @@ def _options_of(section: str, name: str) -> Iterator[Setting]:
             configs = {kind: SystemConfig.for_kind(kind, name if section == "frontend" else None) for kind in KINDS}
             defaults = {kind: getattr(config, section).get(option, default) for kind, config in configs.items()}
             yield Setting(key, name, defaults, *documented(described).get(option, ("", "")))
-
-
-def _of_class(configs: dict[str, Any], section: str) -> Iterator[Setting]:
-    """Settings of one configuration class, given its instances by kind of motion."""
-    first = next(iter(configs.values()))
-    texts = documented(type(first))
-    for f in fields(first):
-        values, key = {kind: getattr(config, f.name) for kind, config in configs.items()}, f"{section}.{f.name}"
-        if is_dataclass(getattr(first, f.name)):
-            yield from _of_class(values, key)
-        else:
-            yield Setting(key, "", values, *texts.get(f.name, ("", "")))
 
 
 def listing(wanted: str | None, width: int) -> Iterator[str]:

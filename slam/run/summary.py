@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -24,7 +25,6 @@ from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
 from slam.third_party import checked, named_failures
 from slam.tracks.step import HIDDEN
-from slam.tracks.table import LandmarkTable
 
 
 @dataclass(eq=False)
@@ -47,6 +47,9 @@ class RunRecord:
     without_right: list[int] = field(default_factory=list)  # rows of frames without a right image
     depths: list[float] = field(default_factory=list)  # median of what each frame sees [m]
     bodies: set[int] = field(default_factory=set)
+    seen: Counter[int] = field(default_factory=Counter)  # number of frames in which each landmark was measured
+    last_seen: dict[int, int] = field(default_factory=dict)  # number of the last of them
+    map_size: int = 0
     repeated: int = 0  # frames with the images of the one before
     hidden: int = 0  # frames in which something moved past a standing vehicle
     rejected: int = 0
@@ -64,6 +67,10 @@ class RunRecord:
         self.hidden += result.reason == HIDDEN
         self.features.append((len(result.features), int(result.features.has_stereo.sum())))
         self.bodies.update(thing.id for thing in result.objects)
+        measured = [*(result.report.used.tolist() if result.status.measured else []), *result.added.tolist()]
+        self.seen.update(measured)
+        self.last_seen.update(dict.fromkeys(measured, number))
+        self.map_size = result.map_size
         if not result.located:
             return
         self.stamps.append(result.estimate.stamp)
@@ -90,7 +97,6 @@ class Replayed:
 
     recording: Recording
     backend: Backend
-    record: RunRecord
 
     def trajectory(self) -> Trajectory:
         """The back end's final estimate of every frame's pose."""
@@ -102,11 +108,6 @@ class Replayed:
         with named_failures("the estimate", self.backend):
             estimate: Estimate = checked(self.backend, "estimate", self.backend.estimate())
             return Rectification(self.recording.rig).estimate_out(estimate)
-
-    @property
-    def landmarks(self) -> LandmarkTable:
-        """How often, and when last, each landmark was given so far."""
-        return self.recording.landmarks(len(self.record.stamps))
 
 
 def results_of(
@@ -125,7 +126,7 @@ def results_of(
         "path_length_m": path.length,
         "speed_m_per_s": float(np.median(speeds)) if len(speeds) else None,
         "final_sigma_m": float(np.sqrt(np.trace(record.covariances[-1][3:, 3:]))),
-        "landmarks": 0 if system.landmarks is None else len(system.landmarks),
+        "landmarks": record.map_size,
         "observations": {"used": record.used, "rejected": record.rejected},
         "accuracy": {
             "online": evaluate(online, sequence),

@@ -1,6 +1,6 @@
 """Runs in the Rerun viewer: images, features, map with ellipsoids, path and objects on one time line.
 
-Rerun is an optional dependency (``pip install 'surf-stereo-slam[viewer]'``), loaded when a viewer is made.
+Rerun is an optional dependency (``pip install rerun-sdk``), loaded when a viewer is made.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Viewer:
         try:
             self.rr = import_module("rerun")
         except ImportError as error:
-            raise SlamError("the viewer needs Rerun: pip install 'surf-stereo-slam[viewer]'") from error
+            raise SlamError("the viewer needs Rerun: pip install rerun-sdk") from error
         self._target, self._rig, self._truth = target, rig, truth
         self._recording = _open(self.rr, target)
         self._stamps: list[float] = []

@@ -90,18 +90,16 @@ def compile_kernels(backend: str, frontend: str = "surf") -> None:
     paths, nowhere = os.pathsep.join(filter(None, sys.path)), subprocess.DEVNULL
     environment = {**os.environ, "PYTHONPATH": paths}
     process = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=environment)
+    compile_clock.change(1)
     try:
         if frontend == "surf":
             images = open_sequence(_IMAGES)
             create("frontends", frontend, images.rig).extract(next(iter(images)))
-        compile_clock.change(1)
-        try:
-            while process.poll() is None:
-                compile_clock.tell()
-                time.sleep(_POLL)
-        finally:
-            compile_clock.change(-1)
+        while process.poll() is None:
+            compile_clock.tell()
+            time.sleep(_POLL)
     finally:
+        compile_clock.change(-1)
         process.kill()
         process.wait()
 

@@ -23,13 +23,27 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from threading import RLock
 from types import CodeType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from slam.errors import ConfigurationError
+
+try:
+    from numba import njit
+    from numba.core import event
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
+except ValueError as error:
+    if not any(name.startswith("NUMBA_") for name in os.environ):
+        raise
+    raise ConfigurationError(f"numba cannot be loaded; one of its variables NUMBA_… is wrong: {error}") from error
+
+_LOG = logging.getLogger(__name__)
+_ROOMS = ("slam.", "frontends.", "backends.")
+_NUMPY: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is no exception
+_INNER: dict[str, Any] = {**_NUMPY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True}
 
 #: Names of NumPy's functions and methods that make arrays.
 _MAKERS = {
@@ -91,22 +105,25 @@ def _digest(file: str, module: str) -> str:
     return hashlib.sha256("".join(linecache.getlines(file, vars(sys.modules[module]))).encode()).hexdigest()
 
 
-class CompileClock:
-    """Runs while any thread compiles: the others wait for it, or for the same processor.
+class CompileClock(event.Listener):
+    """Runs while any thread compiles, of which Numba lets one at a time: the others wait for it or for the processor.
 
-    Reading the clock needs no lock. For why a block stands on the lock's own line, see `slam.runtime.threads`.
+    It says once that kernels are being compiled, and keeps the garbage collector from slowing that.
     """
 
     watch: Callable[[int, int], None] | None = None  # is told how many kernels are compiled, of how many
 
     def __init__(self) -> None:
         self._missing: list[str] = []  # files in Numba's cache that kernels of the loaded modules did not have
-        self._lock = RLock()
         self._state = 0, 0.0, 0.0  # compilations under way (they nest), since when, and the time before [s]
+        self._said = self._collects = False
 
     def change(self, by: int) -> bool:
         """A compilation begins (1) or ends (-1); whether it is the only one."""
-        with self._lock: return self._change(by, time.perf_counter())  # noqa: E701  # fmt: skip
+        (under_way, since, before), now = self._state, time.perf_counter()
+        alone = max(under_way, under_way + by) == 1
+        self._state = under_way + by, now if not under_way else since, before + (now - since if alone and by < 0 else 0)
+        return alone
 
     def seconds(self) -> float:
         """Wall time in which something was compiled [s]."""
@@ -125,36 +142,34 @@ class CompileClock:
         self.watch(sum(map(os.path.exists, self._missing)), max(1, len(self._missing)))
         return True
 
-    def _change(self, by: int, now: float) -> bool:
-        under_way, since, before = self._state
-        alone = max(under_way, under_way + by) == 1
-        self._state = under_way + by, now if not under_way else since, before + (now - since if alone and by < 0 else 0)
-        return alone
+    def on_start(self, event: Any) -> None:
+        """Numba begins to compile a function."""
+        if _is_own(event) and self.change(1):
+            if not self.tell() and not self._said:
+                _LOG.warning("compiling kernels, once on this machine; `slam warm-up` does it beforehand")
+            self._said, self._collects = True, gc.isenabled()
+            gc.disable()
+
+    def on_end(self, event: Any) -> None:
+        """Numba has compiled a function."""
+        if _is_own(event) and self.change(-1) and self._collects:
+            gc.enable()
+
+
+def _is_own(event: Any) -> bool:
+    """A compilation of a kernel or helper of this project?"""
+    function = getattr(event.data["dispatcher"], "py_func", None)
+    return getattr(function, "__module__", "").startswith(_ROOMS)
 
 
 #: Of this process.
 compile_clock = CompileClock()
+event.register("numba:compile", compile_clock)
 
 
 def working_time() -> float:
     """A clock that stands still while kernels are compiled [s]."""
     return time.perf_counter() - compile_clock.seconds()
-
-
-try:
-    from numba import njit
-    from numba.core import event
-    from numba.core.codegen import JITCodeLibrary
-    from numba.core.compiler import Compiler
-except ValueError as error:
-    if not any(name.startswith("NUMBA_") for name in os.environ):
-        raise
-    raise ConfigurationError(f"numba cannot be loaded; one of its variables NUMBA_… is wrong: {error}") from error
-
-_LOG = logging.getLogger(__name__)
-_ROOMS = ("slam.", "frontends.", "backends.")
-_NUMPY: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is no exception
-_INNER: dict[str, Any] = {**_NUMPY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True}
 
 
 class _Inlined(JITCodeLibrary):
@@ -220,36 +235,6 @@ def kernel(function: Callable[..., Any]) -> Any:
     except (RuntimeError, AttributeError) as error:
         _LOG.warning("set NUMBA_CACHE_DIR to a folder, or the kernels are compiled in every run: %s", error)
         return njit(**options)(function)
-
-
-class _Notice(event.Listener):
-    """Says that kernels are being compiled, takes the time, and keeps the garbage collector from slowing it."""
-
-    def __init__(self) -> None:
-        self._said = False
-        self._collects = False
-
-    def on_start(self, event: Any) -> None:
-        if not (_is_own(event) and compile_clock.change(1)):
-            return
-        if not compile_clock.tell() and not self._said:
-            _LOG.warning("compiling kernels, once on this machine; `slam warm-up` does it beforehand")
-        self._said = True
-        self._collects = gc.isenabled()
-        gc.disable()
-
-    def on_end(self, event: Any) -> None:
-        if _is_own(event) and compile_clock.change(-1) and self._collects:
-            gc.enable()
-
-
-def _is_own(event: Any) -> bool:
-    """A compilation of a kernel or helper of this project?"""
-    function = getattr(event.data["dispatcher"], "py_func", None)
-    return getattr(function, "__module__", "").startswith(_ROOMS)
-
-
-event.register("numba:compile", _Notice())
 
 
 class Stages:

@@ -6,41 +6,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
-from importlib import import_module
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import quote
 
-from slam.errors import ConfigurationError, SequenceError, UnknownNameError
-from slam.files import expanded, note_input, reason
-from slam.naming import unknown
-from slam.sequences import hints
-from slam.sequences.base import RecordedSequence, Sequence, is_live, read_masks, turned
-from slam.sequences.captures import VIDEO_SUFFIXES
-from slam.sequences.faults import FaultLog
+from slam.errors import ConfigurationError, SequenceError, SlamError, UnknownNameError
+from slam.files import expanded, note_input, read_object, reason
+from slam.naming import nearest, unknown
+from slam.sequences import euroc, folders, kitti, ros
+from slam.sequences.base import FaultLog, RecordedSequence, Sequence, is_live, read_masks, say, turned
+from slam.sequences.folders import VIDEO_SUFFIXES
+from slam.sequences.images import IMAGE_SUFFIXES
 from slam.sequences.options import RECORDED, Options, read_options
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
-_PACKED = (".zip", ".7z", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4")  # files of one or more others
+#: What to do with files that are no sequence, by their endings.
+_HINTS = {
+    **dict.fromkeys((".zip", ".7z", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4"), "unpack it first"),
+    **dict.fromkeys((".svo", ".svo2"), "export it as a video of both images side by side"),
+    **dict.fromkeys(IMAGE_SUFFIXES, "give the folder that holds both cameras' images"),
+}
+_LOOKED_AT = 500  # entries below a folder that is no sequence, at each of so many levels
+_LEVELS = 4
+_LISTED = 6  # sequences below a folder
 
-#: Formats on disk, in the order in which they are tried: module, the end of its functions' names, and description.
+
+class _Format(NamedTuple):
+    """A format on disk."""
+
+    matches: Callable[[Path], bool]  # whether a folder or file looks like it
+    open: Callable[[Path, Options, FaultLog], RecordedSequence]
+    description: str
+
+
+#: In the order in which they are tried.
 _FORMATS = {
-    "ros": ("ros", "folder", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
-    "euroc": ("euroc", "folder", "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
-    "kitti-raw": ("kitti", "drive", "KITTI raw drives: image_00/data, image_01/data"),
-    "kitti": ("kitti", "folder", "KITTI odometry sequences: image_0, image_1, calib.txt"),
-    "folders": (
-        "folders", "folder", "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
+    "ros": _Format(
+        ros.matches_folder, ros.open_folder, "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"
     ),
-}  # fmt: skip
+    "euroc": _Format(euroc.matches_folder, euroc.open_folder, "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
+    "kitti-raw": _Format(kitti.matches_drive, kitti.open_folder, "KITTI raw drives: image_00/data, image_01/data"),
+    "kitti": _Format(kitti.matches_folder, kitti.open_folder, "KITTI odometry sequences: image_0, image_1, calib.txt"),
+    "folders": _Format(
+        folders.matches_folder,
+        folders.open_folder,
+        "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
+    ),
+}
 
 
 def formats() -> dict[str, str]:
     """Names of the formats with a line on each."""
-    known = {name: description for name, (*_, description) in _FORMATS.items()}
     camera = "live cameras: camera:0 (both images side by side), camera:0,1, or addresses"
-    return {**known, "camera": camera, "synthetic": "built-in worlds: synthetic:NAME?key=value&key=value"}
+    worlds = "built-in worlds: synthetic:NAME?key=value&key=value"
+    return {name: known.description for name, known in _FORMATS.items()} | {"camera": camera, "synthetic": worlds}
 
 
 def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
@@ -82,22 +106,22 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
     if not mark or _exists(text):
         name, query = text, ""
     folder = expanded(name).absolute()
-    like = _format(folder, query, text)
+    like = _format_asked(folder, query, text)
     name = format or like or ""
     if not name:
-        hint = hints.sequences_near(folder, _format_of)
-        raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
+        raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){_hint_near(folder)}")
     if name not in _FORMATS:
         raise UnknownNameError(unknown("format", name, formats()))
-    module = _module(name)
-    options = Options(query, name, RECORDED | getattr(module, "OPTIONS", frozenset()))
+    options = Options(query, name, RECORDED)
     note_input(folder)
     lines: list[str] = []
-    with FaultLog(lines, at_the_end=True) as faults:
-        found: RecordedSequence = getattr(module, f"open_{_FORMATS[name][1]}")(folder, options, faults)
+    with FaultLog(lines, quiet=True) as faults:  # above an error nothing is said
+        found = _FORMATS[name].open(folder, options, faults)
         masks = read_masks(options.get("mask"), folder if folder.is_dir() else folder.parent, found.rig)
         swap = options.get("swap", False)
         options.require_read(f"{folder} is read as {name}")
+    for line in lines:
+        say(line)
     truth = turned(found.ground_truth, found.rig)
     return replace(found, ground_truth=truth, masks=masks, swap=swap, warnings=lines)
 
@@ -133,36 +157,69 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _format(folder: Path, query: str, text: str) -> str | None:
-    """The first format that a folder looks like; told where left and right are, it needs not look.
+def _format_of(folder: Path) -> str | None:
+    """The first format that a folder or file looks like; None for no sequence."""
+    return next((name for name, known in _FORMATS.items() if known.matches(folder)), None)
 
-    What is neither a folder with something in it nor a recording is refused; `text` is what was asked for.
-    """
+
+def _format_asked(folder: Path, query: str, text: str) -> str | None:
+    """The first format that a folder looks like; what is neither a recording nor a folder of something is refused."""
     named = read_options(query).keys()
-    if _matches("ros", folder):
+    if ros.matches_folder(folder):
         return "ros"
     if not folder.exists():
         what = "file or folder" if folder.suffix else "folder"
-        raise SequenceError(f"{folder}: there is no such {what}{hints.near_name(folder, text)}")
+        raise SequenceError(f"{folder}: there is no such {what}{_hint_name(folder, text)}")
     if not folder.is_dir() and "layout" not in named:
-        film = folder.suffix.lower() in VIDEO_SUFFIXES
-        hint = "; unpack it first" if folder.suffix.lower() in _PACKED else hints.of_run(folder.parent)
-        if film:
-            hint = f"; a video with both images side by side is {folder}?layout=sbs, two are {folder.parent}"
-        raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}{'?left=…&right=…' * film}")
+        ending = folder.suffix.lower()
+        hint = f"; {_HINTS[ending]}" if ending in _HINTS else _hint_run(folder.parent)
+        if ending in VIDEO_SUFFIXES:
+            two = f"two are {folder.parent}?left=…&right=…"
+            hint = f"; a video with both images side by side is {folder}?layout=sbs, {two}"
+        raise SequenceError(f"{folder}: a file where the sequence's folder should be{hint}")
     if folder.is_dir() and not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")
     return "folders" if named & {"left", "right", "layout"} else _format_of(folder)
 
 
-def _format_of(folder: Path) -> str | None:
-    """The first format that a folder or file looks like; None for no sequence."""
-    return next((name for name in _FORMATS if _matches(name, folder)), None)
+def _hint_name(folder: Path, text: str) -> str:
+    """A world with a similar name, or the part of the path that is missing first; `text` was asked for."""
+    from slam import worlds
+
+    name, mark, query = text.partition("?")
+    near = None if Path(name).name != name else nearest(name, worlds.names())
+    if near:
+        return f" (did you mean 'synthetic:{near}{mark}{query}'?)"
+    there = next((parent for parent in folder.parents if parent.is_dir()), folder.parent)
+    return "" if there == folder.parent else f": {there} has no {folder.relative_to(there).parts[0]!r}"
 
 
-def _module(name: str) -> object:
-    return import_module(f"slam.sequences.{_FORMATS[name][0]}")
+def _hint_run(folder: Path) -> str:
+    """What a folder that a run left was a run of, and what shows it."""
+    with suppress(SlamError):
+        if (folder / "frames.csv").is_file():
+            source = read_object(folder / "config.json").get("source") or "something"
+            return f"; it is what a run of {source} left: give that, or look at the run with `slam view {folder}`"
+    return ""
 
 
-def _matches(name: str, folder: Path) -> bool:
-    return bool(getattr(_module(name), f"matches_{_FORMATS[name][1]}")(folder))
+def _hint_near(folder: Path) -> str:
+    """Which sequences lie below a folder, or it is a part of; else how to name the two cameras in it."""
+    if run := _hint_run(folder):
+        return run
+    with suppress(OSError, SequenceError):
+        for level in range(1, _LEVELS + 1):  # 2011_09_26/…_sync, dataset/sequences/03
+            inside = islice(folder.glob("/".join("*" * level)), _LOOKED_AT)
+            below = sorted(str(path.relative_to(folder)) for path in inside if _format_of(path))
+            if len(below) == 1:
+                return f"; below it is {below[0]}: give that"
+            if below:
+                more = f", … ({len(below)})" if len(below) > _LISTED else ""
+                return f"; below it are {', '.join(below[:_LISTED])}{more}: give one of them"
+    images = any(path.suffix.lower() in IMAGE_SUFFIXES for path in islice(folder.iterdir(), _LOOKED_AT))
+    for parent in islice(folder.parents, _LEVELS):  # mav0/cam0/data
+        if (name := _format_of(parent)) is not None and (images or name != "folders"):
+            return f"; it is a part of one: give {parent} (format {name})"
+    if images:
+        return f"; where each image holds both cameras: '{folder.name}?layout=sbs'; else name both: ?left=…&right=…"
+    return f"; where two cameras are in it by other names: '{folder.name}?left=…&right=…'"

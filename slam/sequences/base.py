@@ -1,25 +1,29 @@
-"""What a sequence is, and the one class behind all recorded ones."""
+"""What a sequence is, the one class behind all recorded ones, and the log of their faults."""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
-from contextlib import closing
-from dataclasses import dataclass, field, replace
+import logging
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from slam.data import StereoFrame
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import ConfigurationError, SequenceError, one_line
 from slam.files import expanded
 from slam.geometry.rig import StereoRig, quarter_turn
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range, require_frame
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.naming import sequence_line
-from slam.sequences.faults import FaultLog
-from slam.sequences.images import halves, read_image, recorded_size, size_text
+from slam.sequences.images import both, read_image, recorded_size, size_text
+
+logger = logging.getLogger("slam.sequences")
 
 
 @runtime_checkable
@@ -33,32 +37,26 @@ class Sequence(Protocol):
     @property
     def name(self) -> str:
         """Short name, for reports and file names."""
-        ...
 
     @property
     def format(self) -> str:
         """Name of the format, see `slam.sequences.formats`."""
-        ...
 
     @property
     def rig(self) -> StereoRig:
         """The two cameras that took the images."""
-        ...
 
     @property
     def kind(self) -> str:
         """Kind of motion, ``"driving"`` or ``"handheld"``: which `slam.models.KINDS` suits."""
-        ...
 
     @property
     def ground_truth(self) -> Trajectory | None:
         """The left camera's true path ``T_world_left`` at the stamps that the format has; None where it has none."""
-        ...
 
     @property
     def warnings(self) -> list[str]:
         """What was found wrong so far, one line each; what iterating finds is added."""
-        ...
 
     def __len__(self) -> int: ...
 
@@ -78,27 +76,80 @@ def is_live(frames: object) -> bool:
     return bool(getattr(frames, "live", False))
 
 
+#: So many faults of one kind are reported one by one; the others are counted.
+_LINES_PER_KIND = 5
+
+_silent: ContextVar[bool] = ContextVar("whether lines are kept, but not logged", default=False)
+
+
+@contextmanager
+def said_before() -> Iterator[None]:
+    """For opening a sequence once more: what its files lack was logged the first time, and is only kept."""
+    token = _silent.set(True)
+    try:
+        yield
+    finally:
+        _silent.reset(token)
+
+
+def say(line: str) -> None:
+    """Log a fault, unless it was said before."""
+    if not _silent.get():
+        logger.warning("%s", line)
+
+
+class FaultLog:
+    """Keeps faults in `lines`, one each, and says them unless it is `quiet`; a context manager.
+
+    The first few faults of a kind get a line each; the number of the others is reported when the log is closed. A line
+    that is known already (a second pass over the same sequence) is said again, but kept once.
+    """
+
+    def __init__(self, lines: list[str], quiet: bool = False) -> None:
+        self._lines, self._quiet = lines, quiet
+        self._counts: Counter[str] = Counter()
+
+    def report(self, kind: str, line: str) -> None:
+        """Report one fault; faults of the same `kind` are counted together."""
+        self._counts[kind] += 1
+        if self._counts[kind] <= _LINES_PER_KIND:
+            self._keep(line)
+
+    def _keep(self, line: str) -> None:
+        line = one_line(line)
+        if line not in self._lines:
+            self._lines.append(line)
+        if not self._quiet:
+            say(line)
+
+    def __enter__(self) -> FaultLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for what, count in self._counts.items():
+            if count > _LINES_PER_KIND:
+                self._keep(f"{what}: {count} in all, {count - _LINES_PER_KIND} not listed")
+
+
 #: An image as it was read, or why it could not be; None where there is none.
 Image = np.ndarray | SequenceError | None
 
 #: The left and the right image of each frame, or one that holds both, side by side.
 Images = Generator[tuple[Image, ...], None, None]
 
+#: Decodes the images of frames from one number up to another; they may end early, with a fault.
+Decoder = Callable[[int, int, FaultLog], Images]
+
 #: Of the left and the right camera (H, W) bool, False where the image is not to be used; None for all of it.
 Masks = tuple[np.ndarray | None, np.ndarray | None]
 
 
-class FrameSource(Protocol):
-    """Where a recorded sequence's images come from."""
-
-    @property
-    def stamps(self) -> Array:
-        """Times of the frames (N,) [s], strictly increasing."""
-        ...
-
-    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
-        """Decode the images of frames `start` to `stop`; they may end early, with a fault."""
-        ...
+def attempt(read: Callable[..., np.ndarray], *arguments: Any) -> np.ndarray | SequenceError:
+    """The image that a call gives, or why it gives none."""
+    try:
+        return read(*arguments)
+    except SequenceError as error:
+        return error
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,20 +160,16 @@ class RecordedSequence:
     format: str
     kind: str
     rig: StereoRig
-    source: FrameSource  # where the images come from
+    stamps: Array  # times of the listed frames (N,) [s], strictly increasing
+    decode: Decoder
     ground_truth: Trajectory | None = None
     truth_noise: TruthNoise = field(default_factory=TruthNoise)  # how well the ground truth is known
     warnings: list[str] = field(default_factory=list)
     masks: Masks = (None, None)  # where the images of both cameras may be used
-    swap: bool = False  # what the source gives as left is the right camera's
-
-    @property
-    def stamps(self) -> Array:
-        """Times of the listed frames (N,) [s]."""
-        return self.source.stamps
+    swap: bool = False  # what is decoded as left is the right camera's
 
     def __len__(self) -> int:
-        return len(self.source.stamps)
+        return len(self.stamps)
 
     def __iter__(self) -> Iterator[StereoFrame]:
         return self.frames()
@@ -148,25 +195,21 @@ class RecordedSequence:
     __getitem__ = frame
 
     def _read(self, start: int, stop: int) -> Iterator[StereoFrame]:
-        """Decode lazily and sum up repeated faults at the end, also where the caller stops early.
-
-        A left image that cannot be read costs the frame, a right one itself.
-        """
-        with FaultLog(self.warnings) as faults, closing(self.source.images(start, stop, faults)) as images:
-            for index, (left, *other) in zip(range(start, stop), images):
-                right = other[0] if other else None
-                if not other and isinstance(left, np.ndarray):
-                    left, right = halves(left, self.name)
+        """Decode lazily; a left image that cannot be read costs the frame, a right one itself."""
+        with FaultLog(self.warnings) as faults, closing(self.decode(start, stop, faults)) as images:
+            for index, found in zip(range(start, stop), images):
+                left, right = both(found, self.name)
                 if self.swap:
                     left, right = right, left
-                if isinstance(right, SequenceError) and not isinstance(left, SequenceError):
-                    line = f"frame {index} is given without its right image: {right}"
-                    faults.report("right images unreadable, frames given without them", line)
                 if isinstance(left, SequenceError):
                     faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {left}")
-                elif left is not None:
-                    right = right if isinstance(right, np.ndarray) else None
-                    yield as_used(StereoFrame(index, float(self.stamps[index]), left, right), self.rig, self.masks)
+                    continue
+                if isinstance(right, SequenceError):
+                    line = f"frame {index} is given without its right image: {right}"
+                    faults.report("right images unreadable, frames given without them", line)
+                    right = None
+                if left is not None:
+                    yield as_used(index, float(self.stamps[index]), left, right, self.rig, self.masks)
 
 
 def turned(truth: Trajectory | None, rig: StereoRig) -> Trajectory | None:
@@ -178,36 +221,38 @@ def turned(truth: Trajectory | None, rig: StereoRig) -> Trajectory | None:
     return Trajectory(truth.stamps, truth.poses @ Q)
 
 
-def as_used(frame: StereoFrame, rig: StereoRig, masks: Masks) -> StereoFrame:
-    """A frame as recorded, turned as the rig is, with the masks of both cameras."""
+def as_used(
+    index: int, stamp: float, left: np.ndarray, right: np.ndarray | None, rig: StereoRig, masks: Masks
+) -> StereoFrame:
+    """A frame of images as recorded, turned as the rig is, with the masks of both cameras."""
     if rig.turns:
-        right = None if frame.right is None else np.ascontiguousarray(np.rot90(frame.right, rig.turns))
-        frame = replace(frame, left=np.ascontiguousarray(np.rot90(frame.left, rig.turns)), right=right)
-    none = masks[0] is None and masks[1] is None
-    return frame if none else replace(frame, left_mask=masks[0], right_mask=masks[1])
+        left = np.ascontiguousarray(np.rot90(left, rig.turns))
+        right = None if right is None else np.ascontiguousarray(np.rot90(right, rig.turns))
+    return StereoFrame(index, stamp, left, right, *masks)
 
 
 def read_masks(text: str | None, folder: Path, rig: StereoRig) -> Masks:
-    """The masks by the option ``mask``: one image for both cameras, or two joined by a comma, one perhaps empty.
-
-    Masks are of the images as recorded, before they are turned; names are relative to `folder`. SequenceError where one
-    cannot be read, ConfigurationError where it is of another size than the images, or covers all of them.
-    """
+    """The masks by the option ``mask``: an image, as recorded, for both cameras, or two joined by a comma."""
     if text is None:
         return None, None
     names = text.split(",")
     if len(names) > 2 or not any(names):
         raise ConfigurationError(f"mask must be one image, or two joined by a comma, got {text!r}")
-    masks: list[np.ndarray | None] = [None] * len(names)
-    for at, path in ((at, folder / expanded(name)) for at, name in enumerate(names) if name):
-        try:
-            mask = np.rot90(read_image(path) > 0, rig.turns)
-        except SequenceError as error:
-            raise SequenceError(f"mask: {error}") from error
-        if mask.shape != (rig.height, rig.width):
-            size = size_text(recorded_size(rig))
-            raise ConfigurationError(f"mask {path}: images are {size}, the mask is of another size")
-        if not mask.any():
-            raise ConfigurationError(f"mask {path}: it is black all over, so that nothing is left of the images")
-        masks[at] = mask
-    return masks[0], masks[-1]
+    return _mask(names[0], folder, rig), _mask(names[-1], folder, rig)
+
+
+def _mask(name: str, folder: Path, rig: StereoRig) -> np.ndarray | None:
+    if not name:
+        return None
+    path = folder / expanded(name)
+    try:
+        mask = np.rot90(read_image(path) > 0, rig.turns)
+    except SequenceError as error:
+        raise SequenceError(f"mask: {error}") from error
+    if mask.shape != (rig.height, rig.width):
+        raise ConfigurationError(
+            f"mask {path}: images are {size_text(recorded_size(rig))}, the mask is of another size"
+        )
+    if not mask.any():
+        raise ConfigurationError(f"mask {path}: it is black all over, so that nothing is left of the images")
+    return mask

@@ -39,7 +39,8 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
     "width": ("imagewidth", "width", "cols"),
     "height": ("imageheight", "height", "rows"),
     "size": ("imagesize", "size", "imgsize", "resolution"),
-    "baseline": ("baseline", "base", "baselinem", "stereob"),
+    "unit": ("unit", "units"),
+    "baseline": ("baseline", "base", "baselinem", "stereob", "b"),
     "bf": ("bf", "focalxbaseline"),
     "fx": ("fx", "f", "focal", "focallength", "fxpx"),
     "fy": ("fy", "f", "focal", "focallength", "fypx"),
@@ -53,31 +54,19 @@ _GROUPS = ("stereorectifier", "extrinsics", "extrinsic", "intrinsics", "intrinsi
 _OF_ONE = ("tbs", "cameramatrix", "projectionmatrix", "p")  # names that a file of one camera has
 _FROM_ZERO = ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx")  # one of these: cameras are counted from 0
 
-#: Whose a form is: entries that only it has, and what a complete file of it holds.
+#: Whose a form is: entries that only it has.
 _FORMS = {
-    "Kalibr's": (
-        ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel", "cam1cameramodel"),
-        "cam0 and cam1, each with intrinsics and resolution, and T_cn_cnm1 in cam1",
-    ),
-    "EuRoC's": (("lefttbs",), "intrinsics, resolution and T_BS, in two files"),
-    "ROS's": (("leftcameramatrix", "leftp"), "camera_matrix, rectification_matrix and projection_matrix, in two files"),
-    "ORB-SLAM's": (
-        ("camerabf", "stereotc1c2", "stereob", "camera1fx"),
-        "Camera.bf for rectified images, LEFT.K … and RIGHT.K …, or Camera1.fx …, Camera2.fx … and Stereo.T_c1_c2",
-    ),
-    "stella_vslam's": (("camerafocalxbaseline",), "Camera.fx … and Camera.focal_x_baseline"),
-    "VINS-Fusion's": (("bodytcam0",), "cam0_calib and cam1_calib, files that are there, body_T_cam0 and body_T_cam1"),
-    "Basalt's": (("value0intrinsics",), "other entries than are read here: write it in another form"),
-    "MATLAB's": (
-        ("cameraparameters1intrinsicmatrix", "cameraparameters1k"),
-        "matrices that are transposed, and lengths in mm: write it in another form",
-    ),
+    "Kalibr's": ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel", "cam1cameramodel"),
+    "EuRoC's": ("lefttbs",),
+    "ROS's": ("leftcameramatrix", "leftp"),
+    "ORB-SLAM's": ("camerabf", "stereotc1c2", "stereob", "camera1fx"),
+    "stella_vslam's": ("camerafocalxbaseline",),
+    "VINS-Fusion's": ("bodytcam0",),
 }
 _COMPLETE = "K1, D1, K2, D2, R and T; one of rectified images P1 and P2, or fx, fy, cx, cy and baseline"
 
 _ZED_SIZES = {"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200), "HD": (1280, 720), "SVGA": (960, 600),
               "VGA": (672, 376)}  # fmt: skip
-_KITTI = re.compile(r"^(P|P_rect_0)0[: ]", re.MULTILINE)
 _NO_TEXT = (".npz", ".npy", ".pkl", ".mat")  # of NumPy, Python and MATLAB
 _DEEPEST = 32  # of nested entries
 _MOST = 1e9  # numbers of a calibration are smaller than this; larger ones overflow in what is made of them
@@ -96,10 +85,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
-    """A finite array of the shape, flat where that is None; CalibrationError where it is missing, none, or too large.
-
-    Numbers may be texts. OpenCV's matrices are ``{rows, cols, data}``.
-    """
+    """A finite array of the shape, flat where that is None, of numbers, texts or OpenCV's ``{rows, cols, data}``."""
     if value is None:
         raise CalibrationError(f"{name} is missing")
     data = value.get("data") if isinstance(value, Mapping) else value
@@ -128,7 +114,7 @@ class Entries:
         single = len(files) == 2 and any(all(n in f for f in files) for n in _OF_ONE)
         for side, file in zip(("left", "right"), files):
             self._values |= {(side + name if single else name): entry for name, entry in file.items()}
-        found = (known for known, (names, _) in _FORMS.items() if any(name in self._values for name in names))
+        found = (known for known, names in _FORMS.items() if any(name in self._values for name in names))
         self.form = form or next(found, "")
         counts = ("0", "1") if any(name in self._values for name in _FROM_ZERO) else ("1", "2")
         self._sides = [
@@ -158,24 +144,17 @@ class Entries:
         return float(array(value, name, ())[()])
 
     def incomplete(self, missing: Sequence[str]) -> CalibrationError:
-        """The error where roles are missing, in the words of the form; all entries are named as they are written."""
-        there = f"in it: {', '.join(sorted(name for name, _ in self._values.values())) or 'nothing'}"
-        if self.form in _FORMS:
-            return CalibrationError(f"it looks like {self.form}, which has {_FORMS[self.form][1]}; {there}")
+        """The error where roles are missing; all entries are named as they are written."""
+        there = ", ".join(sorted(name for name, _ in self._values.values())) or "nothing"
+        whose = f"it looks like {self.form}, but " if self.form else ""
         one = " (it is one camera's: name both files, calibration=LEFT,RIGHT)" * ("cameramatrix" in self._values)
-        verb = "is" if len(missing) == 1 else "are"
-        return CalibrationError(
-            f"{', '.join(missing)} {verb} missing{one}; {there}. A stereo calibration has {_COMPLETE}"
-        )
+        lacks = f"{whose}{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing{one}"
+        return CalibrationError(f"{lacks}; in it: {there}. A stereo calibration has {_COMPLETE}")
 
 
-def read_entries(paths: Sequence[Path], images: Size | None) -> Entries:
-    """The entries of one file or two, read by the XML, INI and YAML libraries: OpenCV's reader can crash.
-
-    The size of the images, where it is known, chooses one of several resolutions. CalibrationError where a file is
-    missing or unreadable.
-    """
-    read = [_read(path, images) for path in paths]
+def read_entries(paths: Sequence[Path], images: Size | None, cameras: tuple[str, str] = ("0", "1")) -> Entries:
+    """The entries of one file or two; the images' size chooses one of a ZED's resolutions, `cameras` two of KITTI's."""
+    read = [_read(path, images, cameras) for path in paths]
     return Entries([dict(_flat(root, "", "")) for root, _ in read], read[0][1] if len(read) == 1 else "")
 
 
@@ -194,19 +173,20 @@ def plain_name(name: Any) -> str:
     return "".join(filter(str.isalnum, str(name).lower()))
 
 
-def _read(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
+def _read(path: Path, images: Size | None, cameras: tuple[str, str]) -> tuple[Mapping[str, Any], str]:
     """What a file holds, and whose form it is where its entries do not tell; CalibrationError where it is no rig's."""
     if path.suffix.lower() in _NO_TEXT:
         raise CalibrationError(f"{path}: no text: write K1, D1, K2, D2, R and T with cv2.FileStorage (docs/guide.md)")
     text = _text(path).strip()
+    if kitti := re.search(r"^(P|P_rect_0)\d[: ]+[^!\[\s]", text, re.MULTILINE):
+        rows = read_kitti(path)
+        P = {f"P{side}": rows.get(f"{kitti[1]}{camera}") for side, camera in enumerate(cameras)}
+        return P | {"size": rows.get(f"S_rect_0{cameras[0]}")}, "KITTI's"
     with naming(path):
         if text.startswith("<"):
             return _read_xml(text), ""
         if text.startswith("[") and "[STEREO]" in text.upper():
             return _read_zed(text, images), "ZED's"
-    if kitti := _KITTI.search(text):
-        rows = read_kitti(path)
-        return {f"P{i}": rows.get(f"{kitti[1]}{i}") for i in (0, 1)} | {"size": rows.get("S_rect_00")}, "KITTI's"
     root = read_yaml(path)
     with naming(path):
         if {"evidence", "residual_scale", "self_calibration"} & set(root):
@@ -214,9 +194,9 @@ def _read(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
             raise CalibrationError(what)
         if "cameraData" in root:
             return _read_depthai(root), "depthai's"
-    cameras = {side: path.parent / str(root.get(f"cam{at}_calib", "")) for at, side in enumerate(("left", "right"))}
-    if all(file.is_file() for file in cameras.values()):  # VINS-Fusion's, with a file for each camera
-        return {**root, **{side: read_yaml(file) for side, file in cameras.items()}}, ""
+    files = [path.parent / str(root.get(f"cam{side}_calib", "")) for side in (0, 1)]
+    if all(file.is_file() for file in files):  # VINS-Fusion's, with a file for each camera
+        root = {**root, "left": read_yaml(files[0]), "right": read_yaml(files[1])}
     return root, ""
 
 
@@ -225,11 +205,6 @@ def _text(path: Path) -> str:
     if not path.exists():
         raise CalibrationError(f"{path}: the calibration is missing")
     return read_text(path, _LIMIT, CalibrationError)
-
-
-def is_kitti(path: Path) -> bool:
-    """Whether a file is of KITTI's form; CalibrationError where it cannot be read."""
-    return _KITTI.search(_text(path)) is not None
 
 
 def read_kitti(path: Path) -> dict[str, Array]:
@@ -247,10 +222,7 @@ def read_kitti(path: Path) -> dict[str, Array]:
 
 
 def read_yaml(path: Path) -> Mapping[str, Any]:
-    """The mapping in a YAML (or JSON) file, all values as texts; CalibrationError where there is none, or too much.
-
-    OpenCV's dialect has ``%YAML:1.0`` in its first line, ``.Nan`` and ``.Inf``, and a mark on matrices.
-    """
+    """The mapping in a YAML (or JSON) file, all values as texts; also OpenCV's dialect: ``%YAML:1.0``, ``.Nan``."""
     import yaml
 
     text = _text(path)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +15,8 @@ from slam.data import StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.files import expanded
 from slam.geometry.trajectory import Trajectory
-from slam.sequences import captures as devices
-from slam.sequences.base import as_used, read_masks
-from slam.sequences.faults import FaultLog
-from slam.sequences.images import halves, recorded_size, require_same_size, size_text
+from slam.sequences.base import FaultLog, as_used, read_masks
+from slam.sequences.images import both, grabbed_image, quiet_libraries, recorded_size, require_same_size, size_text
 from slam.sequences.options import CALIBRATION, Options, read_options
 from slam.sequences.rigs import calibration_files, read_rig
 
@@ -27,9 +26,9 @@ OPTIONS = CALIBRATION | {"left", "right", "width", "height", "fps", "wait"}
 WAIT = 10.0
 
 _AGAIN = 0.25  # [s] between two attempts to get an image
+_TIMEOUT = 5000  # [ms] for an answer from the network
 
 Pair = tuple[float, np.ndarray, np.ndarray]  # stamp [s], left and right image
-T = TypeVar("T")
 
 
 def open_camera(text: str) -> CameraSequence:
@@ -47,8 +46,8 @@ class CameraSequence:
     again and again for a while; one that stays silent ends the sequence with an error. `frames` opens it anew: images
     that waited in a queue until then are old.
 
-    Its text is the address, or two joined by a comma, see `slam.sequences.captures.open_device`; empty where the
-    options ``left`` and ``right`` name them.
+    Its text is the address, or two joined by a comma, see `open_device`; empty where the options ``left`` and ``right``
+    name them.
 
     Raises:
         SequenceError: a camera cannot be opened, gives no image, or one of another size than the calibration is for.
@@ -70,27 +69,24 @@ class CameraSequence:
             hint = "name one device with both images side by side (camera:0), or two (camera:0,1)"
             raise ConfigurationError(f"camera: {hint}")
         addresses = [a if a.isdecimal() or "!" in a or "://" in a else str(expanded(a)) for a in addresses]
-        self.name = "camera:" + ",".join(devices.without_password(a) for a in addresses)
+        self.name = "camera:" + ",".join(without_password(a) for a in addresses)
         self.kind = options.get("kind", "handheld")
         self.warnings: list[str] = []
         self._addresses, self._swap = addresses, options.get("swap", False)
         self._wanted = [options.get(name) for name in ("width", "height", "fps")]
         self._wait = options.get("wait", WAIT)
         self._origin = time.time() - time.monotonic()  # since 1970 when the monotonic clock was zero [s]
-        opened = self._open()
+        devices = self._open()
         try:
-            missing = f"{self.name}: there is no calibration.yaml or the like in {Path.cwd()}"
-            missing += f"; name the file: '{self.name}?calibration=FILE'"
-            paths = calibration_files(Path.cwd(), options, missing)
-            silent = "it is open, but gives no images"
-            _, left, _ = self._waited(lambda: self._read(opened), silent)  # some take a moment
+            paths = calibration_files(Path.cwd(), options)
+            _, left, _ = self._waited_for(devices, "it is open, but gives no images")  # some take a moment
             self.rig = read_rig(paths, (left.shape[1], left.shape[0]), options)
             self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
         except SequenceError as error:
             hint = "; ask the camera for another size with width=… and height=…" if "images are" in str(error) else ""
             raise SequenceError(f"{self.name}: {str(error).removeprefix(f'{self.name}: ')}{hint}") from None
         finally:
-            _release(opened)
+            _release(devices)
 
     def __len__(self) -> int:
         raise TypeError(f"{self.name}: a camera has no number of frames")
@@ -105,77 +101,114 @@ class CameraSequence:
         return self._frames(start, stop)
 
     def _frames(self, start: int, stop: int | None) -> Iterator[StereoFrame]:
-        opened, index, last, expected = self._open(), 0, -math.inf, recorded_size(self.rig)
+        devices, index, last, expected = self._open(), 0, -math.inf, recorded_size(self.rig)
         try:
             with FaultLog(self.warnings) as faults:
                 while stop is None or index < stop:
-                    pair = self._read(opened)
+                    pair = self._read(devices)
                     if pair is None:
-                        _release(opened)
                         began = time.monotonic()
                         faults.report("silent", f"{self.name}: no more frames; they are waited for {self._wait:g} s")
-                        opened, pair = self._waited(self._again, f"no frames for {self._wait:g} s (see wait=…)")
+                        pair = self._waited_for(devices, f"no frames for {self._wait:g} s (see wait=…)", anew=True)
                         faults.report("back", f"{self.name}: frames again after {time.monotonic() - began:.1f} s")
-                    if pair[1].shape[::-1] != expected:  # as of one that was opened again
-                        now = f"images are {size_text(pair[1].shape[::-1])} now"
+                    stamp, left, right = pair
+                    if left.shape[::-1] != expected:  # as of one that was opened again
                         was = f"they were {size_text(expected)}, as in the calibration"
-                        raise SequenceError(f"{self.name}: {now}; {was}")
-                    if pair[0] > last:  # the clock of the machine may have been set back
-                        last = pair[0]
+                        raise SequenceError(f"{self.name}: images are {size_text(left.shape[::-1])} now; {was}")
+                    if stamp > last:  # the clock of the machine may have been set back
+                        last = stamp
                         if index >= start:
-                            yield as_used(StereoFrame(index, *pair), self.rig, self._masks)
+                            yield as_used(index, stamp, left, right, self.rig, self._masks)
                         index += 1
         finally:
-            _release(opened)
+            _release(devices)
 
-    def _waited(self, attempt: Callable[[], T | None], silent: str) -> T:
-        """What an attempt gives in the end; raises SequenceError where it gives nothing for so long."""
+    def _waited_for(self, devices: list[Any], silent: str, anew: bool = False) -> Pair:
+        """The next pair, of devices that are opened `anew` before each attempt; SequenceError where none comes."""
         began = time.monotonic()
-        while (found := attempt()) is None:
+        while True:
+            if anew:
+                _release(devices)
+                try:
+                    devices[:] = self._open()
+                except SequenceError:
+                    devices.clear()
+            pair = self._read(devices)
+            if pair is not None:
+                return pair
             if time.monotonic() - began >= self._wait:
                 raise SequenceError(f"{self.name}: {silent}")
             time.sleep(_AGAIN)
-        return found
-
-    def _again(self) -> tuple[list[Any], Pair] | None:
-        """The devices, opened again, with their first images; None where they stay silent."""
-        try:
-            opened = self._open()
-        except SequenceError:
-            return None
-        pair = self._read(opened)
-        if pair is None:
-            _release(opened)
-            return None
-        return opened, pair
 
     def _open(self) -> list[Any]:
         """The devices: two, or one with both images side by side."""
-        opened: list[Any] = []
+        devices: list[Any] = []
         try:
             for address in self._addresses:
-                opened.append(devices.open_device(address, *self._wanted))
+                devices.append(open_device(address, *self._wanted))
         except BaseException:
-            _release(opened)
+            _release(devices)
             raise
-        return opened
+        return devices
 
-    def _read(self, opened: list[Any]) -> Pair | None:
-        """The next pair; None where a camera gives none. SequenceError where the two differ in size.
-
-        All are grabbed before any is decoded: so they lie as close together in time as they can.
-        """
-        if not all([device.grab() for device in opened]):
+    def _read(self, devices: list[Any]) -> Pair | None:
+        """The next pair, both grabbed before any is decoded, to be close in time; None where a camera gives none."""
+        if not devices or not all([device.grab() for device in devices]):
             return None
         stamp = self._origin + time.monotonic()
-        images = [image for device in opened if (image := devices.read_image(device)) is not None]
-        if len(images) < len(opened):
+        images = [image for device in devices if (image := grabbed_image(device)) is not None]
+        if len(images) < len(devices):
             return None
-        left, right = halves(images[0], self.name) if len(images) == 1 else images
+        left, right = both(images, self.name)
         require_same_size(left, right, f"{self.name}, left", f"{self.name}, right")
         return (stamp, right, left) if self._swap else (stamp, left, right)
 
 
-def _release(opened: list[Any]) -> None:
-    for device in opened:
+def _release(devices: list[Any]) -> None:
+    for device in devices:
         device.release()
+
+
+def open_device(address: str, width: float | None = None, height: float | None = None, fps: float | None = None) -> Any:
+    """Open a camera as a ``cv2.VideoCapture``; SequenceError where it cannot be opened, or is a file.
+
+    Its address is a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address of a
+    network. Width and height [px] and `fps` [1/s] are asked of it; None for its own choice.
+    """
+    import cv2
+
+    pipeline, network, number = "!" in address, "://" in address, address.isdecimal() and len(address) < 4
+    if not pipeline and not network and os.path.isfile(address):  # noqa: PTH113 unlike Path's, no errors
+        hint = f"with both images side by side it is run as '{address}?layout=sbs', at its own rate with --live"
+        raise SequenceError(f"camera:{address}: a file, not a camera; {hint}")
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT] if network else []
+    library = cv2.CAP_GSTREAMER if pipeline else cv2.CAP_FFMPEG if network else cv2.CAP_ANY
+    with quiet_libraries():
+        capture = cv2.VideoCapture(int(address) if number else address, library, limits)
+        if not capture.isOpened():
+            raise SequenceError(f"camera:{without_password(address)}: cannot be opened{_hint(address)}")
+        wanted = ((cv2.CAP_PROP_FRAME_WIDTH, width), (cv2.CAP_PROP_FRAME_HEIGHT, height), (cv2.CAP_PROP_FPS, fps))
+        for name, value in wanted:
+            if value is not None:
+                capture.set(name, value)
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # images that wait in a queue are old
+    return capture
+
+
+def without_password(address: str) -> str:
+    """An address as it may be shown."""
+    scheme, mark, rest = address.partition("://")
+    return f"{scheme}{mark}{rest.rpartition('@')[2]}" if mark else address
+
+
+def _hint(address: str) -> str:
+    """What may be the reason."""
+    import cv2
+
+    if address.isdecimal():
+        there = sorted(str(path) for path in Path("/dev").glob("video*"))
+        return f": there are {', '.join(there)}" if there else ": this machine shows no camera (/dev/video*)"
+    if "!" in address:
+        known = cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER)
+        return "" if known else ": this OpenCV was built without GStreamer"
+    return "" if "://" in address or Path(address).exists() else ": there is no such file or device"

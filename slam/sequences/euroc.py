@@ -8,14 +8,13 @@ import numpy as np
 
 from slam.errors import CalibrationError, SequenceError, TrajectoryError
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.sequences.base import RecordedSequence
+from slam.sequences.base import FaultLog, RecordedSequence
 from slam.sequences.calibration import naming, read_entries
-from slam.sequences.faults import FaultLog
 from slam.sequences.names import stem
 from slam.sequences.options import Options
-from slam.sequences.pairs import Listing, image_names, image_pairs, in_order, listed, pair_up, told_times
-from slam.sequences.rigs import body_pose, calibration_files, read_rig
-from slam.sequences.tables import MOST_NANOSECONDS, read_rows, require_truth, shorten
+from slam.sequences.pairs import Listing, image_names, in_order, listed, open_images, told_times
+from slam.sequences.rigs import EUROC, body_pose, calibration_files, files_in, first_complete, read_rig
+from slam.sequences.tables import MOST_NANOSECONDS, read_rows, require_truth
 
 #: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
 #: half a metre apart, which makes 2 mrad. The camera's orientation in the vehicle is calibrated to half a degree or so,
@@ -24,7 +23,6 @@ MOCAP_NOISE = TruthNoise(rotation=0.002, translation=0.001, mounting=0.01, lever
 
 _CAMERAS = ("cam0", "cam1")
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")  # both give the body's (IMU's) pose
-_CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "../camchain.yaml", "../dso/camchain.yaml")
 
 
 def matches_folder(folder: Path) -> bool:
@@ -35,19 +33,14 @@ def matches_folder(folder: Path) -> bool:
 def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
     """Open a sequence in EuRoC's format; `folder` holds ``mav0`` or is it."""
     root = _root(folder)
-    left, right = _listings(root, faults)
-    pairs = pair_up(left, right, options, faults, told_times(folder, options, faults))
-    source, size = image_pairs(pairs, left, right)
-    own = [root / cam / "sensor.yaml" for cam in _CAMERAS]
-    if not any(file.exists() for file in own):
-        own = [file for name in _CAMCHAINS if (file := root / name).is_file()][:1]
-    missing = f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing (nor is there a Kalibr camchain.yaml)"
-    named = "calibration" in options or not own
-    files = calibration_files(folder, options, f"{missing}: add calibration=FILE") if named else own
-    rig = read_rig(files, size, options)
+    times = told_times(folder, options, faults)
+    pairs, decode, size = open_images(_listings(root, faults), options, faults, times)
+    own = files_in(root, EUROC)
+    rig = read_rig(calibration_files(folder, options, own), size, options)
+    truth = _ground_truth(root, first_complete(own), faults)
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    truth = _ground_truth(root, own, faults)
-    return RecordedSequence(name, "euroc", options.get("kind", "handheld"), rig, source, truth, MOCAP_NOISE)
+    kind = options.get("kind", "handheld")
+    return RecordedSequence(name, "euroc", kind, rig, pairs.stamps, decode, truth, MOCAP_NOISE)
 
 
 def _root(folder: Path) -> Path:
@@ -72,18 +65,17 @@ def _table(table: Path, faults: FaultLog) -> Listing:
     """The images that a ``data.csv`` lists and that exist; another ending (``.jpg`` for ``.png``) is accepted."""
     rows = [row for row in read_rows(table, _stamp_and_name, faults) if row is not None]
     folder = table.parent / "data"
-    listing = Listing(folder, np.array([s for s, _ in rows], np.int64), [n for _, n in rows], True)
-    listing = in_order(listing, str(table), faults)
     there = image_names(folder)
     known = {stem(name): name for name in there} | {name: name for name in there}
-    names = [known.get(name) or known.get(stem(name), "") for name in listing.names]
-    missing = [wanted for wanted, found in zip(listing.names, names) if not found]
-    if len(missing) == len(names):
-        raise SequenceError(f"{folder}: none of the {len(names)} images listed in {table} is there")
+    found = [known.get(name) or known.get(stem(name), "") for _, name in rows]
+    missing = [name for (_, name), own in zip(rows, found) if not own]
+    if len(missing) == len(rows):
+        raise SequenceError(f"{folder}: none of the {len(rows)} images listed in {table} is there")
     if missing:
-        line = f"{table}: {len(missing)} of {len(names)} listed images are missing (first: {missing[0]})"
+        line = f"{table}: {len(missing)} of {len(rows)} listed images are missing (first: {missing[0]})"
         faults.report("listed images", line)
-    return Listing(folder, listing.keys, names, True).select(np.flatnonzero([bool(name) for name in names]))
+    listing = in_order(Listing(folder, np.array([s for s, _ in rows], np.int64), found, True), str(table), faults)
+    return listing.select(np.flatnonzero([bool(name) for name in listing.names]))
 
 
 def _stamp_and_name(text: str) -> tuple[int, str]:
@@ -92,24 +84,25 @@ def _stamp_and_name(text: str) -> tuple[int, str]:
     try:
         value = int(stamp)
     except ValueError:
-        raise ValueError(f"{shorten(stamp)} is not a time in whole nanoseconds") from None
+        raise ValueError(f"{stamp!r:.40} is not a time in whole nanoseconds") from None
     if not 0 <= value <= MOST_NANOSECONDS:
-        raise ValueError(f"{shorten(stamp)} is no possible time in nanoseconds")
+        raise ValueError(f"{stamp!r:.40} is no possible time in nanoseconds")
     return value, name or f"{stamp}.png"
 
 
 def _ground_truth(root: Path, calibration: list[Path], faults: FaultLog) -> Trajectory | None:
     """The left camera's path: body poses times the camera's pose in the body."""
-    for path in (root / folder / "data.csv" for folder in _TRUTH):
-        if path.is_file():
-            try:
-                if not calibration:
-                    raise SequenceError(f"{path}: no sensor.yaml says where the camera is on the body")
-                with naming(calibration[0]):
-                    T_body_camera = body_pose(read_entries(calibration, None), 0)
-                bodies = Trajectory.read_euroc(path)
-                poses = bodies.poses if T_body_camera is None else bodies.poses @ T_body_camera
-                return require_truth(Trajectory(bodies.stamps, poses), path)
-            except (TrajectoryError, SequenceError, CalibrationError) as error:
-                faults.report("ground truth", f"{error}; there is no ground truth")
-    return None
+    path = next((path for name in _TRUTH if (path := root / name / "data.csv").is_file()), None)
+    if path is None:
+        return None
+    try:
+        if not calibration:
+            raise SequenceError(f"{path}: no sensor.yaml says where the camera is on the body")
+        with naming(calibration[0]):
+            T_body_camera = body_pose(read_entries(calibration, None), 0)
+        bodies = Trajectory.read_euroc(path)
+        poses = bodies.poses if T_body_camera is None else bodies.poses @ T_body_camera
+        return require_truth(Trajectory(bodies.stamps, poses), path)
+    except (TrajectoryError, SequenceError, CalibrationError) as error:
+        faults.report("ground truth", f"{error}; there is no ground truth")
+        return None

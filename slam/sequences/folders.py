@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
+
+import numpy as np
 
 from slam.errors import SequenceError
-from slam.files import expanded
-from slam.sequences.base import FrameSource, RecordedSequence
-from slam.sequences.captures import VIDEO_SUFFIXES, open_videos
-from slam.sequences.faults import FaultLog
-from slam.sequences.images import IMAGE_SUFFIXES, Size
+from slam.files import expanded, require_content
+from slam.geometry.se3 import Array
+from slam.sequences.base import Decoder, FaultLog, Images, RecordedSequence
+from slam.sequences.images import (
+    IMAGE_SUFFIXES,
+    MOST_PIXELS,
+    Size,
+    both,
+    grabbed_image,
+    quiet_libraries,
+    require_same_size,
+)
 from slam.sequences.names import SIDES, natural, of_sides
-from slam.sequences.options import Options
-from slam.sequences.pairs import image_names, image_pairs, listed, pair_up, told_times
+from slam.sequences.options import FASTEST, SLOWEST, Options
+from slam.sequences.pairs import image_names, listed, open_images, told_times
 from slam.sequences.rigs import calibration_files, read_rig
 
+#: Endings of video files, in lower case.
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
 
-class Side(NamedTuple):
-    """The images of a camera: a video, or a folder and the names in it."""
+_MOST_FRAMES = 10_000_000  # of a video, four days of it: what a header says may be anything
 
-    path: Path
-    names: list[str] | None = None
+Side = tuple[Path, list[str] | None]  # of a camera: a folder and the images in it, or a video
 
 
 def matches_folder(folder: Path) -> bool:
@@ -32,34 +44,30 @@ def matches_folder(folder: Path) -> bool:
 def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
     """Open two folders or two videos, or one of either that holds both cameras."""
     home = folder.parent if folder.is_file() else folder
-    source, size = _source(_sides(folder, options), home, options, faults)
-    files = calibration_files(home, options)
-    if files[0].suffix == ".txt" and "calibration" not in options:  # KITTI's, of four cameras
-        faults.report("calibration", f"{files[0]}: the images are taken as its cameras' 0 and 1 (see calibration=…)")
-    rig = read_rig(files, size, options)
-    return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, source)
-
-
-def _source(sides: list[Side], home: Path, options: Options, faults: FaultLog) -> tuple[FrameSource, Size]:
-    """Where the images come from, and their size; `home` has the file of times."""
-    paths, names = [side.path for side in sides], [side.names for side in sides]
+    sides = _sides(folder, options)
+    paths, names = [path for path, _ in sides], [own for _, own in sides]
     if len(sides) == 2 and names[0] == names[1] and paths[0].samefile(paths[1]):
         raise SequenceError(f"{paths[0]} and {paths[1]} are the same: the left and the right camera's are needed")
     if len({own is None for own in names}) > 1:
         raise SequenceError(f"{paths[0]} and {paths[1]}: one is a video and the other is not")
     if names[0] is None:
-        return open_videos(paths, options.get("fps"), faults)
-    left, *right = listed(paths, [own or [] for own in names], faults)
-    times = told_times(home, options, faults, home / "times.txt", home / "timestamps.txt")
-    pairs = pair_up(left, right[0] if right else None, options, faults, times)
-    return image_pairs(pairs, left, right[0] if right else None)
+        stamps, decode, size = _open_videos(paths, options.get("fps"), faults)
+    else:
+        times = told_times(home, options, faults, home / "times.txt", home / "timestamps.txt")
+        pairs, decode, size = open_images(listed(paths, [own or [] for own in names], faults), options, faults, times)
+        stamps = pairs.stamps
+    files = calibration_files(home, options)
+    if files[0].suffix == ".txt" and "calibration" not in options:  # KITTI's, of four cameras
+        faults.report("calibration", f"{files[0]}: the images are taken as its cameras' 0 and 1 (see calibration=…)")
+    rig = read_rig(files, size, options)
+    return RecordedSequence(folder.stem, "folders", options.get("kind", "handheld"), rig, stamps, decode)
 
 
 def _sides(folder: Path, options: Options) -> list[Side]:
     """Both cameras, or the one place where both are side by side."""
     if options.get("layout") is None:
-        if not options.keys() & {"left", "right"} and (both := _two_cameras(folder)):
-            return [side if side.names else _found(side.path) for side in both]
+        if not options.keys() & {"left", "right"} and (two := _two_cameras(folder)):
+            return two
         sides = []
         for at, name in enumerate(("left", "right")):
             path = folder / expanded(options[name]) if name in options else _called(folder, at)
@@ -68,13 +76,12 @@ def _sides(folder: Path, options: Options) -> list[Side]:
             sides.append(_found(path))
         return sides
     if folder.is_file():
-        return [Side(folder)]
+        return [(folder, None)]
     if "left" in options:
         return [_found(folder / expanded(options["left"]))]
-    inside = _inside(folder)
-    if any(path.suffix.lower() in IMAGE_SUFFIXES for path in inside):
+    if any(path.suffix.lower() in IMAGE_SUFFIXES for path in _inside(folder)):
         return [_found(folder)]
-    places = [path for path in inside if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES]
+    places = [path for path in _inside(folder) if _is_place(path)]
     if len(places) != 1:
         raise SequenceError(f"{folder}: {len(places)} folders and videos, where layout=sbs needs one: add left=…")
     return [_found(places[0])]
@@ -83,30 +90,33 @@ def _sides(folder: Path, options: Options) -> list[Side]:
 def _found(path: Path) -> Side:
     """What a path stands for: a folder, a video, or a pattern with ``*``."""
     if "*" in path.name:
-        names = [name for name in image_names(path.parent) if Path(name).match(path.name)]
-        if not names:
-            raise SequenceError(f"{path}: no images")
-        return Side(path.parent, names)
+        return path.parent, [name for name in image_names(path.parent) if Path(name).match(path.name)]
     if not path.exists():
         raise SequenceError(f"{path}: there is no such folder or video")
-    return Side(path) if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES else Side(path, image_names(path))
+    return path, None if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES else image_names(path)
 
 
 def _two_cameras(folder: Path) -> list[Side] | None:
     """Two folders or videos, or the images of one folder, by words such as left and right in their names."""
     inside = _inside(folder)
-    places = [p.name for p in inside if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES]
+    places = [path.name for path in inside if _is_place(path)]
     for words in SIDES:  # these alone, before names that hold them
         exact = [[name for name in places if _word(name) == word] for word in words]
         if all(exact):
-            return [Side(folder / min(names)) for names in exact]
+            return [_found(folder / min(names)) for names in exact]
     found = of_sides(places)
     if found and len(found[0]) == len(found[1]) == 1:
-        return [Side(folder / names[0]) for names in found]
-    names = [p.name for p in inside if p.suffix.lower() in IMAGE_SUFFIXES]
+        return [_found(folder / name) for (name,) in found]
+    names = [path.name for path in inside if path.suffix.lower() in IMAGE_SUFFIXES]
     images = of_sides(names)
     few = images is not None and 2 * sum(map(len, images)) < len(names)  # cam0.png and cam1.png of cam0.png … cam99.png
-    return None if images is None or few else [Side(folder, sorted(names, key=natural)) for names in images]
+    return None if images is None or few else [(folder, sorted(names, key=natural)) for names in images]
+
+
+def _called(folder: Path, side: int) -> Path | None:
+    """What is called as the cameras of one side usually are, though the other side is missing."""
+    names = {words[side] for words in SIDES} - {words[1 - side] for words in SIDES}
+    return next((path for path in sorted(_inside(folder)) if _word(path.name) in names and _is_place(path)), None)
 
 
 def _word(name: str) -> str:
@@ -114,17 +124,8 @@ def _word(name: str) -> str:
     return name.lower().partition(".")[0].replace("_", "").replace("-", "").replace(" ", "")
 
 
-def is_side(path: Path) -> bool:
-    """Whether a folder is one of the two cameras of the folder that it is in."""
-    both = _two_cameras(path.parent)
-    return both is not None and path in [side.path for side in both]
-
-
-def _called(folder: Path, side: int) -> Path | None:
-    """What is called as the cameras of one side usually are, though the other side is missing."""
-    names = {words[side] for words in SIDES} - {words[1 - side] for words in SIDES}
-    usual = (path for path in sorted(_inside(folder)) if _word(path.name) in names)
-    return next((path for path in usual if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES), None)
+def _is_place(path: Path) -> bool:
+    return path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def _inside(folder: Path) -> list[Path]:
@@ -133,3 +134,71 @@ def _inside(folder: Path) -> list[Path]:
         return [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError:
         return []
+
+
+def _open_videos(paths: list[Path], rate: float | None, faults: FaultLog) -> tuple[Array, Decoder, Size]:
+    """Times of the frames of two videos, or of one side by side, what decodes them, and an image's size."""
+    counts, images, rates = zip(*(_beginning(path) for path in paths))
+    size = require_same_size(*both(images, paths[0]), *paths)
+    if rate is None and abs(rates[0] - rates[-1]) * min(counts) > 0.5 * rates[0]:  # more than half a frame in the end
+        said = f"{paths[0]} has {rates[0]:.6g} frames per second, {paths[1]} has {rates[1]:.6g}"
+        raise SequenceError(f"{said}: frames of one number are not of one moment; where they are, add fps=…")
+    if counts[0] != counts[-1]:
+        line = f"{paths[0]} has {counts[0]} frames, {paths[1]} has {counts[1]}: the surplus is left out"
+        faults.report("videos", line)
+    rate = rate or rates[0]
+    if not SLOWEST <= rate <= FASTEST:
+        raise SequenceError(f"{paths[0]}: the frame rate is not known, add fps=…")
+    return np.arange(min(counts)) / rate, partial(_decode_videos, paths, min(counts)), size
+
+
+def _decode_videos(paths: list[Path], count: int, start: int, stop: int, faults: FaultLog) -> Images:
+    """The frames of videos, which cannot be entered in the middle; one that ends too early ends the sequence."""
+    with ExitStack() as stack:
+        videos = [stack.enter_context(_open_video(path)) for path in paths]
+        with quiet_libraries():
+            for _ in range(start):
+                for video in videos:
+                    video.grab()
+        for index in range(start, stop):
+            images = [grabbed_image(video) if video.grab() else None for video in videos]
+            for path, image in zip(paths, images):
+                if image is None:
+                    faults.report("videos", f"{path}: ends or is damaged at frame {index} of {count}")
+            if any(image is None for image in images):
+                return
+            yield tuple(images)
+
+
+def _beginning(path: Path) -> tuple[int, np.ndarray, float]:
+    """A video's number of frames, its first image, and its frame rate [1/s]."""
+    import cv2
+
+    with _open_video(path) as video, quiet_libraries():
+        claimed, rate = video.get(cv2.CAP_PROP_FRAME_COUNT), float(video.get(cv2.CAP_PROP_FPS))
+        first = grabbed_image(video) if video.grab() else None
+        if first is None:
+            raise SequenceError(f"{path}: no frame of the video can be decoded")
+        count = int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 1
+        while claimed <= 0 and count < _MOST_FRAMES and video.grab():  # it does not say
+            count += 1
+        return count, first, rate
+
+
+@contextmanager
+def _open_video(path: Path) -> Iterator[Any]:
+    """A ``cv2.VideoCapture``, released in the end; SequenceError where the file is no readable video."""
+    import cv2
+
+    require_content(path)  # a pipe would be waited for
+    with quiet_libraries():
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # others take a name for a pattern
+    try:
+        if not capture.isOpened():
+            raise SequenceError(f"{path}: not a readable video")
+        if capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT) > MOST_PIXELS:
+            raise SequenceError(f"{path}: frames of more than {MOST_PIXELS} pixels are not read")
+        yield capture
+    finally:
+        with quiet_libraries():
+            capture.release()

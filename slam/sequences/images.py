@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +92,31 @@ def _by_opencv(data: bytes, size: Size, what: str) -> np.ndarray:
     return np.asarray(pixels)
 
 
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Keep OpenCV, and ffmpeg below it, from printing what is about to be reported as an error of ours."""
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    logging = getattr(cv2.utils, "logging", cv2)  # before OpenCV 5, the functions are in `cv2` itself
+    before = logging.setLogLevel(0)  # 0: silent
+    try:
+        yield
+    finally:
+        logging.setLogLevel(before)
+
+
+def grabbed_image(capture: Any) -> np.ndarray | None:
+    """The image that a ``cv2.VideoCapture`` has grabbed, in grey (H, W), 8 or 16 bits as stored; None for none."""
+    import cv2
+
+    with quiet_libraries(), suppress(cv2.error):
+        good, image = capture.retrieve()
+        if good and image is not None and image.size:
+            return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    return None
+
+
 def require_image_size(found: Size, expected: Size | None, what: str) -> None:
     """Raise SequenceError where an image is of another size than expected, or larger than any."""
     if expected is not None and found != expected:
@@ -102,19 +130,25 @@ def recorded_size(rig: StereoRig) -> Size:
     return (rig.height, rig.width) if rig.turns % 2 else (rig.width, rig.height)
 
 
-def require_same_size(left: np.ndarray, right: np.ndarray, *names: object) -> None:
-    """Raise SequenceError where the images (H, W) of two cameras, by these names, differ in size."""
-    if left.shape != right.shape:
-        sizes = ", ".join(f"{name} is {size_text(image.shape[::-1])}" for name, image in zip(names, (left, right)))
-        raise SequenceError(f"left and right images differ in size: {sizes}")
-
-
-def halves(image: np.ndarray, what: object) -> tuple[np.ndarray, np.ndarray]:
-    """The left and the right half of an image that holds two side by side; SequenceError where its width is odd."""
+def both(images: Sequence[Any], what: object) -> tuple[Any, Any]:
+    """The left and the right image of two, or of one (H, 2W) that holds them side by side; what is no image stands."""
+    if len(images) == 2:
+        return images[0], images[1]
+    (image,) = images
+    if not isinstance(image, np.ndarray):
+        return image, image
     width = image.shape[1] // 2
     if image.shape[1] % 2 or not width:
         raise SequenceError(f"{what}: an image of {size_text(image.shape[1::-1])} cannot hold two side by side")
     return image[:, :width], image[:, width:]
+
+
+def require_same_size(left: np.ndarray, right: np.ndarray, *names: object) -> Size:
+    """Width and height of both images (H, W); SequenceError, with their names, where they differ in size."""
+    if left.shape != right.shape:
+        sizes = ", ".join(f"{name} is {size_text(image.shape[::-1])}" for name, image in zip(names, (left, right)))
+        raise SequenceError(f"left and right images differ in size: {sizes}")
+    return left.shape[1], left.shape[0]
 
 
 def size_text(size: tuple[int, ...]) -> str:

@@ -12,19 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from slam.errors import CalibrationError, SequenceError, TrajectoryError
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, about, inverse, pose
 from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory, TruthNoise
-from slam.sequences.base import RecordedSequence
+from slam.sequences.base import FaultLog, RecordedSequence
 from slam.sequences.calibration import array, naming, read_kitti
-from slam.sequences.faults import FaultLog
-from slam.sequences.images import Size, size_text
 from slam.sequences.names import stem
 from slam.sequences.options import Options
-from slam.sequences.pairs import Times, image_names, image_pairs, listed, pair_up, told_times
-from slam.sequences.rigs import calibration_files, projection_offset, read_rig, rig_from_projections, rigid
-from slam.sequences.tables import date_time, numbers, read_rows, require_truth, shorten
+from slam.sequences.pairs import Times, image_names, listed, open_images, told_times
+from slam.sequences.rigs import calibration_files, projection_offset, read_rig, rigid
+from slam.sequences.tables import date_time, numbers, read_rows, require_truth
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 2 cm, 0.03° in roll and pitch, and 0.1°
 #: in heading, which changes slowly. That, and how the camera stands to the unit, is left to be found.
@@ -36,7 +33,6 @@ _OXTS_TIME = 0.01 / np.sqrt(12)
 _COUNT = re.compile(r"\d{1,18}", re.ASCII)  # the name of a record
 _EARTH_RADIUS, _ECCENTRICITY = 6378137.0, 0.0818191908426  # of the earth's ellipsoid (WGS 84): equatorial [m]
 _OXTS = "latitude, longitude, altitude, roll, pitch, yaw"
-_PAIRS = (("0", "1"), ("2", "3"))  # grey first, colour where there is no grey
 
 
 class Layout(NamedTuple):
@@ -44,11 +40,16 @@ class Layout(NamedTuple):
 
     name: str
     folders: list[Path]  # of left and right images
-    cameras: tuple[str, str]  # their numbers, as the calibration writes them
-    calibration: Path  # the file, where it is or should be
+    cameras: tuple[str, str]  # their numbers
+    calibrations: list[Path]  # where the calibration may be
     times: Path  # the file, which may be missing
-    poses: tuple[Path, ...] = ()  # files of poses of the reference camera; the first that is there counts
+    poses: list[Path]  # of the reference camera; the first that is there counts
     drive: Path | None = None  # the folder of a drive of KITTI raw or KITTI-360; None for odometry and tracking
+
+    @property
+    def calibration(self) -> Path | None:
+        """The file, if there is one."""
+        return next((path for path in self.calibrations if path.is_file()), None)
 
 
 def matches_folder(folder: Path) -> bool:
@@ -64,17 +65,12 @@ def matches_drive(folder: Path) -> bool:
 
 
 def open_folder(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
-    """Open one sequence of KITTI odometry, or of KITTI tracking."""
-    return _open(folder, _tracking(folder) if _is_tracking(folder) else _odometry(folder), options, faults)
-
-
-def open_drive(folder: Path, options: Options, faults: FaultLog) -> RecordedSequence:
-    """Open one drive of KITTI raw or KITTI-360; stamps count from its first row of times. Raises as `open_folder`."""
-    return _open(folder, _drive(folder), options, faults)
-
-
-def _open(folder: Path, where: Layout, options: Options, faults: FaultLog) -> RecordedSequence:
-    left, right = listed(where.folders, [image_names(images) for images in where.folders], faults)
+    """Open one sequence of KITTI odometry, KITTI tracking, KITTI raw or KITTI-360."""
+    if matches_drive(folder):
+        where = _drive(folder)
+    else:
+        where = _tracking(folder) if _is_tracking(folder) else _odometry(folder)
+    sides = listed(where.folders, [image_names(images) for images in where.folders], faults)
     origin = None
     if where.drive is not None and where.times.is_file() and not {"times", "fps"} & set(options):
         dates = read_rows(where.times, date_time, faults)
@@ -83,19 +79,20 @@ def _open(folder: Path, where: Layout, options: Options, faults: FaultLog) -> Re
         times: Times | None = Times(where.times, seconds, [])
     else:
         times = told_times(folder, options, faults, where.times)
-    pairs = pair_up(left, right, options, faults, times, by_number=True)
-    source, size = image_pairs(pairs, left, right)
-    rig, T_left_reference = _rig(folder, where, size, options)
-    by_number = dict(zip((pairs.rows[:, 0] if left.stamped else pairs.keys).tolist(), pairs.stamps.tolist()))
+    pairs, decode, size = open_images(sides, options, faults, times, by_number=True)
+    files = calibration_files(folder, options, [[path] for path in where.calibrations])
+    rig = read_rig(files, size, options, where.cameras)
+    by_number = dict(zip((pairs.rows[:, 0] if sides[0].stamped else pairs.keys).tolist(), pairs.stamps.tolist()))
     try:
-        truth = _truth(where, origin, T_left_reference, by_number, faults)
+        truth = _truth(where, origin, by_number, faults)
     except (SequenceError, CalibrationError, TrajectoryError) as error:
         faults.report("ground truth", f"{error}; there is no ground truth")
         truth = None
     kind = options.get("kind", "driving")
     time = 0.0 if where.drive is None or (where.drive / "oxts").is_dir() else _OXTS_TIME
     noise = replace(OXTS_NOISE, time=time, wheels=kind == "driving")
-    return RecordedSequence(where.name, "kitti-raw" if where.drive else "kitti", kind, rig, source, truth, noise)
+    format = "kitti-raw" if where.drive else "kitti"
+    return RecordedSequence(where.name, format, kind, rig, pairs.stamps, decode, truth, noise)
 
 
 def _is_tracking(folder: Path) -> bool:
@@ -104,130 +101,95 @@ def _is_tracking(folder: Path) -> bool:
 
 
 def _odometry(folder: Path) -> Layout:
-    cameras = _choose_pair(folder, _PAIRS)
-    poses = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
-    folders = [folder / f"image_{camera}" for camera in cameras]
-    return Layout(folder.name, folders, cameras, folder / "calib.txt", folder / "times.txt", poses)
+    folders, cameras = _cameras(folder, "image_")
+    poses = [folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"]
+    return Layout(folder.name, folders, cameras, [folder / "calib.txt"], folder / "times.txt", poses)
 
 
 def _tracking(folder: Path) -> Layout:
     root, name = folder.parent.parent, folder.name
     # As downloaded: data_tracking_calib/training beside data_tracking_image_2/training
     files = [root / "calib" / f"{name}.txt", *sorted(root.parent.parent.glob(f"*/{root.name}/calib/{name}.txt"))]
-    folders = [folder, root / "image_03" / name]
-    return Layout(name, folders, ("2", "3"), _first(files), root / f"times_{name}.txt")
+    return Layout(name, [folder, root / "image_03" / name], ("2", "3"), files, root / f"times_{name}.txt", [])
 
 
 def _drive(folder: Path) -> Layout:
     """Of KITTI raw the calibration is in the day's folder, or in the drive's own; of KITTI-360 in ``calibration``."""
-    cameras = _choose_pair(folder, tuple((f"0{a}", f"0{b}") for a, b in _PAIRS))
-    images = [folder / f"image_{camera}" for camera in cameras]
+    if folder.name.endswith("_extract"):
+        raise SequenceError(f"{folder}: an unrectified (extract) drive: take the rectified (sync) one")
+    images, cameras = _cameras(folder, "image_0")
     inside = next((name for name in ("data_rect", "data") if (images[0] / name).exists()), "")
     raw = [where / "calib_cam_to_cam.txt" for where in (folder.parent, folder)]
     usual = [where / "calibration" / "perspective.txt" for where in (folder.parent.parent, folder.parent)]
-    calibration = _first([*usual, *raw] if inside == "data_rect" else [*raw, *usual])
+    files = [*usual, *raw] if inside == "data_rect" else [*raw, *usual]
     poses, times = folder / "poses_cam0_oxts.txt", images[0] / "timestamps.txt"
-    return Layout(folder.name, [path / inside for path in images], cameras, calibration, times, (poses,), folder)
+    return Layout(folder.name, [path / inside for path in images], cameras, files, times, [poses], folder)
 
 
-def _first(paths: list[Path]) -> Path:
-    """The first path that exists, else the first one."""
-    return next((path for path in paths if path.exists()), paths[0])
+def _cameras(folder: Path, name: str) -> tuple[list[Path], tuple[str, str]]:
+    """The folders and numbers of the first pair of cameras of which both folders are there, grey before colour."""
+    for cameras in (("0", "1"), ("2", "3")):
+        folders = [folder / f"{name}{camera}" for camera in cameras]
+        if all(path.is_dir() for path in folders):
+            return folders, cameras
+    raise SequenceError(f"{folder}: two cameras are needed, folders {name}0 and {name}1 or {name}2 and {name}3")
 
 
-def _choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
-    """The first pair of cameras of which both folders are there; SequenceError where no pair is complete."""
-    for left, right in pairs:
-        if all((folder / f"image_{c}").is_dir() for c in (left, right)):
-            return left, right
-    wanted = " or ".join(f"folders image_{a} and image_{c}" for a, c in pairs)
-    raise SequenceError(f"{folder}: two cameras are needed, {wanted}")
-
-
-def _rig(folder: Path, where: Layout, size: Size, options: Options) -> tuple[StereoRig, Array]:
-    """The rig, and the pose (4, 4) of the reference camera 0 (of a drive before rectification) in the left one."""
-    if not where.calibration.exists():
-        missing = f"{where.calibration}: the calibration is missing: add calibration=FILE"
-        return read_rig(calibration_files(folder, options, missing), size, options), np.eye(4)
-    named = calibration_files(folder, options) if "calibration" in options else None
-    T: Array = np.eye(4)
-    rows = read_kitti(where.calibration)
+def _reference(where: Layout) -> Array:
+    """Pose (4, 4) of the reference camera 0 (of a drive before rectification) in the left one."""
+    if where.calibration is None:
+        return np.eye(4)
+    rows, name = read_kitti(where.calibration), f"{'P_rect_0' if where.drive else 'P'}{where.cameras[0]}"
     with naming(where.calibration):
-        name = "P" if where.drive is None else "P_rect_"
-        P_left, P_right = (array(rows.get(f"{name}{camera}"), f"{name}{camera}", (3, 4)) for camera in where.cameras)
-        if where.drive is not None:
-            expected = array(rows.get(f"S_rect_{where.cameras[0]}"), f"S_rect_{where.cameras[0]}", (2,)).astype(int)
-            if tuple(expected) != size:  # perhaps those of an unrectified drive
-                text = f"images are {size_text(size)}, S_rect_{where.cameras[0]} says {size_text(tuple(expected))}"
-                if tuple(rows.get(f"S_{where.cameras[0]}", ())) == size:
-                    text += ": this is an unrectified (extract) drive, take the rectified (sync) one"
-                raise CalibrationError(text)
-            T = rigid(pose(array(rows.get("R_rect_00"), "R_rect_00", (3, 3)), np.zeros(3)), "R_rect_00")
-        T = pose(np.eye(3), projection_offset(P_left)) @ T
-        return read_rig(named, size, options) if named else rig_from_projections(P_left, P_right, size), T
+        T = pose(np.eye(3), projection_offset(array(rows.get(name), name, (3, 4))))
+        if where.drive is None:
+            return T
+        return T @ rigid(pose(array(rows.get("R_rect_00"), "R_rect_00", (3, 3)), np.zeros(3)), "R_rect_00")
 
 
-def _truth(
-    where: Layout, origin: int | None, T_left_reference: Array, by_number: dict[int, float], faults: FaultLog
-) -> Trajectory | None:
-    """The left camera's path at the stamps of the frames `by_number`.
-
-    Of drives by the OXTS records, where the world is the left camera's first frame; KITTI-360 has poses of the
-    rectified left camera. Else by rows of 12, one for each frame number, of the reference camera: of a drive camera 0
-    before rectification. `origin` is the time of stamp zero [ns since 1970], None where it is not known.
-    """
+def _truth(where: Layout, origin: int | None, by_number: dict[int, float], faults: FaultLog) -> Trajectory | None:
+    """The left camera's path at the frames' stamps `by_number`; `origin` is stamp zero [ns since 1970], if known."""
+    grey = where.cameras[0] == "0"
     if where.drive is not None:
         drive = where.drive
         world = drive.parent.parent / "data_poses" / drive.name / "cam0_to_world.txt"
-        grey = where.cameras[0] == "00"
         if world.is_file() and grey:
             found = read_rows(world, partial(numbers, count=17, what="a frame and its pose"), faults)
             table = np.array(sorted(row for row in found if row and row[0] in by_number)).reshape(-1, 17)
             times = np.array([by_number[int(number)] for number in table[:, 0]])
             return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), world)
         if (drive / "oxts").is_dir():
-            day = where.calibration.parent
+            day = (where.calibration or where.calibrations[0]).parent
             T_camera0_velo, T_velo_imu = (_extrinsics(day / f"calib_{n}.txt") for n in ("velo_to_cam", "imu_to_velo"))
             body = require_truth(read_oxts(drive / "oxts", origin, by_number, faults), drive / "oxts")
-            poses = body.poses @ inverse(T_left_reference @ T_camera0_velo @ T_velo_imu)
+            poses = body.poses @ inverse(_reference(where) @ T_camera0_velo @ T_velo_imu)
             return Trajectory(body.stamps, inverse(poses[0]) @ poses)
-        T_left_reference = np.eye(4)  # `poses_cam0_oxts.txt` is of the rectified camera
-        if not grey:
-            return None
     path = next((path for path in where.poses if path.is_file()), None)
-    if path is None:
+    if path is None or (where.drive and not grey):
         return None
     given = Trajectory.read_kitti(path)
     inside = [number for number in by_number if number < len(given)]
     if len(inside) < len(by_number):
         line = f"{path}: {len(given)} poses, {len(by_number) - len(inside)} frames are beyond them"
         faults.report("ground truth", line)
-    times = np.array([by_number[number] for number in inside])
-    truth = require_truth(Trajectory(times, given.poses[inside]), path)
-    return Trajectory(truth.stamps, truth.poses @ inverse(T_left_reference))
+    truth = require_truth(Trajectory(np.array([by_number[number] for number in inside]), given.poses[inside]), path)
+    return truth if where.drive else Trajectory(truth.stamps, truth.poses @ inverse(_reference(where)))
 
 
 def read_oxts(folder: Path, origin: int | None, frame_stamps: dict[int, float], faults: FaultLog) -> Trajectory:
-    """Poses ``T_world_imu`` of the records ``data/NUMBER.txt``; the world's origin is the first record's position.
-
-    Stamps come from ``timestamps.txt`` [s since `origin`, ns since 1970]; where it or `origin` is missing, a record
-    has the stamp of the frame of its number. SequenceError where no record is readable and has a stamp.
-    """
-    files = {int(stem(f.name)): f for f in sorted((folder / "data").glob("*.txt")) if _COUNT.fullmatch(stem(f.name))}
-    if not files:
-        raise SequenceError(f"{folder / 'data'}: no OXTS records")
+    """Poses ``T_world_imu`` of the records ``data/NUMBER.txt``, timed by ``timestamps.txt`` or the frames."""
     stamps, rows = frame_stamps, []
     if origin is not None and (folder / "timestamps.txt").exists():
         dates = read_rows(folder / "timestamps.txt", date_time, faults)
         stamps = {number: (row - origin) * 1e-9 for number, row in enumerate(dates) if row is not None}
-    for number, file in files.items():
+    for file in sorted((folder / "data").glob("*.txt")):
+        number = int(stem(file.name)) if _COUNT.fullmatch(stem(file.name)) else -1
+        if number not in stamps:
+            continue
         try:
-            record = read_rows(file, _record, faults)[0]
+            rows += [[stamps[number], *record] for record in read_rows(file, _record, faults)[:1] if record]
         except SequenceError as error:
             faults.report("OXTS records left out", f"{error}; record left out")
-            continue
-        if record is not None and number in stamps:
-            rows.append([stamps[number], *record])
     if not rows:
         raise SequenceError(f"{folder}: no OXTS record is readable and has a stamp")
     table = np.array(rows)
@@ -258,7 +220,7 @@ def _record(text: str) -> list[float]:
     """The first six numbers of an OXTS record."""
     row = numbers(text, 6, _OXTS)
     if abs(row[0]) >= 90 or max(map(abs, (row[1], *row[3:]))) > 360:
-        raise ValueError(f"{shorten(text)} is not {_OXTS}")
+        raise ValueError(f"{text!r:.40} is not {_OXTS}")
     return row
 
 

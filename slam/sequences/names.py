@@ -95,12 +95,12 @@ def keys_of(sides: Sequence[Sequence[str]]) -> Keys | None:
     frame's number is the one that differs from name to name; of several, those that both cameras share, and that count
     best.
     """
+    stems = [[stem(name) for name in names] for names in sides]
     for read in (_dates, _stamps):
-        found = [read([stem(name) for name in names]) for names in sides]
-        if all(keys is not None for keys in found):
-            keys = [own for own in found if own is not None]
-            stems = [stem(name) for own in sides for name in own]
-            plain = all(_SECONDS.fullmatch(own) or (own.isdecimal() and _STAMP.fullmatch(own)) for own in stems)
+        keys = [found for own in stems if (found := read(own)) is not None]
+        if len(keys) == len(sides):
+            every = [name for own in stems for name in own]
+            plain = all(_SECONDS.fullmatch(name) or (name.isdecimal() and _STAMP.fullmatch(name)) for name in every)
             moment = f"{1e-9 * keys[0][0]:.6f} s" + " since 1970" * bool(keys[0][0] >= 10**17)
             return Keys(keys, True, f"the stamp in {sides[0][0]} is taken as {moment}" if not plain else "")
     return _numbers(sides)
@@ -109,16 +109,16 @@ def keys_of(sides: Sequence[Sequence[str]]) -> Keys | None:
 def _stamps(names: Sequence[str]) -> IntArray | None:
     """A stamp [ns] that every name has and that tells the names apart."""
     rows: list[list[tuple[str, ...]]] = [_STAMP.findall(name) for name in names]
-    whole = [match for name in names if (match := _SECONDS.fullmatch(name))]
-    if len(whole) == len(names):
-        rows = [[("",) * 6 + match.groups()] for match in whole]
+    whole = all(_SECONDS.fullmatch(name) for name in names)
+    if whole:
+        rows = [[("",) * 6 + match.groups()] for name in names if (match := _SECONDS.fullmatch(name))]
     for parts in zip(*rows):
         fractions = [part[1] or part[7] for part in parts]
         if _counters([part[0] or part[6] for part in parts], fractions):
             continue
         # Fractions of unequal length have lost zeros at their ends, or those in front: then steps are uneven.
         lengths = {len(fraction) for fraction in fractions}
-        if all(part[6] for part in parts) and len(whole) < len(names) and len(lengths) == 1:
+        if all(part[6] for part in parts) and not whole and len(lengths) == 1:
             moments = [_nanoseconds(part, 0) for part in parts]
             if [names[row] for row in np.argsort(moments, kind="stable")] != sorted(names, key=natural):
                 continue  # seconds of a time of day, an exposure
@@ -131,11 +131,7 @@ def _stamps(names: Sequence[str]) -> IntArray | None:
 
 
 def _counters(seconds: Sequence[str], digits: Sequence[str]) -> bool:
-    """Whether what stands behind the seconds counts frames, of which a few may be missing, and is no fraction.
-
-    It does where it goes on through the seconds, begins anew in each without filling it, or has steps too short for a
-    camera's times; and where ones without zeros in front are of unequal length, 9 and 10.
-    """
+    """Whether what stands behind the seconds counts frames, of which a few may be missing, and is no fraction."""
     if not all(seconds) or not all(digits):
         return False
     rows = sorted((int(second), int(counter)) for second, counter in zip(seconds, digits))
@@ -193,7 +189,7 @@ def _numbers(sides: Sequence[Sequence[str]]) -> Keys | None:
     if not all(tables):
         return None
     told = [[c for c in table if len(set(c)) == len(c) and max(c) <= MOST_NANOSECONDS] for table in tables]
-    if not all(told):
+    if not all(told):  # only several numbers together tell the names apart
         return _ranks([list(zip(*table)) for table in tables])
     best, chosen = (-1, 0), [columns[-1] for columns in told]
     for column in told[0]:
@@ -231,7 +227,7 @@ def _columns(names: Sequence[str]) -> list[tuple[int, ...]]:
 
 
 def _ranks(rows: Sequence[Sequence[tuple[int, ...]]]) -> Keys | None:
-    """Places of names that only several numbers together tell apart, in the order of all of them."""
+    """Places of names in the order of all their numbers."""
     if any(len(set(own)) < len(own) for own in rows) or not set(rows[0]).intersection(*rows[1:]):
         return None
     rank = {row: number for number, row in enumerate(sorted(set().union(*rows)))}

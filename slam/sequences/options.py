@@ -21,14 +21,11 @@ SLOWEST, FASTEST = 1e-3, 1e5
 #: Most that the option ``tolerance`` takes [s].
 WIDEST_TOLERANCE = 10.0
 
-_MOST_OPTIONS = 100
-
-_YES_NO = {"yes": True, "no": False}
 _WORDS: dict[str, dict[str, Any]] = {
     "kind": {"driving": "driving", "handheld": "handheld"},
     "unit": {"m": 1.0, "cm": 0.01, "mm": 0.001},  # in metres
     "layout": {"sbs": "sbs"},  # side by side
-    **dict.fromkeys(("rectified", "fisheye", "swap"), _YES_NO),
+    **{name: {"yes": True, "no": False} for name in ("rectified", "fisheye", "swap")},
 }
 _RANGES = {
     "fps": (SLOWEST, FASTEST),
@@ -60,8 +57,7 @@ def value_of(name: str, text: str) -> Any:
 class Options(dict[str, Any]):
     """Options of a format by name, with their values; they remember which of them were read.
 
-    ConfigurationError where the query, ``key=value&key=value``, has one twice, one that is not `known`, or whose value
-    is none.
+    ConfigurationError where the query has one twice, one that is not `known`, or whose value is none.
     """
 
     def __init__(self, query: str, format: str, known: frozenset[str]) -> None:
@@ -93,9 +89,9 @@ class Options(dict[str, Any]):
 def read_options(query: str) -> dict[str, str]:
     """The options ``key=value&key=value`` as texts."""
     try:
-        texts = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=_MOST_OPTIONS))
+        texts = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=100))
     except ValueError:
-        raise ConfigurationError(f"more than {_MOST_OPTIONS} options") from None
+        raise ConfigurationError("more than 100 options") from None
     for name, text in texts.items():
         if "\0" in text:
             raise ConfigurationError(f"option {name!r} holds a NUL")

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from slam.errors import SequenceError
-from slam.files import expanded, note_input
+from slam.files import expanded, note_input, reason
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
 from slam.naming import count
-from slam.sequences.base import Images
-from slam.sequences.faults import FaultLog
-from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, require_same_size
+from slam.sequences.base import Decoder, FaultLog, Images, attempt
+from slam.sequences.images import IMAGE_SUFFIXES, Size, both, read_image, require_same_size
 from slam.sequences.names import Keys, keys_of, natural, odd_ones, stem
 from slam.sequences.options import WIDEST_TOLERANCE, Options
 from slam.sequences.tables import read_times
@@ -35,7 +34,7 @@ class Listing:
     folder: Path
     keys: IntArray  # what pairs them with the other camera's (N,), increasing: stamps [ns] or frame numbers
     names: list[str]  # their file names, N of them
-    stamped: bool = False  # the keys are stamps
+    stamped: bool  # the keys are stamps
 
     def __len__(self) -> int:
         return len(self.names)
@@ -45,61 +44,47 @@ class Listing:
         return replace(self, keys=self.keys[rows], names=[self.names[i] for i in rows])
 
 
-@dataclass(frozen=True, eq=False)
-class Pairs:
+class Pairs(NamedTuple):
     """Which images make a frame, and when."""
 
     keys: IntArray  # the left images' (N,)
-    rows: IntArray  # of the left and the right listing (N, 2), -1 where there is no right image
+    rows: IntArray  # of each listing (N, 1 or 2), -1 where there is no right image
     stamps: Array  # times (N,) [s], strictly increasing
 
 
-@dataclass(frozen=True, eq=False)
-class ImagePairs:
-    """A frame source: two folders of image files, already paired."""
+class Times(NamedTuple):
+    """A file of times."""
 
-    stamps: Array  # times (N,) [s], strictly increasing
-    left: list[Path]  # (N)
-    right: list[Path | None]  # None where there is no right image
-    size: Size  # width and height that every image must have
-    single: bool  # both images are in the left file, side by side; there are no others
-
-    def images(self, start: int, stop: int, faults: FaultLog) -> Images:
-        """Decode the images of frames `start` to `stop`; an error in place of one that is unreadable."""
-        for left, right in zip(self.left[start:stop], self.right[start:stop]):
-            image = _image(left, self.size)
-            yield (image,) if self.single else (image, None if right is None else _image(right, self.size))
+    path: Path
+    rows: Array  # times by row [s], NaN for unreadable ones
+    names: list[str]  # of the images by row, where the file has them
 
 
-def _image(path: Path, size: Size) -> np.ndarray | SequenceError:
-    try:
-        return read_image(path, size)
-    except SequenceError as error:
-        return error
-
-
-def image_pairs(pairs: Pairs, left: Listing, right: Listing | None) -> tuple[ImagePairs, Size]:
-    """The source of pairs of image files, and the size of a camera's images.
-
-    Without a right listing both images are in the left files, side by side.
-
-    SequenceError where no pair can be read, or the two images of the first one that can differ in size.
-    """
-    lefts = [left.folder / left.names[row] for row in pairs.rows[:, 0]]
-    rights = [right.folder / right.names[row] if right and row >= 0 else None for row in pairs.rows[:, 1]]
+def open_images(
+    sides: list[Listing], options: Options, faults: FaultLog, times: Times | None = None, by_number: bool = False
+) -> tuple[Pairs, Decoder, Size]:
+    """Pair image files, see `pair_up`: which make a frame, what decodes them, and the size of a camera's images."""
+    pairs = pair_up(sides, options, faults, times, by_number)
+    frames = [
+        [None if row < 0 else side.folder / side.names[row] for side, row in zip(sides, rows)]
+        for rows in pairs.rows.tolist()
+    ]
     fault = "no frame has two images"
-    for left_path, right_path in zip(lefts, rights):
-        if right is None or right_path is not None:
-            try:
-                image = read_image(left_path)
-                a, b = halves(image, left_path) if right_path is None else (image, read_image(right_path))
-            except SequenceError as error:
-                fault = str(error)
-                continue
-            require_same_size(a, b, left_path, right_path)
-            whole = image.shape[1], image.shape[0]
-            return ImagePairs(pairs.stamps, lefts, rights, whole, right is None), (a.shape[1], a.shape[0])
-    raise SequenceError(f"{left.folder}: no pair of images can be read: {fault}")
+    for paths in frames:
+        images = [attempt(read_image, path) for path in paths if path is not None]
+        if unreadable := [image for image in images if isinstance(image, SequenceError)]:
+            fault = str(unreadable[0])
+        elif len(images) == len(sides):
+            shape, (left, right) = images[0].shape, both(images, paths[0])  # type: ignore[union-attr]
+            size = require_same_size(left, right, *paths)
+            return pairs, partial(_decoded, frames, (shape[1], shape[0])), size
+    raise SequenceError(f"{sides[0].folder}: no pair of images can be read: {fault}")
+
+
+def _decoded(frames: list[list[Path | None]], size: Size, start: int, stop: int, faults: FaultLog) -> Images:
+    """The images of the files of each frame, all of one size."""
+    for paths in frames[start:stop]:
+        yield tuple(None if path is None else attempt(read_image, path, size) for path in paths)
 
 
 def image_names(folder: Path) -> list[str]:
@@ -107,32 +92,16 @@ def image_names(folder: Path) -> list[str]:
     try:
         with os.scandir(folder) as entries:
             names = [e.name for e in entries if not e.name.startswith(".")]
-    except NotADirectoryError:
-        raise SequenceError(f"{folder}: a file where a folder of images should be") from None
     except OSError as error:
-        raise SequenceError(f"{folder}: {error.strerror or error}") from error
+        what = "a file where a folder of images should be" if isinstance(error, NotADirectoryError) else reason(error)
+        raise SequenceError(f"{folder}: {what}") from error
     note_input(folder)
     return sorted((n for n in names if os.path.splitext(n)[1].lower() in IMAGE_SUFFIXES), key=natural)  # noqa: PTH122
 
 
 def listed(folders: list[Path], names: list[list[str]], faults: FaultLog) -> list[Listing]:
-    """The images of one camera or two by what their names say: stamps, else numbers, else their order.
-
-    SequenceError where a camera has no images, or where only their order is left and the cameras have unequally many.
-    """
-    for at, (folder, own) in enumerate(zip(folders, names)):
-        if not own:
-            raise SequenceError(f"{folder}: no images")
-        endings = Counter(name.rpartition(".")[2] for name in own)
-        once = {stem(name): name for name in sorted(own, key=lambda name: endings[name.rpartition(".")[2]])}
-        odd = odd_ones(list(once.values()))
-        for kind, left_out in (("images are there in another format, too", set(own) - set(once.values())),
-                               ("images are named unlike the others", odd)):  # fmt: skip
-            if left_out:
-                first = min(left_out, key=natural)
-                faults.report("images", f"{folder}: {len(left_out)} of {len(own)} {kind} (first: {first}); left out")
-        taken = set(once.values()) - odd
-        names[at] = [name for name in own if name in taken]
+    """The images of one camera or two by what their names say: stamps, else numbers, else their order."""
+    names = [_alike(folder, own, faults) for folder, own in zip(folders, names)]
     found = keys_of(names)
     if found is None:
         if len({len(own) for own in names}) > 1:
@@ -144,8 +113,7 @@ def listed(folders: list[Path], names: list[list[str]], faults: FaultLog) -> lis
         faults.report("names", f"{folders[0]}: {found.guess}")
     listings = []
     for folder, keys, own in zip(folders, found.sides, names):
-        rows = np.argsort(keys, kind="stable")
-        listing = Listing(folder, keys, own, found.stamped).select(rows)
+        listing = Listing(folder, keys, own, found.stamped).select(np.argsort(keys, kind="stable"))
         steps = np.diff(listing.keys)
         gaps = int(steps.sum()) - len(steps)
         if not found.stamped and gaps > 0 and np.median(steps) == 1:
@@ -154,6 +122,19 @@ def listed(folders: list[Path], names: list[list[str]], faults: FaultLog) -> lis
             faults.report("images", line)
         listings.append(in_order(listing, str(folder), faults))
     return listings
+
+
+def _alike(folder: Path, names: list[str], faults: FaultLog) -> list[str]:
+    """The names without thumbnails and the like, and without copies in another format."""
+    once = list({stem(name): name for name in names}.values())
+    odd = odd_ones(once)
+    taken = [name for name in once if name not in odd]
+    if not taken:
+        raise SequenceError(f"{folder}: no images")
+    if left_out := sorted(set(names) - set(taken), key=natural):
+        what = f"{len(left_out)} of {len(names)} images are named unlike the others, or there in another format, too"
+        faults.report("images", f"{folder}: {what} (first: {left_out[0]}); left out")
+    return taken
 
 
 def in_order(listing: Listing, what: str, faults: FaultLog) -> Listing:
@@ -169,67 +150,80 @@ def in_order(listing: Listing, what: str, faults: FaultLog) -> Listing:
     return listing.select(rows)
 
 
-class Times(NamedTuple):
-    """A file of times."""
-
-    path: Path
-    rows: Array  # times by row [s], NaN for unreadable ones
-    names: list[str]  # of the images by row, where the file has them
-
-
 def told_times(folder: Path, options: Options, faults: FaultLog, *usual: Path) -> Times | None:
     """The file of times, by option or by convention; None where there is none, or ``fps`` is given in its place."""
     if "times" in options:
-        path: Path | None = folder / expanded(options["times"])
-    else:
-        path = None if "fps" in options else next((path for path in usual if path.is_file()), None)
+        usual = (folder / expanded(options["times"]),)
+    elif "fps" in options:
+        usual = ()
+    path = next((path for path in usual if path.is_file() or "times" in options), None)
     return None if path is None else Times(path, *read_times(path, faults))
 
 
 def pair_up(
-    left: Listing, right: Listing | None, options: Options, faults: FaultLog,
-    times: Times | None = None, by_number: bool = False,
-) -> Pairs:  # fmt: skip
+    sides: list[Listing], options: Options, faults: FaultLog, times: Times | None = None, by_number: bool = False
+) -> Pairs:
     """The images of two cameras that belong together by their keys, the option ``tolerance`` apart at most.
 
     Left images before the first pair and after the last are left out, and so are right images without a partner; with
-    the option ``swap`` also left ones, which are the right camera's. What is left out or stands alone is reported.
-    Without a right listing both images are in one file, side by side.
+    the option ``swap`` also left ones, which are the right camera's. What is left out or stands alone is reported. Of a
+    single listing each image holds both cameras', side by side.
 
     Time is by the file of `times`, else by ``fps``, else by stamps, else by numbers at `RATE`. Rows of the file belong
     to the left images that they name, else to those in order; with `by_number`, or where there are more rows than
     images, a row's number is a frame's. SequenceError where nothing pairs, or hardly a frame has a time.
     """
-    partner = np.full(len(left), -1)
-    kept = np.arange(len(left))
-    if right is not None:
-        tolerance = _tolerance(left, options, times is not None or "fps" in options)
-        partner = pair(left.keys, right.keys, tolerance)
-        kept = kept[trim(partner)]
-        if not len(kept):
-            raise SequenceError(_no_pair(left, right, tolerance))
-        swap = options.get("swap", False)
-        _report_alone(left, right, partner, kept, swap, faults)
-        kept = kept[partner[kept] >= 0] if swap else kept
+    left, rows = sides[0], np.arange(len(sides[0]))[:, None]
+    if len(sides) == 2:
+        rows = _partners(left, sides[1], options, times is not None or "fps" in options, faults)
     source = left.folder if times is None else times.path
-    stamps = _stamps_of(left, kept, options, faults, times, by_number)
+    stamps = _seconds(left, rows[:, 0], options, faults, times, by_number)
     timed = np.flatnonzero(np.isfinite(stamps))
     good = timed[increasing(stamps[timed])]
-    untimed, unordered = len(kept) - len(timed), len(timed) - len(good)
-    if 2 * len(good) < len(kept):
+    untimed, unordered = len(rows) - len(timed), len(timed) - len(good)
+    if 2 * len(good) < len(rows):
         what = f"{untimed} have no time and {unordered} one that does not increase"
-        raise SequenceError(f"{source}: of {len(kept)} images {what}")
-    for number, what in (
-        (untimed, "images have no time; left out"),
-        (unordered, "times stand twice or run backwards; images left out"),
+        raise SequenceError(f"{source}: of {len(rows)} images {what}")
+    if untimed:
+        faults.report("stamps", f"{source}: {untimed} images have no time; left out")
+    if unordered:
+        faults.report("stamps", f"{source}: {unordered} times stand twice or run backwards; images left out")
+    return Pairs(left.keys[rows[good, 0]], rows[good], stamps[good])
+
+
+def _partners(left: Listing, right: Listing, options: Options, told: bool, faults: FaultLog) -> IntArray:
+    """Rows (N, 2) of the images that make a frame, see `pair_up`; `told` where a file or a rate tells the time."""
+    tolerance = 0
+    if left.stamped:
+        half = float(np.median(np.diff(left.keys))) / 2 if len(left) > 1 else _TOLERANCE
+        default = 0.98 * half if told and len(left) > 1 else min(_TOLERANCE, half)
+        tolerance = round(1e9 * options.get("tolerance", 1e-9 * default))
+    partner = pair(left.keys, right.keys, tolerance)
+    kept = np.arange(len(left))[trim(partner)]
+    if not len(kept):
+        gap = int(np.abs(right.keys[pair(left.keys, right.keys, np.inf)] - left.keys).min())
+        apart = f"{gap} frames apart"
+        if left.stamped:
+            hint = "see tolerance=… [s]" if gap <= WIDEST_TOLERANCE * 1e9 else "the clocks of the cameras differ"
+            apart = f"{1e-6 * gap:.6g} ms apart, {1e-6 * tolerance:.6g} ms are allowed; {hint}"
+        raise SequenceError(f"no image of {left.folder} has a partner in {right.folder}: the nearest two are {apart}")
+    swap = options.get("swap", False)
+    alone = kept[partner[kept] < 0]
+    first = f" (first: {left.names[alone[0]]})" if len(alone) else ""
+    for side, other, number, where, then in (
+        (left, right, kept[0], "before the first pair", " left out"),
+        (left, right, len(left) - 1 - kept[-1], "after the last pair", " left out"),
+        (left, right, len(alone), "", f"{first}; {'left out' if swap else 'given without a right image'}"),
+        (right, left, len(right) - (partner >= 0).sum(), "", "; left out"),
     ):
         if number:
-            faults.report("stamps", f"{source}: {number} {what}")
-    kept = kept[good]
-    return Pairs(left.keys[kept], np.stack([kept, partner[kept]], axis=1), stamps[good])
+            where = where or f"without a partner in {other.folder}"
+            faults.report("pairs", f"{side.folder}: {count(int(number), 'image')} {where}{then}")
+    kept = np.setdiff1d(kept, alone) if swap else kept
+    return np.stack([kept, partner[kept]], axis=1)
 
 
-def _stamps_of(
+def _seconds(
     left: Listing, kept: IntArray, options: Options, faults: FaultLog, times: Times | None, by_number: bool
 ) -> Array:
     """Times of the `kept` left images [s], see `pair_up`; NaN for none."""
@@ -254,51 +248,9 @@ def _rows_of(left: Listing, times: Times, by_number: bool, faults: FaultLog) -> 
     rows = np.array([named.get(stem(name), count) for name in left.names])
     if (rows < count).any():
         return rows
-    if not left.stamped and (by_number or len(left) < count):
-        first = int(not by_number and left.keys[-1] == count)  # numbers from 1 on
-        if by_number or left.keys[0] - first >= 0 <= count - 1 - (left.keys[-1] - first):
-            return left.keys - first
+    numbers = left.keys - int(not by_number and left.keys[-1] == count)  # perhaps from 1 on
+    if not left.stamped and (by_number or (len(left) < count and numbers[0] >= 0 and numbers[-1] < count)):
+        return numbers
     if not by_number and count != len(left):
         faults.report("stamps", f"{times.path} has {count} rows, {left.folder} has {len(left)} images")
     return np.arange(len(left))
-
-
-def _tolerance(left: Listing, options: Options, told: bool) -> float:
-    """How far the keys of a pair may be apart: of numbers not at all, of stamps [ns] as the option says.
-
-    Where time is `told` by a file or a rate, half a frame, not `_TOLERANCE`, is the default.
-    """
-    if not left.stamped:
-        return 0
-    half = float(np.median(np.diff(left.keys))) / 2 if len(left) > 1 else _TOLERANCE
-    default = 0.98 * half if told and len(left) > 1 else min(_TOLERANCE, half)
-    return round(1e9 * options.get("tolerance", 1e-9 * default))
-
-
-def _report_alone(
-    left: Listing, right: Listing, partner: IntArray, kept: IntArray, swap: bool, faults: FaultLog
-) -> None:
-    """Report the images that have no partner."""
-    head, tail = int(kept[0]), len(left) - 1 - int(kept[-1])
-    alone = kept[partner[kept] < 0]
-    unused = len(right) - int((partner >= 0).sum())
-    for ends, where in ((head, "before the first pair"), (tail, "after the last pair")):
-        if ends:
-            faults.report("pairs", f"{left.folder}: {count(ends, 'image')} {where} left out")
-    if len(alone):
-        line = f"{left.folder}: {count(len(alone), 'image')} without a partner in {right.folder}"
-        what = "left out" if swap else "given without a right image"
-        faults.report("pairs", f"{line} (first: {left.names[alone[0]]}); {what}")
-    if unused:
-        faults.report("pairs", f"{right.folder}: {count(unused, 'image')} without a partner in {left.folder}; left out")
-
-
-def _no_pair(left: Listing, right: Listing, tolerance: float) -> str:
-    """Why nothing pairs, with how far the nearest two images are apart."""
-    gap = int(np.abs(right.keys[pair(left.keys, right.keys, np.inf)] - left.keys).min())
-    line = f"no image of {left.folder} has a partner in {right.folder}: the nearest two are "
-    if not left.stamped:
-        return f"{line}{gap} frames apart"
-    line += f"{1e-6 * gap:.6g} ms apart, {1e-6 * tolerance:.6g} ms are allowed"
-    enough = gap <= WIDEST_TOLERANCE * 1e9
-    return f"{line}; see tolerance=… [s]" if enough else f"{line}: the clocks of the cameras differ"

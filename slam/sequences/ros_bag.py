@@ -12,18 +12,13 @@ from typing import Any
 import numpy as np
 
 from slam.errors import CalibrationError, SequenceError, SlamError, one_line, text_of
+from slam.sequences.base import attempt
 from slam.sequences.calibration import Entry, array, naming
 from slam.sequences.images import Size, decode_image, require_image_size, size_text
 
 #: Types of messages that hold an image.
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"  #: type of what a camera says of itself
-_MATRICES: dict[str, tuple[str, tuple[int, ...] | None]] = {
-    "K": ("cameramatrix", (3, 3)),  # of the raw image
-    "D": ("distcoeffs", None),
-    "R": ("rectificationmatrix", (3, 3)),  # from raw to rectified camera axes
-    "P": ("projectionmatrix", (3, 4)),  # of the rectified image; ``P[0, 3] = -fx B`` of the right camera of a pair
-}
 _LARGEST, _RATIO = 2**30, 50  # of what is unpacked: bytes, or times its size
 
 #: Encodings of depth images, in ROS's convention (REP 118): no picture of a camera.
@@ -61,10 +56,7 @@ def _one_line(path: Path) -> Iterator[None]:
 
 
 def grey_image(message: Any, kind: str, what: str, size: Size | None = None) -> np.ndarray:
-    """The image (H, W) of a message of a `kind`, `RAW` or `COMPRESSED`, in grey, 8 or 16 bits as sent.
-
-    SequenceError, which names `what` it is, where it is damaged, in an unknown encoding, or of another size.
-    """
+    """The image (H, W) of a message, of a `kind` `RAW` or `COMPRESSED`, in grey as sent; `what` names it in errors."""
     if kind == COMPRESSED:
         return decode_image(bytes(message.data), what, size)
     width, height, step = int(message.width), int(message.height), int(message.step)
@@ -113,20 +105,19 @@ class Bag:
         """A message as an object."""
         return self._reader.deserialize(data, self.kinds[topic])
 
-    def image(self, topic: str, data: bytes, what: str, size: Size | None = None) -> np.ndarray:
-        """The image (H, W) of a message, see `grey_image`."""
+    def image(self, topic: str, row: int, data: bytes, size: Size | None = None) -> np.ndarray:
+        """The image (H, W) of a topic's message by its number, see `grey_image`."""
         with _one_line(self.path):
-            return grey_image(self.read(topic, data), self.kinds[topic], what, size)
+            return grey_image(self.read(topic, data), self.kinds[topic], f"{topic}, message {row}", size)
 
     def first_image(self, topic: str) -> np.ndarray:
         """The first image (H, W) of a topic that can be read; SequenceError where none can."""
-        reason = "no messages"
-        for _, _, data in self.messages([topic]):
-            try:
-                return self.image(topic, data, topic)
-            except SequenceError as error:
-                reason = str(error)
-        raise SequenceError(f"{self.path}: no image of {topic} can be read: {reason}")
+        image = None
+        for row, (_, _, data) in enumerate(self.messages([topic])):
+            image = attempt(self.image, topic, row, data)
+            if isinstance(image, np.ndarray):
+                return image
+        raise SequenceError(f"{self.path}: no image of {topic} can be read: {image}")
 
     def first(self, topic: str) -> Any:
         """The first message of a topic as an object; None where there is none."""
@@ -134,33 +125,27 @@ class Bag:
             return next((self.read(topic, data) for _, _, data in messages), None)
 
     def camera_info(self, topic: str) -> dict[str, Entry]:
-        """The first CameraInfo message of a topic, of ROS 1, which writes matrices in capitals, or 2, as entries.
-
-        CalibrationError where there is none, it holds what no calibration holds, or only a part of the image is given.
-        """
+        """The first CameraInfo message of a topic as entries; ROS 1 writes the matrices' names in capitals."""
         message = self.first(topic)
         if message is None:
             raise CalibrationError(f"{self.path}: topic {topic} has no messages")
         with naming(Path(topic)):
-            found: dict[str, Entry] = {"distortionmodel": ("distortion_model", str(message.distortion_model))}
-            for name, (entry, shape) in _MATRICES.items():
-                found[entry] = name, array(getattr(message, name, getattr(message, name.lower(), None)), name, shape)
-            size = int(message.width), int(message.height)
-            roi = int(message.roi.width), int(message.roi.height)
+            size, roi = ((int(area.width), int(area.height)) for area in (message, message.roi))
             if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):
                 raise CalibrationError("binning and regions of interest are not supported")
-            return found | {"size": ("size", size)}
+            entries: dict[str, Entry] = {"size": ("size", size)}
+            entries["distortionmodel"] = "distortion_model", str(message.distortion_model)
+            for name in "KDRP":
+                numbers = getattr(message, name, getattr(message, name.lower(), None))
+                entries[name.lower()] = name, array(numbers, name, None)
+            return entries
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a recording, and close it in the end.
-
-    SequenceError for every fault of it, also of what is read meanwhile, or where rosbags is missing.
-    """
+    """Open a recording, and close it in the end; every fault of it, also while it is read, is a SequenceError."""
     if find_spec("rosbags") is None:
-        line = "ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
-        raise SequenceError(f"{path}: {line}")
+        raise SequenceError(f"{path}: it is read by the package rosbags, which is not installed: pip install rosbags")
     with _one_line(path), ExitStack() as stack:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -179,7 +164,7 @@ def _unpack(packed: Path, target: Path) -> None:
         from compression import zstd  # type: ignore[import-not-found, unused-ignore]
     except ImportError:  # before Python 3.14
         from backports import zstd
-    most = max(_LARGEST, _RATIO * packed.stat().st_size)
+    most = max(_LARGEST, _RATIO * packed.stat().st_size)  # bytes
     with zstd.open(packed, "rb") as file, target.open("wb") as unpacked:
         while part := file.read(_LARGEST // 64):
             unpacked.write(part)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,7 +15,7 @@ from slam.errors import SequenceError, TrajectoryError
 from slam.files import read_text
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.sequences.faults import FaultLog
+from slam.sequences.base import FaultLog
 
 T = TypeVar("T")
 
@@ -33,11 +34,7 @@ _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASC
 
 
 def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T | None]:
-    """The rows of a text file; blank lines, ``#`` comments, and a first row such as ``frame,timestamp`` do not count.
-
-    A row that `parse` refuses with a ValueError is reported and stands as None, so that row numbers keep their meaning.
-    SequenceError where the file cannot be read or holds no row, or where more than half of its rows are refused.
-    """
+    """What `parse` makes of the rows of a text, but comments and a heading; None for one refused with a ValueError."""
     rows: list[T | None] = []
     refused: list[str] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -61,22 +58,19 @@ def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T
 def read_times(path: Path, faults: FaultLog) -> tuple[Array, list[str]]:
     """The times in a file by row [s], NaN for unreadable ones, and the images that its rows name, if all do.
 
-    A row's time is its first number, or a date with the time, whatever names stand beside it; the second number where
-    the first ones count rows. Times since 1970 in a finer unit are known by their size, which is said.
-
-    SequenceError where the file cannot be read, or a time is impossible.
+    A row's time is its first number, or a date with the time; the second number where the first ones count rows. Times
+    since 1970 in a finer unit are known by their size. SequenceError where a time is impossible.
     """
     names: list[str] = []
 
     def row(text: str) -> list[float]:
         names.extend(name for name in re.split(r"[,;\s/\\]+", text) if _IMAGE.search(name))
-        return _numbers_in(text)
+        return [*_numbers_in(text), np.nan][:2]
 
     rows = read_rows(path, row, faults)
-    table = np.array([(*(row or ())[:2], np.nan, np.nan)[:2] for row in rows])
-    times, second = table.T
+    times, second = np.array([row or [np.nan, np.nan] for row in rows]).T
     low, high = SINCE_1970
-    counts = len(table) > 1 and times[0] % 1 == 0 and 0 <= times[0] < low and (np.diff(times) == 1).all()
+    counts = len(times) > 1 and times[0] % 1 == 0 and 0 <= times[0] < low and (np.diff(times) == 1).all()
     if counts and (np.diff(second) > 0).all():
         faults.report("times", f"{path}: the first number of each row counts rows; the second one is taken as time")
         times = second
@@ -95,25 +89,19 @@ def _numbers_in(text: str) -> list[float]:
         return [1e-9 * date_time(date[0])]
     found: list[float] = []
     for word in re.split(r"[,;\s]+", text):
-        try:
+        with suppress(ValueError):
             found.append(float(word))
-        except ValueError:
-            continue
-    if not found:
-        raise ValueError(f"{shorten(text)} is not a time in seconds")
-    if not np.isfinite(found[0]):
-        raise ValueError(f"{shorten(text)} is not a finite time")
+    if not found or not np.isfinite(found[0]):
+        raise ValueError(f"{text!r:.40} is not a {'finite time' if found else 'time in seconds'}")
     return found
 
 
 def date_time(text: str) -> int:
     """Nanoseconds since 1970 of ``2011-09-26 13:10:51.174740992``."""
-    try:
-        if not _DATE_TIME.fullmatch(text):
-            raise ValueError
-        return int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
-    except ValueError:
-        raise ValueError(f"{shorten(text)} is not a date and time") from None
+    with suppress(ValueError):  # of the 31st of February
+        if _DATE_TIME.fullmatch(text):
+            return int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
+    raise ValueError(f"{text!r:.40} is not a date and time")
 
 
 def numbers(text: str, count: int, what: str) -> list[float]:
@@ -121,34 +109,23 @@ def numbers(text: str, count: int, what: str) -> list[float]:
     try:
         row = [float(word) for word in text.split()[:count]]
     except ValueError:
-        raise ValueError(f"{shorten(text)} is not a row of numbers") from None
+        raise ValueError(f"{text!r:.40} is not a row of numbers") from None
     if len(row) < count or not np.isfinite(row).all():
-        raise ValueError(f"{shorten(text)} is not {what}")
+        raise ValueError(f"{text!r:.40} is not {what}")
     return row
 
 
-def shorten(text: str, length: int = 40) -> str:
-    """The text in quotes, cut where it is long."""
-    return repr(text if len(text) <= length else text[:length] + "…")
-
-
 def require_truth(path: Trajectory, source: Path) -> Trajectory:
-    """The true path of a file.
-
-    TrajectoryError where a rotation is none (a matrix of zeros, a reflection), a position beyond the Earth, or every
-    position exactly zero: errors against such a path would mean nothing.
-    """
+    """The true path of a file; TrajectoryError where a rotation or position is impossible, or all positions zero."""
     if not len(path):
         raise TrajectoryError(f"{source}: no pose is left")
-    R, positions = path.poses[:, :3, :3], path.positions
-    beyond = np.abs(positions).max(axis=1) > LARGEST
-    if beyond.any():
-        raise TrajectoryError(f"{source}: the position of pose {int(np.argmax(beyond))} is beyond the Earth")
+    R = path.poses[:, :3, :3]
     R = np.where((np.abs(R).max(axis=(1, 2)) > 1 + _ROTATION)[:, None, None], 0.0, R)
-    improper = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) > _ROTATION
-    improper |= np.linalg.det(R) < 0
-    if improper.any():
-        raise TrajectoryError(f"{source}: the rotation of pose {int(np.argmax(improper))} is none")
-    if len(path) > 1 and not positions.any():
+    improper = (np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) > _ROTATION) | (np.linalg.det(R) < 0)
+    beyond = np.abs(path.positions).max(axis=1) > LARGEST
+    for wrong, what in ((beyond, "position of pose {} is beyond the Earth"), (improper, "rotation of pose {} is none")):
+        if wrong.any():
+            raise TrajectoryError(f"{source}: the {what.format(int(np.argmax(wrong)))}")
+    if len(path) > 1 and not path.positions.any():
         raise TrajectoryError(f"{source}: every position is zero")
     return path

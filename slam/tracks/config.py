@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from slam.bounds import LEAST, MOST, require_not_negative
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN, require_not_negative
 
-_RANGES = {
-    "wide_hypotheses": (1, 100_000),
-    "window_sigmas": (0.0, 1e3),
-    "window_min": (0.0, 1e4),
-    "window_max": (0.0, 1e4),
-    "window_sizes": (0.0, 1e4),
-}
+_COUNT, _SHARE = (1, 10**6), (0.0, 1.0)
+_ASSOCIATION = {  # least and largest values
+    "wide_hypotheses": (1, 100_000), "window_sigmas": (LEAST, 1e3), "window_min": (LEAST, 1e4),
+    "window_max": (LEAST, 1e4), "ratio": (LEAST, 1.0), "view_ratio": (1.0, MOST), "kidnapped_after": _COUNT,
+}  # fmt: skip
+_MAP = {
+    "target_in_view": (3, 10**6), "max_depth_error": (LEAST, 1.0), "erase_share": _SHARE, "erase_missed": _COUNT,
+    "lost_after": _COUNT, "restart_after": _COUNT, "descriptor_update": _SHARE,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -22,11 +24,8 @@ class AssociationConfig:
     """Settings of the association.
 
     Attributes:
-        windows: kind of the search windows: ``"covariance"``, ellipses by the innovation's covariance, or ``"fixed"``,
-            squares of fixed sizes as in paper A, Fig. 4.
-        window_sigmas: half sizes of covariance windows, smallest first, in standard deviations of the innovation.
-        window_min, window_max: bounds of the half axes of the smallest covariance window [px].
-        window_sizes: half sizes of fixed windows, smallest first [px].
+        window_sigmas: half sizes of the search windows, smallest first, in standard deviations of the innovation.
+        window_min, window_max: bounds of the half axes of the smallest window [px].
         d_match: largest descriptor distance in each window (paper A, Eq. 12); falls as the window grows.
         ratio: largest ratio of the best to the second best distance in a window (paper B, 2.2).
         consistency_sigmas: largest reprojection error of a match that agrees with a pose, in units of the pixel noise.
@@ -41,11 +40,9 @@ class AssociationConfig:
             `slam.tracks.alignment`), if the front end can do that.
     """
 
-    windows: str = "covariance"
     window_sigmas: tuple[float, ...] = (2.5, 5.0)
     window_min: float = 4.0
     window_max: float = 400.0
-    window_sizes: tuple[float, ...] = (10.0, 30.0)
     d_match: tuple[float, ...] = (0.55, 0.4)
     ratio: float = 0.8
     consistency_sigmas: float = 5.0
@@ -80,26 +77,13 @@ class AssociationConfig:
     #: Standard deviation [px] assumed in the second search, around the pose on which matches agreed.
     refined_window: ClassVar[float] = 3.0
 
-    __pydantic_config__ = FORBID_UNKNOWN
-
     def __post_init__(self) -> None:
-        require_not_negative(self, _RANGES, "association")
-        if self.windows not in ("covariance", "fixed"):
-            raise ConfigurationError(f"association: windows must be 'covariance' or 'fixed', got {self.windows!r}")
-        name = "window_sizes" if self.windows == "fixed" else "window_sigmas"
-        sizes = getattr(self, name)
-        if len(sizes) != len(self.d_match) or not sizes:
-            raise ConfigurationError(f"association: {name} and d_match must have the same number of values")
-        if list(sizes) != sorted(sizes) or sizes[0] <= 0:
-            raise ConfigurationError(f"association: {name} must be positive and ascending")
-        if not 0 < self.window_min <= self.window_max:
-            raise ConfigurationError("association: 0 < window_min <= window_max is required")
-        if not 0 < self.ratio <= 1:
-            raise ConfigurationError("association: ratio must lie in (0, 1]")
-        if self.view_ratio < 1:
-            raise ConfigurationError("association: view_ratio must be at least 1")
-        if self.kidnapped_after < 1:
-            raise ConfigurationError("association: kidnapped_after must be at least 1")
+        require_not_negative(self, _ASSOCIATION, "association")
+        sizes = self.window_sigmas
+        if len(sizes) != len(self.d_match) or list(sizes) != sorted(sizes):
+            raise ConfigurationError("association: window_sigmas must be ascending, one for each value of d_match")
+        if self.window_min > self.window_max:
+            raise ConfigurationError("association: window_min must not lie above window_max")
 
 
 @dataclass(frozen=True)
@@ -155,17 +139,7 @@ class MapConfig:
     #: Largest descriptor distance at which landmarks are merged.
     same_descriptor: ClassVar[float] = 0.4
 
-    __pydantic_config__ = FORBID_UNKNOWN
-
     def __post_init__(self) -> None:
-        require_not_negative(self)
-        if self.target_in_view < 3 or self.max_landmarks < self.target_in_view:
-            raise ConfigurationError("map: 3 <= target_in_view <= max_landmarks is required")
-        if min(self.grid) < 1 or self.separation < 0:
-            raise ConfigurationError("map: grid cells must be at least 1 and separation not negative")
-        if not (0 < self.max_depth_error < 1 and 0 <= self.erase_share < 1):
-            raise ConfigurationError("map: max_depth_error or erase_share is out of range")
-        if min(self.erase_missed, self.lost_after, self.restart_after) < 1 or self.descriptor_update > 1:
-            raise ConfigurationError(
-                "map: erase_missed, lost_after and restart_after >= 1 and descriptor_update <= 1 are required"
-            )
+        require_not_negative(self, _MAP, "map")
+        if self.max_landmarks < self.target_in_view:
+            raise ConfigurationError("map: target_in_view must not lie above max_landmarks")

@@ -16,7 +16,6 @@ from slam.data import BoolArray, StereoFeatures
 from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
 from slam.runtime.compilation import helper, kernel, vector_helper
-from slam.tracks.config import AssociationConfig
 
 Descriptors = NDArray[np.float32]
 
@@ -31,20 +30,13 @@ class Matches(Table):
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Search windows about expected pixels, the smallest first, and how alike descriptors must be in each."""
+    """Search ellipses about expected pixels, the smallest first, and how alike descriptors must be in each."""
 
-    sizes: tuple[float, ...]  # half sizes (L,): standard deviations of the innovation; of squares [px]
+    sizes: tuple[float, ...]  # half sizes (L,), in standard deviations of the innovation
     d_match: tuple[float, ...]  # largest descriptor distance in each (L,)
     ratio: float  # largest ratio of the best to the second best distance
-    most: float = 0.0  # half axes of the smallest ellipse are bounded by this [px]; 0 for squares
-    least: float | Array = 0.0  # and from below by this, or by one number for each track (M,)
-
-    @classmethod
-    def of(cls, c: AssociationConfig) -> Windows:
-        """The windows of landmarks."""
-        if c.windows == "fixed":
-            return cls(c.window_sizes, c.d_match, c.ratio)
-        return cls(c.window_sigmas, c.d_match, c.ratio, c.window_max, c.window_min)
+    most: float  # half axes of the smallest are bounded by this [px]
+    least: float | Array  # and from below by this, or by one number for each track (M,)
 
 
 def follow(
@@ -73,40 +65,18 @@ def match_everywhere(
     allowed: BoolArray | None = None,
 ) -> Matches:  # fmt: skip
     """Recognise tracks (M, D) by descriptor alone, wherever they lie in the image, or in pairs `allowed` (M, N)."""
-    best = np.empty(len(descriptors), np.intp)
     allowed = np.ones((0, 0), bool) if allowed is None else np.ascontiguousarray(allowed)
-    mutual_best(
-        descriptors @ features.descriptors.T, allowed, laplacian, features.laplacian, np.float32(d_match),
-        np.float32(ratio), best,
-    )  # fmt: skip
+    products, limits = descriptors @ features.descriptors.T, (np.float32(d_match), np.float32(ratio))
+    best = mutual_best(products, allowed, laplacian, features.laplacian, *limits)
     rows = np.flatnonzero(best >= 0)
     return Matches(rows, best[rows])
 
 
-def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pairs of rows of centres (M, 2) and of pixels (N, 2) within `reach` (M, 2) of them, by ascending centre.
-
-    Pixels are sorted by column, so that few pairs have to be tested.
-    """
-    order = np.argsort(uv[:, 0], kind="stable")
-    boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach), np.ascontiguousarray(uv), order
-    rows, inside = np.empty((2, 8 * len(centres)), np.intp)  # 8: pairs a box for which there is room at once
-    count = _pairs_in_boxes(*boxes, rows, inside)
-    if count > len(rows):
-        rows, inside = np.empty((2, count), np.intp)
-        _pairs_in_boxes(*boxes, rows, inside)
-    return rows[:count], inside[:count]
-
-
-def crowded(uv: Array, neighbours: Array, radius: float) -> BoolArray:
-    """Which pixels (N, 2) lie within `radius` [px] of any of the `neighbours` (M, 2)."""
-    if not len(neighbours):
-        return np.zeros(len(uv), bool)
-    rows, columns = pairs_in_boxes(uv, np.full((len(uv), 2), radius), neighbours)
-    gap = (uv[rows] - neighbours[columns]).astype(np.float32)
-    out = np.zeros(len(uv), bool)
-    out[rows[np.square(gap).sum(axis=1) < radius * radius]] = True
-    return out
+def pairs_near(centres: Array, reach: float, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pairs of rows of centres (M, 2) and of pixels (N, 2) within `reach` of them either way, by ascending centre."""
+    order = np.argsort(uv[:, 0], kind="stable")  # so that few pairs have to be tested
+    rows, found, count = _pairs_near(np.ascontiguousarray(centres), reach, np.ascontiguousarray(uv), order)
+    return rows[:count], found[:count]
 
 
 @helper
@@ -122,23 +92,48 @@ def first_column(uv, order, low):
     return place
 
 
-@kernel
-def _pairs_in_boxes(centres, reach, uv, order, rows, found):
-    """Pairs of boxes and of pixels inside them, by ascending box; returns how many there are.
+@helper
+def grown(array, room):
+    """A copy with more room."""
+    new = np.empty(room, array.dtype)
+    for k in range(len(array)):
+        new[k] = array[k]
+    return new
 
-    Boxes have centres and half sizes `reach` (M, 2); `order` is that of the columns of the pixels `uv` (N, 2). Pairs
-    are written into `rows` of boxes and those `found` as far as there is room.
-    """
-    count = 0
+
+@kernel
+def _pairs_near(centres, reach, uv, order):
+    """Rows of `pairs_near`, with room for more, and their number; `order` is that of the pixels' columns."""
+    count, room = 0, 8 * len(centres)
+    rows, found = np.empty(room, np.intp), np.empty(room, np.intp)
     for row in range(len(centres)):
-        place, high = first_column(uv, order, centres[row, 0] - reach[row, 0]), centres[row, 0] + reach[row, 0]
+        place, high = first_column(uv, order, centres[row, 0] - reach), centres[row, 0] + reach
         while place < len(order) and uv[order[place], 0] <= high:
-            if abs(uv[order[place], 1] - centres[row, 1]) <= reach[row, 1]:
-                if count < len(rows):
-                    rows[count], found[count] = row, order[place]
+            if abs(uv[order[place], 1] - centres[row, 1]) <= reach:
+                if count == room:
+                    room *= 2
+                    rows, found = grown(rows, room), grown(found, room)
+                rows[count], found[count] = row, order[place]
                 count += 1
             place += 1
-    return count
+    return rows, found, count
+
+
+@kernel
+def apart(uv, queue, wanted, separation):
+    """The first `wanted` rows of a queue (Q,) whose pixels are not closer together than the separation [px]."""
+    chosen, count = np.empty(min(wanted, len(queue)), np.intp), 0
+    for row in queue:
+        if count == len(chosen):
+            break
+        free = True
+        for k in range(count):
+            dx, dy = uv[row, 0] - uv[chosen[k], 0], uv[row, 1] - uv[chosen[k], 1]
+            free = free and dx * dx + dy * dy >= separation * separation
+        if free:
+            chosen[count] = row
+            count += 1
+    return chosen[:count]
 
 
 @helper
@@ -171,18 +166,17 @@ def best_pairs(rows, columns, distance, allowed, count, size, d_match, ratio, go
 
 
 @kernel
-def mutual_best(products, allowed, signs, feature_signs, d_match, ratio, best):
-    """Features (N,) into `best` that belong to tracks by `best_pairs`, −1 for none, wherever they lie.
+def mutual_best(products, allowed, signs, feature_signs, d_match, ratio):
+    """The features (N,) that belong to tracks by `best_pairs`, −1 for none, wherever they lie.
 
     Given are the inner products of descriptors, tracks by features (N, M), which pairs are `allowed` (N, M; all where
     that is empty), and both signs of the Laplacian.
     """
     limit = d_match / ratio  # farther features affect neither best nor ratio
     least = np.float32(1.0) - np.float32(0.5) * limit * limit
-    count, room = 0, 4 * len(products) + 64
+    best, count, room = np.full(len(products), -1, np.intp), 0, 4 * len(products) + 64
     rows, columns, distance = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.float32)
     for n in range(products.shape[0]):
-        best[n] = -1
         for m in range(products.shape[1]):
             if products[n, m] <= least or signs[n] != feature_signs[m] or (allowed.size > 0 and not allowed[n, m]):
                 continue
@@ -197,6 +191,7 @@ def mutual_best(products, allowed, signs, feature_signs, d_match, ratio, best):
     for p in range(count):
         if good[p] and best[rows[p]] < 0:
             best[rows[p]] = columns[p]
+    return best
 
 
 @helper
@@ -234,26 +229,18 @@ def in_windows(pixels, innovation, least, most, sizes, signs, uv, feature_signs,
         x, y = pixels[row, 0], pixels[row, 1]
         if not (np.isfinite(x) and np.isfinite(y)):
             continue
-        if most > 0:
-            shape = ellipse(innovation[row], least[row] ** 2, most**2)
-            uu, cross, vv = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
-            reach_u, reach_v = last * shape[3], last * shape[4]
-        else:
-            uu = cross = vv = np.float32(0.0)
-            reach_u = reach_v = last
+        uu, cross, vv, reach_u, reach_v = ellipse(innovation[row], least[row] ** 2, most**2)
+        reach_u, reach_v = last * reach_u, last * reach_v
         place = first_column(uv, order, x - reach_u)
         while place < len(order) and uv[order[place], 0] <= x + reach_u:
             feature = order[place]
             place += 1
             if abs(uv[feature, 1] - y) > reach_v or feature_signs[feature] != signs[row]:
                 continue
-            du, dv = np.float32(uv[feature, 0] - x), np.float32(uv[feature, 1] - y)
-            if most > 0:
-                off, power = np.float64(uu * du * du + np.float32(2.0) * cross * du * dv + vv * dv * dv), 2
-            else:
-                off, power = np.float64(max(abs(du), abs(dv))), 1
+            du, dv = uv[feature, 0] - x, uv[feature, 1] - y
+            off = uu * du * du + 2.0 * cross * du * dv + vv * dv * dv
             smallest = 0
-            while smallest < levels and off > sizes[smallest] ** power:
+            while smallest < levels and off > sizes[smallest] ** 2:
                 smallest += 1
             if smallest == levels:
                 continue
@@ -272,8 +259,8 @@ def _follow(
     """Pairs of tracks and of the features that continue them: those in the smallest window, then in larger ones.
 
     Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows: their half axes
-    are `sizes` (L,) times standard deviations from `least` (M,) to `most`, or [px] of squares if `most` is zero. In
-    each window, descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs`; the features are at
+    are `sizes` (L,) times standard deviations from `least` (M,) to `most`. In each window, descriptors must be nearer
+    than its limit (L,). Tracks have `looks` and `signs`; the features are at
     `uv`, in the `order` of their columns. `pairs` (2, M) are filled in; returns their number.
     """
     a, b, level, count = in_windows(pixels, innovation, least, most, sizes, signs, uv, feature_signs, order)
@@ -294,38 +281,3 @@ def _follow(
                 pairs[0, matched], pairs[1, matched] = a[p], b[p]
                 matched += 1
     return matched
-
-
-@kernel
-def nearest(points, order, places, radius, looks, place_looks, alike):
-    """Of each place (M, 2 or more) the nearest point (N, 2 or more) that has it as its own nearest place; −1 for none.
-
-    Both are less than `radius` apart, and their descriptors (N, D), (M, D) less than `alike`; `order` is that of the
-    places' columns.
-    """
-    matched, gaps = np.full(len(places), -1, np.intp), np.full(len(places), np.inf)
-    for n in range(len(points)):
-        x, y, best, least = points[n, 0], points[n, 1], -1, radius * radius
-        place = first_column(places, order, x - radius)
-        while place < len(order) and places[order[place], 0] <= x + radius:
-            m = order[place]
-            gap = (places[m, 0] - x) ** 2 + (places[m, 1] - y) ** 2
-            if gap < least:
-                best, least = m, gap
-            place += 1
-        if best >= 0 and least < gaps[best]:
-            off = np.float32(0.0)
-            for k in range(looks.shape[1]):
-                off += (looks[n, k] - place_looks[best, k]) ** 2
-            if off < alike * alike:
-                matched[best], gaps[best] = n, least
-    return matched
-
-
-@helper
-def grown(array, room):
-    """A copy with more room."""
-    new = np.empty(room, array.dtype)
-    for k in range(len(array)):
-        new[k] = array[k]
-    return new

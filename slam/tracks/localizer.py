@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, Prediction, StereoFeatures, UpdateReport
+from slam.data import BoolArray, Prediction, StereoFeatures
 from slam.geometry.arrays import isin, median
-from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
+from slam.geometry.rig import StereoRig, measurement_rows
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.models import EstimatorModels
 from slam.tracks.config import AssociationConfig
@@ -24,18 +24,13 @@ from slam.tracks.table import LandmarkTable
 from slam.window.consensus import CLEAR_MAJORITY, PoseConsensus, find_consensus
 
 
+@dataclass(frozen=True, eq=False)
 class Localizer:
-    """How landmarks are searched for in frames, and when the pose that they give is credible.
+    """How landmarks are searched for in frames, and when the pose that they give is credible."""
 
-    After `lost_after` frames without a measured pose a camera with an uncertain prediction is lost.
-    """
-
-    def __init__(self, rig: StereoRig, config: AssociationConfig, models: EstimatorModels, lost_after: int = 5) -> None:
-        self.rig = rig
-        self.config = config
-        self.models = models
-        self.pixel_sigma = models.pixel_sigma
-        self._lost_after = lost_after
+    rig: StereoRig
+    config: AssociationConfig
+    models: EstimatorModels
 
     def match(
         self, prediction: Prediction, landmarks: LandmarkTable, positions: Array, features: StereoFeatures, seed: int
@@ -55,22 +50,6 @@ class Localizer:
         ratio = self.config.view_ratio
         return np.asarray(~(turned | (after > ratio * before) | (before > ratio * after)))
 
-    def state_after(
-        self, tracking: TrackingState, prediction: Prediction, features: StereoFeatures, matches: LandmarkMatches,
-        report: UpdateReport, stands: bool,
-    ) -> TrackingState:  # fmt: skip
-        """The tracking state after a frame, by whether its pose was measured.
-
-        It was not measured if the back end used less than half of the landmarks that agree with each other; a lost
-        camera must match more landmarks than a tracked one. A frame whose pose agrees with the last frame's, but
-        awaits a third one, does not count as showing an unknown place.
-        """
-        least = self.config.minimum_consistent if tracking.lost else MINIMAL_POINTS
-        measured = len(report.used) >= least and 2 * len(report.used) >= len(matches)
-        uncertain = median_deviation(prediction) > self.config.tight_window
-        stereo = 0 if tracking.doubted.count > 1 else int(features.has_stereo.sum())
-        return tracking.after(measured, stands, uncertain, stereo, self._lost_after)
-
 
 @dataclass(frozen=True, eq=False)
 class Search:
@@ -83,11 +62,6 @@ class Search:
     features: StereoFeatures  # of the frame
     seed: int  # of the random choice in the geometric check
 
-    @property
-    def config(self) -> AssociationConfig:
-        """The settings."""
-        return self.localizer.config
-
     def follow(
         self, tracking: TrackingState, standing: Standing, elsewhere: Callable[[], Array | None]
     ) -> tuple[LandmarkMatches, TrackingState, Standing]:
@@ -98,7 +72,7 @@ class Search:
         if standing.stands:
             matches = self.match()
             if matches.T_world_left is not None:
-                rig, sigma = self.localizer.rig, self.localizer.pixel_sigma
+                rig, sigma = self.localizer.rig, self.localizer.models.pixel_sigma
                 standing = standing.contested(rig, sigma, self.features, matches.rows, matches.T_world_left)
             if standing.stands:
                 if 2 * isin(matches.rows, standing.witnesses).sum() <= len(matches):
@@ -120,8 +94,9 @@ class Search:
         is asked for a pose, which is treated likewise, but is accepted at once if the prediction allows it and enough
         landmarks match around it.
         """
-        models, stamp, doubtful = self.localizer.models, self.features.stamp, tracking.unmeasured > 0
-        matches, farthest = self.match(doubtful), self.config.lost_jump if doubtful else self.config.max_jump
+        c, models, stamp = self.localizer.config, self.localizer.models, self.features.stamp
+        doubtful = tracking.unmeasured > 0
+        matches, farthest = self.match(doubtful), c.lost_jump if doubtful else c.max_jump
         T = matches.T_world_left
         if T is None:
             T = elsewhere()
@@ -139,12 +114,12 @@ class Search:
             around, expected = self.match_around(T)
             # 0.5: share of the landmarks in view, or of the features where these are fewer, that makes a majority
             majority = 0.5 * min(expected, len(self.features))
-            allowed = len(around) >= max(majority, 2 * self.config.minimum_consistent)
+            allowed = len(around) >= max(majority, 2 * c.minimum_consistent)
             matches = around if allowed else matches
-        if allowed and len(matches):
+        if allowed and len(matches.ids):
             return matches, tracking.believing(T, stamp, hidden_at)
         doubted = tracking.doubted.after(T, stamp, models)
-        if doubted.count < self.config.kidnapped_after:
+        if doubted.count < c.kidnapped_after:
             return replace(LandmarkMatches.nothing(), doubted=len(matches)), replace(tracking, doubted=doubted)
         nothing = replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
         return nothing, tracking.believing(T, stamp)
@@ -159,9 +134,9 @@ class Search:
         `doubtful` says that nothing was matched in the last frame, so that a pose from the whole map needs more
         matches, see `AssociationConfig.wide_share`.
         """
-        if not len(self.landmarks) or not len(self.features):
+        if not len(self.landmarks.ids) or not len(self.features.scale):
             return LandmarkMatches.nothing()
-        c, p = self.config, self.prediction
+        c, p = self.localizer.config, self.prediction
         rows = self.landmarks.rows(p.ids)
         searched = self._searched_for(p.T_world_left)[rows]
         matches = self._in_windows(p.uv_left[searched], p.innovation[searched], rows[searched])
@@ -190,18 +165,20 @@ class Search:
         """Landmarks in small windows around a pose (4, 4), none if too few agree, and how many were searched for."""
         matches, expected = self._around(T_world_left)
         consensus = self._consensus(matches, T_world_left)
-        enough = consensus.inliers.sum() >= self.config.minimum_consistent
+        enough = consensus.inliers.sum() >= self.localizer.config.minimum_consistent
         return self._agreeing(matches, consensus) if enough else LandmarkMatches.nothing(), expected
 
     def _searched_for(self, T_world_left: Array) -> BoolArray:
         """Which landmarks (N,) are searched for in windows: those in a similar view, and those long out of view."""
         alike = self.localizer.similar_view(T_world_left, self.landmarks.seen_from, self.positions)
-        return alike | self.landmarks.long_out_of_view(self.config.rematch_after)
+        return alike | self.landmarks.long_out_of_view(self.localizer.config.rematch_after)
 
     def _in_windows(self, uv: Array, innovation: Array, rows: NDArray[np.intp]) -> Matches:
         """Matches of the landmarks at `rows` (M,), in windows around their pixels (M, 2)."""
         looks = self.landmarks.descriptors[rows], self.landmarks.laplacian[rows]
-        pairs = follow(uv, innovation, *looks, self.features, Windows.of(self.config))
+        c = self.localizer.config
+        windows = Windows(c.window_sigmas, c.d_match, c.ratio, c.window_max, c.window_min)
+        pairs = follow(uv, innovation, *looks, self.features, windows)
         return Matches(rows[pairs.tracks], pairs.features)
 
     def _around(self, T_world_left: Array) -> tuple[Matches, int]:
@@ -209,16 +186,16 @@ class Search:
         left = self.localizer.rig.left
         uv = left.project(transform(inverse(T_world_left), self.positions))
         view = np.flatnonzero(left.in_image(uv) & self._searched_for(T_world_left))
-        innovation = np.tile(np.eye(2) * self.config.refined_window**2, (len(view), 1, 1))
+        innovation = np.tile(np.eye(2) * self.localizer.config.refined_window**2, (len(view), 1, 1))
         return self._in_windows(uv[view], innovation, view), len(view)
 
     def _consensus(self, matches: Matches, guess: Array, wide: bool = False) -> PoseConsensus:
         """The pose on which matches agree."""
-        c, rows = self.config, matches.features
+        c, rows, rig = self.localizer.config, matches.features, self.localizer.rig
         if wide and len(matches) < c.minimum_consistent:
             return PoseConsensus(guess, np.zeros(len(matches), bool))
         measured = measurement_rows(self.features.uv_left[rows], self.features.uv_right[rows])
-        rig, threshold = self.localizer.rig, c.consistency_sigmas * self.localizer.pixel_sigma
+        threshold = c.consistency_sigmas * self.localizer.models.pixel_sigma
         hypotheses = c.wide_hypotheses if wide else c.hypotheses
         return find_consensus(rig, self.positions[matches.tracks], measured, guess, threshold, hypotheses, self.seed)
 
@@ -232,7 +209,7 @@ class Search:
         if not len(matches):
             return LandmarkMatches.nothing()
         matches = matches.select(np.argsort(matches.tracks, kind="stable"))
-        c, table = self.config, self.landmarks
+        c, table = self.localizer.config, self.landmarks
         agreeing = LandmarkMatches(table.ids[matches.tracks], matches.features, consensus.T_world_left)
         awaited = table.long_out_of_view(c.rematch_after) & (table.returning + 1 < c.kidnapped_after)
         awaited = awaited[matches.tracks]

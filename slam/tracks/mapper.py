@@ -6,10 +6,10 @@ move, duplicate another one, crowd a place out of view, or if the map is full.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.checks import in_front
 from slam.chi_square import SIGMAS
@@ -21,7 +21,7 @@ from slam.geometry.se3 import inverse, transform
 from slam.interfaces import Backend, MapBackend
 from slam.third_party import checked
 from slam.tracks.config import MapConfig
-from slam.tracks.follow import crowded, pairs_in_boxes
+from slam.tracks.follow import apart, pairs_near
 from slam.tracks.localizer import Localizer
 from slam.tracks.monocular import depths_by_motion, frame_covariance, unclaimed
 from slam.tracks.step import LandmarkMatches, Step
@@ -31,11 +31,9 @@ _BLOCK = 256  # cost: landmarks compared with all others at once
 _SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
 
 
-@dataclass(frozen=True, eq=False)
-class MapView:
+class MapView(NamedTuple):
     """The map and the frame's features as seen from one pose."""
 
-    T_world_left: Array  # the pose (4, 4)
     positions: Array  # of the landmarks (N, 3) in world coordinates [m]
     local: Array  # the same in left-camera coordinates (N, 3)
     uv_left: Array  # the landmarks' left pixels (N, 2), NaN behind the camera
@@ -51,8 +49,7 @@ class MapView:
         local = transform(inverse(T_world_left), positions)
         uv = rig.left.project(local)
         points = rig.triangulate(features.uv_left, features.uv_right)
-        deviation = rig.depth_deviation(points, pixel_sigma)
-        return cls(T_world_left, positions, local, uv, rig.left.in_image(uv), points, deviation)
+        return cls(positions, local, uv, rig.left.in_image(uv), points, rig.depth_deviation(points, pixel_sigma))
 
 
 class Mapper:
@@ -75,18 +72,17 @@ class Mapper:
         view = self._view(backend, step)
         self._count(view, step)
         rows, landmarks = tracks.mapped, tracks.landmarks()
-        bad = isin(landmarks.ids, step.labels.landmarks)
+        doubled, known = duplicates(view, landmarks, features, self.config)
+        bad = isin(landmarks.ids, step.labels.landmarks) | doubled
         if features.has_stereo.any() or not len(features):  # else nothing can take their place
             bad |= undetected_landmarks(landmarks, self.config)
-        bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= redundant_landmarks(landmarks, view.positions, self.config)
-        free = ~features_of_landmarks(view, landmarks, features, self.config)
         erased = landmarks.ids[bad]
         tracks.erase_landmarks(rows[bad])
         if len(tracks.mapped) < MINIMAL_POINTS or step.tracking.may_add(self.config.restart_after):
             for taken in (step.matches.rows, step.labels.moving, step.labels.undecided):
-                free[taken] = False
-            step = self._add(backend, step, free)
+                known[taken] = True
+            step = self._add(backend, step, view, ~known)
         if len(tracks.mapped) > self.config.max_landmarks:
             surplus = tracks.mapped[surplus_landmarks(tracks.landmarks(), self.config)]
             erased = np.concatenate([erased, tracks.ids[surplus]])
@@ -128,55 +124,53 @@ class Mapper:
         """The map as the camera sees it."""
         ids = step.tracks.ids[step.tracks.mapped]
         positions = checked(backend, "positions", backend.positions(ids), n=len(ids))
-        return MapView.of(self.rig, step.estimate.T_world_left, positions, step.features, self._localizer.pixel_sigma)
+        T, sigma = step.estimate.T_world_left, self._localizer.models.pixel_sigma
+        return MapView.of(self.rig, T, positions, step.features, sigma)
 
     def _count(self, view: MapView, step: Step) -> None:
         """Count landmarks as seen or missed, in place, unless the frame's pose was not measured."""
-        m, tracks, rows, matches = self.config, step.tracks, step.tracks.mapped, step.matches
-        matches = matches.select(isin(matches.ids, step.report.used))
+        m, tracks, rows, T = self.config, step.tracks, step.tracks.mapped, step.estimate.T_world_left
+        matches = step.matches.select(isin(step.matches.ids, step.report.used))
         expected = rows[:0]
         if not step.tracking.unmeasured:
             size = (self.rig.left.width, self.rig.left.height)
             shown = expected_landmarks(view, step.features, size, m.view_margin, m.occlusion_radius)
-            shown &= self._localizer.similar_view(view.T_world_left, tracks.seen_from[rows], view.positions)
+            shown &= self._localizer.similar_view(T, tracks.seen_from[rows], view.positions)
             expected = rows[shown]
         tracks.count_frame(
-            step.index, expected, tracks.rows(matches.ids), step.features, matches.rows, m.descriptor_update,
-            view.T_world_left[:3, 3], rows[~view.in_image], self._localizer.config.rematch_after,
-            rows[isin(tracks.ids[rows], step.suspects)],
+            step.index, expected, tracks.rows(matches.ids), step.features, matches.rows, m.descriptor_update, T[:3, 3],
+            rows[~view.in_image], self._localizer.config.rematch_after, rows[isin(tracks.ids[rows], step.suspects)],
         )  # fmt: skip
 
-    def _add(self, backend: Backend, step: Step, free: BoolArray) -> Step:
-        """Turn `free` features (F,) into landmarks, so far as landmarks are wanted."""
-        features, occupied = step.features, step.features.uv_left[step.matches.rows]
-        step = self._entered(
-            step, new_landmarks(features, free, occupied, self.rig, self._localizer.pixel_sigma, self.config)
-        )
-        if len(step.added):
-            backend.add(step.added.observations(features))
-        wanted = self.config.monocular or (self.config.monocular is None and not features.has_stereo.any())
-        if wanted and isinstance(backend, MapBackend) and len(step.matches) >= MINIMAL_POINTS:
-            return self._add_monocular(backend, step, np.flatnonzero(free & ~features.has_stereo))
-        return step
+    def _add(self, backend: Backend, step: Step, view: MapView, free: BoolArray) -> Step:
+        """Turn `free` features (F,) into landmarks, so far as landmarks are wanted.
 
-    def _add_monocular(self, backend: MapBackend, step: Step, rows: IndexArray) -> Step:
-        """Turn features `rows` without a stereo match into landmarks once two views give depth (paper B, 2.2)."""
-        landmarks, features, matches = step.tracks.landmarks(), step.features, step.matches
-        T, sigma = step.estimate.T_world_left, self._localizer.pixel_sigma
-        view = self._view(backend, step)  # type: ignore[arg-type]
+        Those without a stereo match become landmarks once two views give depth (paper B, 2.2).
+        """
+        features, matches, c, sigma = step.features, step.matches, self.config, self._localizer.models.pixel_sigma
+        occupied, stereo = features.uv_left[matches.rows], features.has_stereo
+        deep = free & (view.depth_sigma < c.max_depth_error * view.points[:, 2])
+        step = self._entered(step, new_landmarks(features, deep, occupied, self.rig, c))
+        if len(step.added.ids):
+            backend.add(step.added.observations(features))
+        wanted = c.monocular or (c.monocular is None and not stereo.any())
+        if not (wanted and isinstance(backend, MapBackend) and len(matches.ids) >= MINIMAL_POINTS):
+            return step
+        landmarks, view = step.tracks.landmarks(), self._view(backend, step)
         shown = np.flatnonzero(view.in_image)
+        rows = np.flatnonzero(free & ~stereo)
         rows = unclaimed(view.uv_left[shown], landmarks.descriptors[shown], features, rows)
         in_map = isin(matches.ids, landmarks.ids)
-        local, stereo = view.local[landmarks.rows(matches.ids[in_map])], features.has_stereo[matches.rows[in_map]]
-        P = frame_covariance(self.rig, local, stereo, sigma)
-        with_depth, depths = depths_by_motion(
-            self.rig, step.tracks, features, rows, T, P, step.index, sigma, self.config.max_depth_error
-        )
-        front = np.flatnonzero(in_front(depths.local))
-        wanted = max(self.config.target_in_view - len(matches) - len(step.added), 0)
-        best = front[np.sort(np.argsort(-features.response[with_depth[front]], kind="stable")[:wanted])]
-        before = len(step.added)
-        step = self._entered(step, with_depth[best])
+        local = view.local[landmarks.rows(matches.ids[in_map])]
+        P = frame_covariance(self.rig, local, stereo[matches.rows[in_map]], sigma)
+        T = step.estimate.T_world_left
+        rows, depths = depths_by_motion(
+            self.rig, step.tracks, features, rows, T, P, step.index, sigma, c.max_depth_error
+        )  # fmt: skip
+        front, before = np.flatnonzero(in_front(depths.local)), len(step.added.ids)
+        most = max(c.target_in_view - len(matches.ids) - before, 0)
+        best = front[np.sort(np.argsort(-features.response[rows[front]], kind="stable")[:most])]
+        step = self._entered(step, rows[best])
         if len(best):
             backend.place(step.added.ids[before:], depths.local[best], depths.covariances[best])
         return step
@@ -195,21 +189,35 @@ class Mapper:
 
 
 def new_landmarks(
-    features: StereoFeatures, free: BoolArray, occupied: Array, rig: StereoRig, pixel_sigma: float, config: MapConfig
+    features: StereoFeatures, free: BoolArray, occupied: Array, rig: StereoRig, config: MapConfig
 ) -> IndexArray:
-    """Rows of the features that become landmarks.
+    """Rows of the features that become landmarks: the grid fills evenly, and no two lie closer than the separation.
 
-    `free` (N,) says which features belong to no landmark; `occupied` (M, 2) are pixels of the landmarks in view, the
-    measured ones first.
+    `free` (N,) says which features have a known depth and belong to no landmark; `occupied` (M, 2) are pixels of the
+    landmarks in view, the measured ones first.
     """
-    wanted = config.target_in_view - len(occupied)
-    if wanted <= 0 or not len(features):
-        return np.zeros(0, np.intp)
-    rows = np.flatnonzero(free & features.has_stereo)
-    rows = rows[~crowded(features.uv_left[rows], occupied, config.separation)]
-    rows = rows[depth_is_known(rig, features, rows, pixel_sigma, config.max_depth_error)]
+    wanted, uv, separation = config.target_in_view - len(occupied), features.uv_left, config.separation
+    rows = np.flatnonzero(free)
+    if wanted <= 0 or not len(rows):
+        return rows[:0]
+    at, which = pairs_near(uv[rows], separation, occupied)
+    gap = uv[rows[at]] - occupied[which]
+    rows = np.delete(rows, at[np.einsum("ij,ij->i", gap, gap) < separation**2])
     rows = rows[np.argsort(-features.response[rows], kind="stable")]
-    return _spread(features.uv_left, rows, occupied, wanted, rig, config)
+    columns, lines = config.grid
+    size = np.array([rig.left.width / columns, rig.left.height / lines])
+
+    def cell(pixels: Array) -> IndexArray:
+        c = np.clip((pixels / size).astype(int), 0, (columns - 1, lines - 1))
+        return c[:, 1] * columns + c[:, 0]
+
+    # Queue by each feature's rank in its cell plus the cell's landmarks: features of empty cells come first.
+    load, cells = np.bincount(cell(occupied), minlength=columns * lines), cell(uv[rows])
+    order = np.argsort(cells, kind="stable")
+    starts = np.searchsorted(cells[order], np.arange(columns * lines))
+    rank = np.empty(len(rows), int)
+    rank[order] = np.arange(len(rows)) - starts[cells[order]]
+    return apart(uv, rows[np.argsort(rank + load[cells], kind="stable")], wanted, separation)
 
 
 def depth_is_known(
@@ -218,41 +226,6 @@ def depth_is_known(
     """Which rows (K,) of stereo features have a positive depth whose relative standard deviation is below the limit."""
     points = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
     return np.asarray(rig.depth_deviation(points, pixel_sigma) < limit * points[:, 2])
-
-
-def _spread(uv: Array, rows: IndexArray, occupied: Array, wanted: int, rig: StereoRig, config: MapConfig) -> IndexArray:
-    """Pick rows (best first) so that the grid fills evenly and no two lie closer than the separation."""
-    if not len(rows):
-        return np.zeros(0, np.intp)
-    columns, lines = config.grid
-    size = np.array([rig.left.width / columns, rig.left.height / lines])
-
-    def cell(pixels: Array) -> IndexArray:
-        c = np.clip((pixels / size).astype(int), 0, (columns - 1, lines - 1))
-        return c[:, 1] * columns + c[:, 0]
-
-    load = np.bincount(cell(occupied), minlength=columns * lines)
-    # Queue by each feature's rank in its cell plus the cell's landmarks: features of empty cells come first.
-    cells = cell(uv[rows])
-    order = np.argsort(cells, kind="stable")
-    starts = np.searchsorted(cells[order], np.arange(columns * lines))
-    rank = np.empty(len(rows), int)
-    rank[order] = np.arange(len(rows)) - starts[cells[order]]
-    queue = rows[np.argsort(rank + load[cells], kind="stable")]
-    # Pairs of features closer than the separation, ordered by place in the queue.
-    first, second = pairs_in_boxes(uv[queue], np.full((len(queue), 2), config.separation), uv[queue])
-    gap = uv[queue[first]] - uv[queue[second]]
-    near = np.einsum("ij,ij->i", gap, gap) < config.separation**2
-    begin, second = np.searchsorted(first[near], np.arange(len(queue) + 1)).tolist(), second[near]
-    chosen: list[int] = []
-    free = np.ones(len(queue), bool)
-    for place in range(len(queue)):
-        if len(chosen) == wanted:
-            break
-        if free[place]:
-            free[second[begin[place] : begin[place + 1]]] = False
-            chosen.append(int(queue[place]))
-    return np.array(chosen, np.intp)
 
 
 def expected_landmarks(
@@ -267,7 +240,7 @@ def expected_landmarks(
     expected = inside & view.in_image
     rows, stereo = np.flatnonzero(expected), np.flatnonzero(np.isfinite(view.depth_sigma))
     if len(rows) and len(stereo) and radius > 0:
-        at, which = pairs_in_boxes(view.uv_left[rows], np.full((len(rows), 2), radius), features.uv_left[stereo])
+        at, which = pairs_near(view.uv_left[rows], radius, features.uv_left[stereo])
         feature = stereo[which]
         depth = view.points[feature, 2] + SIGMAS * view.depth_sigma[feature]
         # 0.9: a surface nearer than this share of a landmark's depth may hide it
@@ -329,52 +302,26 @@ def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
     return out
 
 
-def features_of_landmarks(
+def duplicates(
     view: MapView, landmarks: LandmarkTable, features: StereoFeatures, config: MapConfig
-) -> BoolArray:
-    """Which unmatched features (F,) have the position and descriptor of an existing landmark.
+) -> tuple[BoolArray, BoolArray]:
+    """Which landmarks (N,) duplicate one that was seen more often, or as often and is older; which features (F,) any.
 
-    Positions are the same if they are within `same_distance`, or differ in depth by no more than stereo's uncertainty.
+    Positions are the same within `same_distance`; a feature's may differ in depth by stereo's uncertainty, too.
     """
-    out = np.zeros(len(view.points), bool)
-    feature, rows = _near_landmarks(features.uv_left, view)
-    offset = view.points[feature] - view.local[rows]
-    along = np.abs(offset[:, 2]) < SIGMAS * view.depth_sigma[feature]
-    same = along | (np.linalg.norm(offset, axis=1) < config.same_distance)
-    same &= _alike(landmarks, rows, features.descriptors[feature], features.laplacian[feature], config)
-    out[feature[same]] = True
-    return out
-
-
-def doubled_landmarks(view: MapView, landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
-    """Which landmarks in view (N,) duplicate another one that was seen more often, or as often and is older."""
-    out = np.zeros_like(view.in_image)
     shown = np.flatnonzero(view.in_image)
-    row, rival = _near_landmarks(view.uv_left[shown], view)
-    row = shown[row]
-    less = (landmarks.seen[row] < landmarks.seen[rival]) | (
-        (landmarks.seen[row] == landmarks.seen[rival]) & (row > rival)
-    )
-    row, rival = row[less], rival[less]
-    same = np.linalg.norm(view.positions[row] - view.positions[rival], axis=1) < config.same_distance
-    same &= _alike(landmarks, row, landmarks.descriptors[rival], landmarks.laplacian[rival], config)
-    out[row[same]] = True
-    return out
-
-
-def _near_landmarks(uv: Array, view: MapView) -> tuple[IndexArray, IndexArray]:
-    """Pairs of pixels (P, 2) and landmarks in view that are near each other in the image, as rows of both."""
-    shown = np.flatnonzero(view.in_image)
-    if not len(uv) or not len(shown):
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    at, which = pairs_in_boxes(uv, np.full((len(uv), 2), _SAME_PIXELS), view.uv_left[shown])
-    return at, shown[which]
-
-
-def _alike(
-    landmarks: LandmarkTable, rows: IndexArray, descriptors: NDArray[np.float32], laplacian: NDArray[np.int8],
-    config: MapConfig,
-) -> BoolArray:  # fmt: skip
-    """Whether landmarks at `rows` (P,) match descriptors (P, D) and signs of the Laplacian (P,), pair by pair."""
-    distance = np.linalg.norm(landmarks.descriptors[rows] - descriptors, axis=1)
-    return np.asarray((distance < config.same_descriptor) & (landmarks.laplacian[rows] == laplacian))
+    uv = np.concatenate([view.uv_left[shown], features.uv_left])
+    points = np.concatenate([view.local[shown], view.points])
+    slack = np.concatenate([np.zeros(len(shown)), SIGMAS * view.depth_sigma])
+    looks = np.concatenate([landmarks.descriptors[shown], features.descriptors])
+    signs = np.concatenate([landmarks.laplacian[shown], features.laplacian])
+    row, which = pairs_near(uv, _SAME_PIXELS, view.uv_left[shown])
+    offset = points[row] - points[which]
+    same = (np.abs(offset[:, 2]) < slack[row]) | (np.linalg.norm(offset, axis=1) < config.same_distance)
+    same &= (np.linalg.norm(looks[row] - looks[which], axis=1) < config.same_descriptor) & (signs[row] == signs[which])
+    row, which = row[same], which[same]
+    doubled, known = np.zeros(view.in_image.shape, bool), np.zeros(features.laplacian.shape, bool)
+    seen, mark, rival = landmarks.seen[shown], row[row < len(shown)], which[row < len(shown)]
+    less = (seen[mark] < seen[rival]) | ((seen[mark] == seen[rival]) & (mark > rival))
+    doubled[shown[mark[less]]] = known[row[row >= len(shown)] - len(shown)] = True
+    return doubled, known

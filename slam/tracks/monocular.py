@@ -23,7 +23,7 @@ from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import Table
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, points_by_pose
-from slam.tracks.follow import Matches, Windows, follow, pairs_in_boxes
+from slam.tracks.follow import Matches, Windows, follow, pairs_near
 from slam.tracks.table import Tracks
 
 _PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
@@ -118,7 +118,7 @@ def unclaimed(uv: Array, descriptors: NDArray[np.float32], features: StereoFeatu
     """Those of the features `rows` (K,) to which no landmark in view, at pixels (M, 2), is near and looks alike."""
     if not len(rows) or not len(uv):
         return np.asarray(rows)
-    at, which = pairs_in_boxes(uv, np.full((len(uv), 2), _CLAIM), features.uv_left[rows])
+    at, which = pairs_near(uv, _CLAIM, features.uv_left[rows])
     gap = np.linalg.norm(descriptors[at] - features.descriptors[rows[which]], axis=1)
     return np.delete(rows, which[gap < _D_MATCH])
 
@@ -166,7 +166,7 @@ def _followed(
     """Features that continue the tracks `waiting` (M,) for a depth, where the camera's rotation takes them."""
     expected = rig.left.project(tracks.direction[waiting] @ T_world_left[:3, :3])
     # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
-    windows, square = Windows((2 * _RADIUS,), (_D_MATCH,), _RATIO), np.zeros((len(expected), 2, 2))
-    pairs = follow(expected, square, tracks.look[waiting], tracks.laplacian[waiting], features, windows)
+    windows, none = Windows((1.0,), (_D_MATCH,), _RATIO, 2 * _RADIUS, 2 * _RADIUS), np.zeros((len(expected), 2, 2))
+    pairs = follow(expected, none, tracks.look[waiting], tracks.laplacian[waiting], features, windows)
     gap = np.abs(features.uv_left[pairs.features] - expected[pairs.tracks])
     return pairs.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))

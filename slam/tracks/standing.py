@@ -21,6 +21,7 @@ from slam.data import StereoFeatures
 from slam.geometry.arrays import Table, median
 from slam.geometry.rig import MINIMAL_POINTS, StereoRig, measurement_rows
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+from slam.tracks.follow import Windows, follow
 
 _FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
 _GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
@@ -36,16 +37,18 @@ class Places(Table):
 
     z: Array  # mean (uL, vL, uR) of their first sights (K, 3) [px]
     descriptors: NDArray[np.float32]  # at first sight (K, D)
+    laplacian: NDArray[np.int8]  # signs of the Laplacian (K,)
     sights: NDArray[np.int64]  # number of frames in which each was there (K,)
     missed: NDArray[np.int64]  # frames since (K,)
 
     @classmethod
-    def of(cls, z: Array, descriptors: NDArray[np.float32]) -> Places:
-        """Features seen for the first time."""
-        return cls(z, descriptors, np.ones(len(z), np.int64), np.zeros(len(z), np.int64))
+    def of(cls, z: Array, features: StereoFeatures) -> Places:
+        """Features at `z` (N, 3), seen for the first time."""
+        ones = np.ones(len(z), np.int64)
+        return cls(z, features.descriptors, features.laplacian, ones, 0 * ones)
 
-    def after(self, at: NDArray, rows: NDArray, z: Array, descriptors: NDArray[np.float32]) -> Places:
-        """The places after a frame with features (N,), of which `rows` stayed at the places `at`."""
+    def after(self, at: NDArray, rows: NDArray, z: Array, features: StereoFeatures) -> Places:
+        """The places after a frame with features (N,) at `z` (N, 3), of which `rows` stayed at the places `at`."""
         sights, missed, mean = self.sights.copy(), self.missed + 1, self.z.copy()
         sights[at] += 1
         missed[at] = 0
@@ -55,7 +58,8 @@ class Places(Table):
         keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
         keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:3000])  # 3000: features
         new = np.delete(np.arange(len(z)), rows)
-        return Places(mean, self.descriptors, sights, missed).select(keep).joined(Places.of(z[new], descriptors[new]))
+        kept = replace(self, z=mean, sights=sights, missed=missed).select(keep)
+        return kept.joined(Places.of(z[new], features.select(new)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,21 +85,17 @@ class Standing:
 
     def after(self, rig: StereoRig, sigma: float, features: StereoFeatures) -> Standing:
         """What a frame's features with a right pixel say; `sigma` is the pixel noise [px]."""
-        stereo = np.flatnonzero(features.has_stereo)
-        z = measurement_rows(features.uv_left[stereo], features.uv_right[stereo])
-        descriptors = features.descriptors[stereo]
-        begun, places = Standing(Places.of(z, descriptors), T_world_left=self.T_world_left), self.places
-        if places is None or places.descriptors.shape[1] != descriptors.shape[1]:
+        stereo, places = np.flatnonzero(features.has_stereo), self.places
+        seen = features.select(stereo)
+        z = measurement_rows(seen.uv_left, seen.uv_right)
+        begun = Standing(Places.of(z, seen), T_world_left=self.T_world_left)
+        if places is None or places.descriptors.shape[1] != seen.descriptors.shape[1]:
             return begun
-        at, rows = np.zeros((2, 0), np.intp)
-        if len(places) and len(z):
-            from slam.tracks.follow import nearest
-
-            # 0.5: largest distance of descriptors of one feature in unchanged light
-            order, radius = np.argsort(places.z[:, 0], kind="stable"), SIGMAS * np.sqrt(2.0) * sigma
-            row_of = nearest(z, order, places.z, radius, descriptors, places.descriptors, 0.5)
-            at = np.flatnonzero(row_of >= 0)
-            rows = row_of[at]
+        radius, none = SIGMAS * np.sqrt(2.0) * sigma, np.zeros((len(places.z), 2, 2))
+        # 0.5: largest distance of descriptors of one feature in unchanged light
+        near = Windows((1.0,), (0.5,), 1.0, radius, radius)
+        pairs = follow(places.z[:, :2], none, places.descriptors, places.laplacian, seen, near)
+        at, rows = pairs.tracks, pairs.features
         shift = z[rows] - places.z[at]
         stay = np.square(shift).sum(axis=1) <= _GATE * min(self.variance, 2.0 * sigma**2)
         at, rows, shift = at[stay], rows[stay], shift[stay]
@@ -103,7 +103,7 @@ class Standing:
         if not (self.stands or most):
             return begun
         witnesses = stereo[rows[places.sights[at] >= _FRAMES]]
-        places_after = places.after(at, rows, z, descriptors)
+        places_after = places.after(at, rows, z, seen)
         at_rest, variance = _at_rest(rig, places.z[at], shift, self.variance)
         if at_rest:
             return Standing(places_after, self.frames + 1, witnesses, variance, self.T_world_left)

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, IndexArray, StereoFeatures
-from slam.geometry.arrays import Table, among
+from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array
 from slam.naming import count
 
 _ROOM = 1000  # cost: rows that a table begins with
 
-#: Columns of `Tracks` that say, besides the Laplacian, what waits for a depth.
-_WAITING = ("look", "waiting_since", "first_pixel", "first_pose", "first_covariance", "direction")
+#: Columns of `Tracks` that say what waits for a depth; all but the first one mean nothing where nothing does.
+_WAITING = ("waiting_since", "look", "first_pixel", "first_pose", "first_covariance", "direction")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +106,12 @@ class LandmarkTable(Table):
         `rematch_after` frames outside the image count as first seen now, from there. For landmarks `withheld` from the
         update, the frame counts as neither missed nor seen.
         """
-        counts = np.ones(len(self), bool)
+        counts, shown = np.ones(len(self.ids), bool), np.zeros(len(self.ids), bool)
         counts[withheld] = False
         view = in_view[counts[in_view]]
         again = self.long_out_of_view(rematch_after)[measured]
-        self.in_view[among(len(self), view) | among(len(self), measured)] += 1
+        shown[view] = shown[measured] = True
+        self.in_view[shown] += 1
         self.missed[view] += 1
         self.seen[measured] += 1
         self.last_seen[measured] = frame
@@ -184,7 +185,8 @@ class Tracks(LandmarkTable):
         The columns of landmarks and of what waits for a depth are copied; those of what is followed are shared with the
         copy, unless it has windows of another number of frames.
         """
-        kept = {name: getattr(self, name).copy() for name in (*LandmarkTable.__dataclass_fields__, *_WAITING)}
+        waiting = _WAITING if (self.waiting_since >= 0).any() else _WAITING[:1]
+        kept = {name: getattr(self, name).copy() for name in (*LandmarkTable.__dataclass_fields__, *waiting)}
         same = self.dof.shape[1] == window
         tracks = copy(self) if same else Tracks.empty(self.descriptors.shape[1], window, len(self))
         vars(tracks).update(kept)

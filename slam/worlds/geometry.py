@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from slam.data import BoolArray, IdArray
+from slam.geometry.arrays import Table
 from slam.geometry.se3 import Array, transform
 from slam.worlds.surfaces import Material
 
@@ -128,7 +129,7 @@ class Parts(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RectangleArrays:
+class RectangleArrays(Table):
     """Many rectangles as arrays, a row each, in one frame; see `Rectangle`."""
 
     origin: Array  # (Q, 3)
@@ -150,13 +151,6 @@ class RectangleArrays:
         vectors = (self.origin, self.along, self.down, self.normal)
         origin, along, down, normal = (turned(v, self.body, T_world_body) for v in vectors)
         return RectangleArrays(origin + T_world_body[self.body, :3, 3], along, down, normal, self.body)
-
-    def select(self, rows: np.ndarray) -> RectangleArrays:
-        """These rows."""
-        return RectangleArrays(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def __len__(self) -> int:
-        return len(self.body)
 
     @cached_property
     def middle(self) -> Array:
@@ -216,7 +210,7 @@ def _between(centre: Array, rays: Array, occluders: RectangleArrays) -> np.ndarr
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
+class Landmarks(Table):
     """The landmarks of a world, a row each; the row is the id."""
 
     positions: Array  # in the frame of the object that they sit on, which is the world for object 0 (P, 3) [m]
@@ -225,13 +219,6 @@ class Landmarks:
     object: IdArray  # id of the object, 0 for the still world (P,)
     size: Array = field(repr=False)  # diameter of what is painted there (P,) [m]
     looks: IdArray = field(repr=False)  # which landmark it looks like, usually itself (P,)
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    def select(self, rows: IdArray) -> Landmarks:
-        """These rows; `surface` and `looks` stay as they are."""
-        return Landmarks(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def world_positions(self, T_world_body: Array) -> Array:
         """Positions (P, 3) in the world, for body poses (B + 1, 4, 4) whose row 0 is the identity."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import BACK, DOWN, FACES, FORWARD, LEFT, RIGHT, Parts, Rectangle, crate, cuboid, rectangle
+from slam.worlds.geometry import BACK, DOWN, FORWARD, LEFT, RIGHT, Parts, Rectangle, crate, cuboid, rectangle
 from slam.worlds.paths import camera_poses, carried, clock, placed, sway, through, watching, yaw_pitch_roll
 from slam.worlds.surfaces import Material, Shelves, Signs
 
@@ -75,7 +75,7 @@ def _aisle_walls(layout: int) -> list[Rectangle]:
     def shelves(wide: float, number: int) -> Shelves:
         return Shelves(wide, HEIGHT, 100 * layout + number)
 
-    end = Material(depth + 0.4, CEILING, "door_wall", layout + 1, 8)
+    end = Material(depth + 0.4, CEILING, "plaster", layout + 1, 8)
     wall = Material(BARE[1] - BARE[0] + 1.0, CEILING, "plaster", layout + 2, 0.6)
     side = Material(0.19, HEIGHT, "wood", layout)
     return [
@@ -111,8 +111,8 @@ WALL_Y = 0.55  #: the wall behind the desk
 
 #: Things on the desk: name, size (x, y, z) [m], place of the lower front left corner (x, y), turn [degrees], lift.
 _THINGS = (
-    ("screen", (0.52, 0.05, 0.33), (-0.10, 0.28), -4, 0.09),
-    ("keyboard", (0.44, 0.15, 0.02), (-0.12, -0.08), 3, 0.0),
+    ("poster", (0.52, 0.05, 0.33), (-0.10, 0.28), -4, 0.09),
+    ("cover", (0.44, 0.15, 0.02), (-0.12, -0.08), 3, 0.0),
     ("cover", (0.21, 0.29, 0.035), (-0.58, -0.10), 14, 0.0),
     ("cover", (0.19, 0.26, 0.05), (-0.56, -0.08), -9, 0.035),
     ("cover", (0.17, 0.24, 0.03), (-0.55, -0.05), 22, 0.085),
@@ -121,7 +121,7 @@ _THINGS = (
     ("cover", (0.04, 0.17, 0.25), (-0.46, 0.25), 0, 0.0),
     ("cover", (0.05, 0.19, 0.28), (-0.41, 0.25), 0, 0.0),
     ("cover", (0.03, 0.17, 0.23), (-0.35, 0.25), 0, 0.0),
-    ("paper", (0.21, 0.297, 0.003), (0.14, -0.385), -12, 0.0),
+    ("board", (0.21, 0.297, 0.003), (0.14, -0.385), -12, 0.0),
 )
 
 
@@ -148,7 +148,7 @@ def _orbit(t: Array, stamps: Array, layout: int) -> Array:
 
 def _desk_room(layout: int) -> list[Rectangle]:
     """Desk, wall with pinned papers, and the things on the desk."""
-    board = Material(1.1, 0.75, "pinboard", layout, 160, (0.01, 0.05))
+    board = Material(1.1, 0.75, "board", layout, 160, (0.01, 0.05))
     top = Material(1.5, 0.75, "wood", layout, 60, (0.006, 0.02))
     out = [
         rectangle(Material(9.0, 3.0, "plaster", layout), (-4.5, WALL_Y, 3.0), RIGHT, DOWN),
@@ -272,13 +272,9 @@ def field(values: Mapping[str, Any]) -> Parts:
         hall += cuboid(faces, (0.05, 0.05, 0.8), (across, 1.7, 0))
     rng = np.random.default_rng([layout, 50])
     for i, place in enumerate(((-1.6, 0.9), (-0.4, 1.2), (0.5, 0.8), (1.7, 1.1))):  # cartons on the field
-        size = rng.uniform(0.18, 0.32, 3)
-        faces = {}
-        for side in ("front", "left", "right", "top"):
-            a, b = FACES[side][3]
-            faces[side] = Material(size[a], size[b], "carton", 1000 * layout + 10 * i + a, 200, (0.015, 0.04))
+        size, looks = rng.uniform(0.18, 0.32, 3), Material(0, 0, "carton", 1000 * layout + 10 * i, 200, (0.015, 0.04))
         T = pose(yaw_pitch_roll(rng.uniform(-0.6, 0.6), 0, 0), np.array([*place, 0.0]))
-        hall += cuboid(faces, size, T_body_box=T)
+        hall += crate(size, looks, T_body_box=T, sides=("front", "left", "right", "top"))
     return Parts(stamps, poses, hall)
 
 

@@ -131,9 +131,9 @@ def simulate(
         _clutter(rig, seen, round(len(rows) * values["clutter"] / (1 - values["clutter"])), rng),
     ]
     uv_left, uv_right = (np.concatenate([own, *(o[i] for o in others)]) for i, own in enumerate((uv_left, uv_right)))
-    uv_right[~_inside(rig, uv_right)] = np.nan
+    uv_right[~rig.right.in_image(uv_right)] = np.nan
     order = rng.permutation(len(uv_left))
-    order = order[_inside(rig, uv_left[order])]
+    order = order[rig.left.in_image(uv_left[order])]
     false = len(uv_left) - len(rows)
     source = np.concatenate([rows, np.full(false, _FALSE)])[order]
     false_stereo = np.concatenate([false_stereo, np.zeros(false, bool)])[order]
@@ -183,12 +183,6 @@ def _clutter(rig: StereoRig, seen: VisibleLandmarks, count: int, rng: np.random.
     points = seen.points[rows] * (1 + 0.05 * rng.standard_normal((count, 1)))
     points[:, :2] += 0.03 * points[:, 2:] * rng.standard_normal((count, 2))
     return rig.project(points)
-
-
-def _inside(rig: StereoRig, uv: Array) -> BoolArray:
-    """Which pixels (N, 2) lie in an image; NaN does not."""
-    x, y = uv[:, 0], uv[:, 1]
-    return (x >= 0) & (y >= 0) & (x <= rig.width - 1) & (y <= rig.height - 1)
 
 
 @dataclass(frozen=True, eq=False)

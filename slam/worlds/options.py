@@ -51,7 +51,7 @@ class Option:
 
 #: Keys of every world: what is there and how it is recorded. (Their defaults may differ from world to world.)
 RECORDING = (
-    Option("frames", 0, "number of frames; 0 for the whole path", 0, 1_000_000),
+    Option("frames", 0, "number of frames; the whole path unless it is given", 1, 1_000_000),
     Option("seed", 0, "of everything random in a recording: noise, misses, outliers, faults", 0, 2**31 - 1),
     Option("layout", 0, "of what stands where, and of the path's sway", 0, 2**31 - 1),
     Option("rate", 30.0, "frames per second [Hz]", 0.1, 1000),

@@ -1,4 +1,4 @@
-"""Painting what stands indoors, and all materials by their names."""
+"""Painting all textures but bookshelves, and all materials by their names."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from slam.errors import UnknownNameError
-from slam.worlds import streetside
 from slam.worlds.brushes import Box, Colour, Page, Rng, Size, clouds, grain, mottled, tinted, wood, words
 from slam.worlds.geometry import Texture
 from slam.worlds.shelves import paint_bay
-from slam.worlds.streetside import paint_facade
 from slam.worlds.surfaces import Bay, Facade, Material, Signs
 
 _INKS = ((25, 30, 40), (235, 240, 240), (40, 40, 170), (150, 70, 30))
@@ -39,10 +37,8 @@ def paint(texture: Texture, density: float) -> np.ndarray:
     return picture
 
 
-def _paint_material(piece: Material, density: float) -> np.ndarray:
-    """A piece of a material; UnknownNameError where there is no such material."""
-    if piece.material not in RECIPES:
-        raise UnknownNameError(f"unknown material {piece.material!r}; known: {', '.join(RECIPES)}")
+def _paint_material(piece: Material | Signs, density: float) -> np.ndarray:
+    """A piece of a material, or a board of signs."""
     recipe = RECIPES[piece.material]
     rng = np.random.default_rng([piece.seed, 63])
     density *= recipe.detail
@@ -51,39 +47,6 @@ def _paint_material(piece: Material, density: float) -> np.ndarray:
     if recipe.spot is not None:
         for x, y, diameter in piece.marks() * density:
             recipe.spot(page, x, y, diameter)
-    return page.picture
-
-
-def _sheet(page: Page, box: Box) -> None:
-    """A sheet of paper with a heading, print and a picture, pinned up."""
-    rng, (left, top, width, height) = page.rng, box
-    page.bar((left + 0.02 * width, top + 0.02 * height, width, height), (90.0, 95.0, 100.0))
-    page.bar(box, rng.uniform(190, 250, 3) if rng.random() < 0.4 else (232.0, 238.0, 240.0))
-    ink = rng.choice([(40, 40, 40), (120, 60, 30), (40, 40, 150)]).astype(float)
-    page.title(8, page.part(0.1, 0.06, 0.8, 0.1, box), ink)
-    page.bar(page.part(0.1, 0.22, 0.8, 0.3, box), rng.uniform(40, 200, 3))
-    for _ in range(3):
-        x, y = left + rng.uniform(0.2, 0.8) * width, top + rng.uniform(0.27, 0.47) * height
-        page.dot(x, y, rng.uniform(0.03, 0.08) * height, rng.uniform(20, 235, 3))
-    page.print(page.part(0.1, 0.57, 0.8, 0.36, box), 0.05 * height, ink)
-
-
-def _pinboard(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A cork board with papers pinned to it."""
-    page = Page(mottled(size, rng, density, (95.0, 135.0, 170.0), (0.12, 0.006, 2)), rng)
-    height, width = size
-    x = 0.04 * density
-    while x < width - 0.25 * density:
-        y = rng.uniform(0.03, 0.08) * density
-        wide = 0.0
-        while y < height - 0.2 * density:
-            w, h = (0.21, 0.297) if rng.random() < 0.5 else (rng.uniform(0.1, 0.2), rng.uniform(0.1, 0.2))
-            if y + h * density < height - 4:
-                _sheet(page, (x + rng.uniform(0, 0.02) * density, y, w * density, h * density))
-            wide = max(wide, w)
-            y += (h + rng.uniform(0.02, 0.05)) * density
-        x += (wide + rng.uniform(0.03, 0.05)) * density
-    _frame(page, 0.018 * density, (80.0, 110.0, 140.0))
     return page.picture
 
 
@@ -106,56 +69,6 @@ def _cover(size: Size, rng: Rng, density: float) -> np.ndarray:
         x, y = rng.uniform(0.2, 0.8) * page.width, rng.uniform(0.5, 0.75) * page.height
         page.dot(x, y, rng.uniform(0.02, 0.09) * min(size), rng.uniform(20, 240, 3))
     page.title(5, page.part(0.3, 0.86, 0.4, 0.06), ink)
-    return page.picture
-
-
-def _screen(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A monitor with windows full of text and a plot."""
-    page = Page(np.full((*size, 3), 25, np.uint8), rng)
-    edge = 0.012 * density
-    if min(size) < 4 * edge:
-        return page.picture
-    page.bar((edge, edge, page.width - 2 * edge, page.height - 2 * edge), (110.0, 70.0, 40.0))
-    for window, ground, ink in (
-        ((0.05, 0.08, 0.45, 0.8), (40.0, 40.0, 40.0), (200.0, 220.0, 200.0)),
-        ((0.53, 0.05, 0.42, 0.5), (245.0, 245.0, 245.0), (60.0, 50.0, 40.0)),
-        ((0.57, 0.6, 0.36, 0.32), (250.0, 250.0, 250.0), (150.0, 80.0, 40.0)),
-    ):
-        x, y, w, h = page.part(*window)
-        page.bar((x, y, w, h), ground)
-        page.bar((x, y, w, 0.03 * page.height), (160.0, 160.0, 165.0))
-        inner = (x + 0.02 * page.width, y + 0.06 * page.height, w - 0.05 * page.width, h - 0.1 * page.height)
-        page.print(inner, 0.035 * page.height, ink)
-    return page.picture
-
-
-def _keyboard(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A keyboard; the letters are a matter of luck."""
-    page = Page(np.full((*size, 3), 45, np.uint8), rng)
-    pitch, y = 0.019 * density, 0.012 * density
-    if page.height < 3 * pitch:
-        return page.picture
-    while y + pitch < page.height:
-        x = 0.01 * density + rng.uniform(0, 0.5) * pitch
-        while x + pitch < page.width - 0.01 * density:
-            w = pitch * (1.5 if rng.random() < 0.06 else 1.0)
-            page.bar((x + 0.1 * pitch, y + 0.1 * pitch, w - 0.2 * pitch, 0.8 * pitch),
-                     (205.0 if rng.random() < 0.9 else 130.0,) * 3)  # fmt: skip
-            page.write(words(rng, 3)[0], (x + 0.25 * pitch, y + 0.2 * pitch, 0.4 * pitch, 0.4 * pitch), (40.0,) * 3)
-            x += w
-        y += pitch
-    return page.picture
-
-
-def _paper(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A printed page."""
-    page = Page(np.full((*size, 3), 238, np.uint8), rng)
-    ink = (50.0, 45.0, 45.0)
-    page.title(12, page.part(0.1, 0.06, 0.8, 0.05), ink)
-    for column in (0.1, 0.53):
-        page.print(page.part(column, 0.16, 0.37, 0.76), 0.018 * page.height, ink)
-    page.bar(page.part(0.12, 0.3, 0.33, 0.14), (225.0, 225.0, 225.0))
-    page.dot(0.28 * page.width, 0.37 * page.height, 0.05 * page.height, (120.0, 80.0, 60.0))
     return page.picture
 
 
@@ -189,21 +102,6 @@ def _ceiling(size: Size, rng: Rng, density: float) -> np.ndarray:
     return page.picture
 
 
-def _door_wall(size: Size, rng: Rng, density: float) -> np.ndarray:
-    """A wall with a door and notices."""
-    page = Page(_PLASTER(size, rng, density), rng)
-    height, width = size
-    wide, high = 0.9 * density, 2.05 * density
-    left = (width - wide) / 2
-    page.bar((left - 0.06 * density, height - high - 0.06 * density, wide + 0.12 * density, high), (120, 130, 135))
-    door = wood((round(wide), round(high)), rng, density, (90.0, 120.0, 150.0)).transpose(1, 0, 2)
-    x, y = round(left), height - round(high)
-    page.picture[y : y + door.shape[0], x : x + door.shape[1]] = door[: height - y, : width - x]
-    page.dot(left + 0.86 * wide, height - 1.05 * density, 0.03 * density, (190.0, 195.0, 200.0))
-    _sheet(page, (left + 0.3 * wide, height - 1.7 * density, 0.3 * density, 0.4 * density))
-    return page.picture
-
-
 def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
     """A side of a carton: brown board, tape, print and a label."""
     ribs = grain(size, rng, (2.0, 0.2 * density))
@@ -223,23 +121,122 @@ def _carton(size: Size, rng: Rng, density: float) -> np.ndarray:
     return page.picture
 
 
-def _paint_signs(board: Signs, density: float) -> np.ndarray:
-    """A white board with signs: discs and squares with a pattern of their own around and on them."""
-    rng = np.random.default_rng([board.seed, 65])
-    size = round(board.height * density), round(board.width * density)
-    page = Page(_BOARD(size, rng, density), rng)
-    for x, y, diameter in board.marks() * density:
-        dark = rng.random() < 0.7
-        ground, ink = ((215.0,) * 3, (30.0,) * 3) if dark else ((45.0,) * 3, (225.0,) * 3)
-        field = 2.2 * diameter
-        page.bar((x - field / 2, y - field / 2, field, field), ground)
-        for _ in range(4):
-            angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(0.75, 0.95) * diameter
-            page.dot(x + far * np.cos(angle), y + far * np.sin(angle), rng.uniform(0.06, 0.14) * diameter, ink)
-        page.dot(x, y, diameter / 2, ink)
-        for _ in range(2):
-            spot = x + rng.uniform(-0.2, 0.2) * diameter, y + rng.uniform(-0.2, 0.2) * diameter
-            page.dot(*spot, rng.uniform(0.04, 0.08) * diameter, ground)
+_WALLS = ((150, 190, 215), (120, 140, 185), (190, 205, 215), (110, 120, 150), (160, 175, 180), (120, 165, 200))
+_PAINTS = ((40, 40, 150), (130, 80, 40), (60, 60, 60), (185, 190, 195), (215, 220, 222), (70, 110, 60), (30, 32, 35))
+_LINES = (225.0, 232.0, 228.0)
+
+
+def _paint_facade(house: Facade, density: float) -> np.ndarray:
+    """The picture of a house front, BGR uint8, `density` texels per metre."""
+    rng = np.random.default_rng([house.seed, 64])
+    size = round(house.height * density), round(house.width * density)
+    colour = _WALLS[int(rng.integers(len(_WALLS)))]
+    light = 1 + 0.06 * clouds(size, rng, 1.5 * density, 5) + 0.03 * rng.standard_normal(size, np.float32)
+    page = Page(tinted(light, colour), rng, density)
+    if rng.random() < 0.4:
+        _bricks(page)
+    page.bar((0, page.height - 0.7 * density, page.width, 0.7 * density), (95.0, 100.0, 105.0))
+    page.bar((0, 0, page.width, 0.35 * density), (70.0, 80.0, 110.0))
+    for left, top, w, h in house.windows() * density:
+        _window(page, (left, top, w, h))
+    left, top = rng.uniform(0.4, 0.6) * page.width, page.height - 2.2 * density
+    page.bar((left - 0.1 * density, top - 0.1 * density, 1.2 * density, 2.3 * density), (200.0, 205.0, 210.0))  # a door
+    page.bar((left, top, density, 2.2 * density), rng.uniform(30, 110, 3))
+    page.bar((left + 0.2 * density, top + 0.2 * density, 0.6 * density, 0.7 * density), (70.0, 60.0, 55.0))
+    page.dot(left + 0.88 * density, top + 1.2 * density, 0.05 * density, (200.0, 210.0, 215.0))
+    for x, y, diameter in house.stains.marks() * density:
+        shade = np.multiply(colour, rng.uniform(0.55, 0.85))
+        page.bar((x - diameter / 2, y - diameter / 6, diameter, diameter / 3), shade)
+    if rng.random() < 0.5:
+        sign = (0.15 * page.width, page.height - 3.0 * density, rng.uniform(2.0, 4.0) * density, 0.5 * density)
+        page.bar(sign, rng.uniform(30, 200, 3))
+        page.title(9, sign, (240.0, 240.0, 240.0))
+    return page.picture
+
+
+def _bricks(page: Page) -> None:
+    """Courses of bricks."""
+    course, length = 0.09 * page.density, 0.26 * page.density
+    for row, y in enumerate(np.arange(0, page.height, course)):
+        for x in np.arange(-length / 2 * (row % 2), page.width, length):
+            if page.rng.random() < 0.25:
+                part = page.picture[int(y) : int(y + course), max(int(x), 0) : int(x + length)]
+                np.copyto(part, (part * page.rng.uniform(0.75, 0.95)).astype(np.uint8))
+
+
+def _window(page: Page, box: Box) -> None:
+    """A window with its frame, panes, sill, and sometimes shutters or a curtain."""
+    rng, (left, top, w, h), frame = page.rng, box, 0.07 * page.density
+    page.bar((left - frame, top - frame, w + 2 * frame, h + 2 * frame), (225.0, 230.0, 232.0))
+    glass = rng.uniform(35, 90)
+    page.bar(box, (glass * 1.2, glass * 1.05, glass))
+    if rng.random() < 0.5:
+        page.bar((left, top, w * rng.uniform(0.2, 0.45), h), (170.0, 185.0, 195.0))
+    page.bar((left + w / 2 - frame / 2, top, frame, h), (220.0, 225.0, 228.0))
+    page.bar((left, top + 0.35 * h, w, 0.7 * frame), (220.0, 225.0, 228.0))
+    page.bar((left - 1.5 * frame, top + h + frame, w + 3 * frame, frame), (110.0, 115.0, 120.0))
+    if rng.random() < 0.25:
+        shutter = rng.uniform(40, 130, 3)
+        for x in (left - frame - 0.45 * w, left + w + frame):
+            page.bar((x, top, 0.42 * w, h), shutter)
+
+
+def _asphalt(size: Size, rng: Rng, density: float) -> np.ndarray:
+    """Asphalt."""
+    light = 1 + 0.05 * clouds(size, rng, 2.0 * density, 4) + 0.06 * clouds(size, rng, 2.0, 1)
+    return tinted(light, (88.0, 86.0, 85.0))
+
+
+_BLACK, _GLASS, _GLARE = (25.0, 25.0, 28.0), (75.0, 65.0, 55.0), (125.0, 115.0, 105.0)
+_WHEEL = ((0.079, 25.0), (0.047, 165.0), (0.014, 60.0))  # half widths as shares of a car's length, and grey values
+_CAR_END = (
+    ((0.32, 0.5, 0.36, 0.16), (240.0, 240.0, 240.0)), ((0, 0.72, 1, 0.12), (55.0, 55.0, 58.0)),
+    ((0.05, 0.84, 0.17, 0.16), _BLACK), ((0.78, 0.84, 0.17, 0.16), _BLACK),
+)  # fmt: skip
+#: What is on the parts of a car: boxes by shares of the part, and their colours.
+_CAR_PARTS: dict[str, tuple[tuple[Box, Colour], ...]] = {
+    "car_top": (),
+    "car_side": (
+        *(((x, 0, 0.005, 0.8), _BLACK) for x in (0.36, 0.60, 0.82)),
+        *(((x, 0.22, 0.042, 0.067), (190.0, 190.0, 190.0)) for x in (0.40, 0.64)),
+        *(((x - r, 0.85 - 5.73 * r, 2 * r, 11.47 * r), (grey,) * 3) for x in (0.18, 0.80) for r, grey in _WHEEL),
+    ),
+    "car_front": (*(((x, 0.18, 0.18, 0.2), (235.0, 240.0, 240.0)) for x in (0.05, 0.77)), *_CAR_END),
+    "car_back": (*(((x, 0.18, 0.18, 0.2), (45.0, 45.0, 200.0)) for x in (0.05, 0.77)), *_CAR_END),
+    "cabin_side": (
+        ((0.04, 0.18, 0.42, 0.75), _GLASS), ((0.09, 0.25, 0.08, 0.6), _GLARE),
+        ((0.50, 0.18, 0.42, 0.75), _GLASS), ((0.55, 0.25, 0.08, 0.6), _GLARE),
+    ),
+    "cabin_end": (
+        ((0.07, 0.15, 0.86, 0.8), _GLASS), ((0.15, 0.25, 0.2, 0.3), _GLARE), ((0.62, 0.6, 0.12, 0.2), _BLACK),
+    ),
+}  # fmt: skip
+
+
+def _car_part(size: Size, rng: Rng, density: float, items: tuple[tuple[Box, Colour], ...]) -> np.ndarray:
+    """A part of a car: paint, whose colour is drawn first, so that all parts have the same, and boxes on it."""
+    colour = _PAINTS[int(rng.integers(len(_PAINTS)))]
+    light = 1.05 - 0.25 * np.linspace(0, 1, size[0], dtype=np.float32)[:, None]
+    page = Page(tinted(light + 0.02 * clouds(size, rng, 0.3 * density), colour), rng)
+    for box, shade in items:
+        page.bar(page.part(*box), shade)
+    return page.picture
+
+
+def _field(size: Size, rng: Rng, density: float) -> np.ndarray:
+    """A robots' playing field: green carpet with white lines."""
+    page = Page(mottled(size, rng, density, (60.0, 125.0, 55.0), (0.09, 0.012, 2), (0.05, 0.3, 3)), rng)
+    (height, width), line, edge = size, 0.05 * density, 0.35 * density
+    for box in (
+        (edge, edge, width - 2 * edge, line),
+        (edge, height - edge, width - 2 * edge, line),
+        (edge, edge, line, height - 2 * edge),
+        (width - edge, edge, line, height - 2 * edge),
+        (width / 2, edge, line, height - 2 * edge),
+    ):
+        page.bar(box, _LINES)
+    centre = round((width / 2 - 0.5) * 16), round((height / 2 - 0.5) * 16)
+    cv2.circle(page.picture, centre, round(0.6 * density * 16), _LINES, max(1, round(line)), cv2.LINE_AA, 4)
     return page.picture
 
 
@@ -274,28 +271,16 @@ RECIPES = {
     "plaster": Recipe(_PLASTER, _fleck, 0.25),
     "carpet": Recipe(_even((105.0, 85.0, 75.0), (0.10, 0.008, 2), (0.05, 0.15, 3)), _fleck, 0.5),
     "ceiling": Recipe(_ceiling, None, 0.5),
-    "door_wall": Recipe(_door_wall, _fleck),
     "carton": Recipe(_carton, _print),
     "board": Recipe(_BOARD, _print),
     "wood": Recipe(wood, _fleck),
-    "pinboard": Recipe(_pinboard),
     "cover": Recipe(_cover, _print),
-    "screen": Recipe(_screen),
-    "keyboard": Recipe(_keyboard),
-    "paper": Recipe(_paper),
     "poster": Recipe(_poster, _print),
-    "asphalt": Recipe(streetside.asphalt, _fleck, 0.5),
-    "road": Recipe(streetside.road, _fleck),
-    "road_across": Recipe(streetside.road_across, _fleck),
-    "car_side": Recipe(streetside.car_side),
-    "car_front": Recipe(partial(streetside.car_end, lamp=(235.0, 240.0, 240.0))),
-    "car_back": Recipe(partial(streetside.car_end, lamp=(45.0, 45.0, 200.0))),
-    "car_top": Recipe(streetside.paintwork),
-    "cabin_side": Recipe(partial(streetside.cabin, panes=streetside.SIDE_PANES)),
-    "cabin_end": Recipe(partial(streetside.cabin, panes=streetside.END_PANES)),
-    "field": Recipe(streetside.field, _fleck),
+    "asphalt": Recipe(_asphalt, _fleck, 0.5),
+    **{name: Recipe(partial(_car_part, items=items)) for name, items in _CAR_PARTS.items()},
+    "field": Recipe(_field, _fleck),
 }
 
 PAINTERS: dict[type, Callable[..., np.ndarray]] = {
-    Material: _paint_material, Facade: paint_facade, Signs: _paint_signs, Bay: paint_bay,
+    Material: _paint_material, Facade: _paint_facade, Signs: _paint_material, Bay: paint_bay,
 }  # fmt: skip

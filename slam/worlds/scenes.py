@@ -11,7 +11,7 @@ import numpy as np
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import so3_exp
-from slam.worlds import indoors, roadside, streets
+from slam.worlds import indoors, streets, traffic
 from slam.worlds.geometry import Parts, place_landmarks
 from slam.worlds.options import Option
 from slam.worlds.paths import CAMERAS
@@ -73,7 +73,7 @@ SCENES = {
         indoors.field, (0.3, 5.0), 500.0, defaults={"density": 60.0},
     ),
     "people": Scene(
-        "a slow drive past parked cars, among cyclists and walkers whose legs swing", roadside.people,
+        "a slow drive past parked cars, among cyclists and walkers whose legs swing", traffic.people,
         (4.0, 60.0), 64.0, "driving", defaults=_DRIVING,
     ),
     "startup": Scene(
@@ -83,7 +83,7 @@ SCENES = {
     ),
     "street": Scene(
         "a drive through a town at KITTI's scale and rate, with parked and moving cars and a turn to the left",
-        roadside.street, (4.0, 60.0), 64.0, "driving", (Option("cars", 3, "moving cars", 0, 3),), _DRIVING,
+        traffic.street, (4.0, 60.0), 64.0, "driving", (Option("cars", 3, "moving cars", 0, 3),), _DRIVING,
     ),
     "town": Scene(
         "a drive around the blocks of a town at KITTI's scale, back to its streets after 550 m, and the other way",

@@ -15,9 +15,8 @@ from slam.data import IdArray
 from slam.geometry.se3 import Array, pose
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.drives import EYE, SAME_ROAD, STEP, Road, around_blocks, level, read_path, sampled
-from slam.worlds.geometry import DOWN, Parts, Rectangle, rectangle
+from slam.worlds.geometry import DOWN, Parts, Rectangle, crate, cuboid, rectangle
 from slam.worlds.paths import yaw_pitch_roll
-from slam.worlds.roadside import car, post
 from slam.worlds.surfaces import Facade, Material
 
 ASIDE = 9.0  #: from a road's middle to the house fronts [m]
@@ -41,6 +40,32 @@ _LAP = 0.3  # by which these overlap where the ground is not level [m]
 _SMOOTHED = 6.0  # standard deviation of the mean that gives the ground's height [m]
 
 
+#: The two boxes of a car: size, lowest corner [m], and materials of its back, its front and its sides.
+_CAR = (
+    ((1.75, 4.3, 0.75), (-0.875, -2.15, 0.2), ("car_back", "car_front", "car_side")),
+    ((1.5, 2.3, 0.55), (-0.75, -1.35, 0.95), ("cabin_end", "cabin_end", "cabin_side")),
+)
+
+
+def car(T: Array, seed: int, body: int = 0) -> list[Rectangle]:
+    """A car of two boxes; its frame: origin on the ground in its middle, y ahead."""
+    out = []
+    for size, corner, (rear, fore, side) in _CAR:
+        x, y, z = size
+        sides = {"front": (rear, x, z), "back": (fore, x, z), "left": (side, y, z), "right": (side, y, z)}
+        faces = {face: Material(a, b, name, seed, 12, (0.05, 0.25)) for face, (name, a, b) in sides.items()}
+        faces["top"] = Material(x, y, "car_top", seed, 1, (0.05, 0.2))
+        out += cuboid(faces, size, corner, body, T)
+    return out
+
+
+def post(T: Array, size: tuple[float, float, float], material: str, seed: int) -> list[Rectangle]:
+    """A box that stands on the ground; its frame: origin on the ground in its middle."""
+    looks = Material(0, 0, material, 10 * seed, 12, (0.05, 0.25))
+    corner = (-size[0] / 2, -size[1] / 2, 0)
+    return crate(size, looks, corner, T_body_box=T, sides=("front", "back", "left", "right"))
+
+
 def drive(values: Mapping[str, Any]) -> Parts:
     """A town along the path of a file; raises SequenceError where the file is no path."""
     return _town(read_path(values["path"]), values)
@@ -56,8 +81,7 @@ def _town(path: Trajectory, values: Mapping[str, Any]) -> Parts:
     R = level(path)  # to level axes
     streets = Streets(Road.along(path.positions @ R.T), values["layout"])
     drive = sampled(path, values)
-    level_parts = [*streets.houses(), *streets.beside("trees", "cabinets"), *streets.ground(), *streets.beside("cars")]
-    parts = [replace(r, origin=R.T @ r.origin, along=R.T @ r.along, down=R.T @ r.down) for r in level_parts]
+    parts = [replace(r, origin=R.T @ r.origin, along=R.T @ r.along, down=R.T @ r.down) for r in streets.rectangles()]
     return Parts(drive.stamps, drive.poses, parts)
 
 
@@ -100,6 +124,10 @@ class Streets:
             self._low = self._high = np.full(len(near), np.median(heights))
             self._foundation = 0.0
         self._stretch = np.floor((road.way - road.way[0]) / STRETCH).astype(int)
+
+    def rectangles(self) -> list[Rectangle]:
+        """Everything, in level axes."""
+        return [*self.houses(), *self.beside("trees", "cabinets"), *self.ground(), *self.beside("cars")]
 
     def houses(self) -> Iterator[Rectangle]:
         """House fronts along both sides of every road, and across both ends of the path."""

@@ -66,11 +66,12 @@ class Facade:
 
 @dataclass(frozen=True)
 class Signs:
-    """A white board with four rows of six signs, of which none is like the others: features known beforehand."""
+    """A white board with four rows of six signs: features known beforehand."""
 
     width: float  # [m]
     height: float  # [m]
     seed: int
+    material: str = "board"
 
     def marks(self) -> Array:
         """The signs."""

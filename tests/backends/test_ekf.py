@@ -232,8 +232,3 @@ def test_the_last_poses_are_known_together():
         low, high = chi2.ppf([0.001, 0.999], dof * runs) / runs
         assert low < np.mean(distances) < high
     assert len(backend.recent(1)) == 1 and len(backend.recent(100)) == 5
-
-
-def test_the_form_of_the_filter_is_no_option_for_users():
-    with pytest.raises(ConfigurationError, match="form"):
-        EkfBackend(RIG, MODELS, form="abc")

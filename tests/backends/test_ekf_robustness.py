@@ -1,9 +1,7 @@
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -264,53 +262,3 @@ def test_no_pixel_of_a_camera(drive, pixel):
     uv[3, 0] = 0.9e5  # no camera has it, but a number that can be worked with
     report = backend.update(Observations(seen.ids, uv, seen.uv_right))
     np.testing.assert_array_equal(report.rejected, seen.ids[[3]])
-
-
-def interrupted(backend: EkfBackend, call, rng: np.random.Generator) -> int:
-    """Make a call again and again until it has happened, each time interrupted at a later line; how often."""
-    line, count, start = int(rng.integers(1, 40)), 0, backend.state
-    while backend.state is start:
-        left = [line]
-
-        def trace(frame, event, argument, left=left):
-            if "ekf" not in Path(frame.f_code.co_filename).parts:
-                return None
-            left[0] -= event == "line"
-            if left[0] == 0:
-                raise KeyboardInterrupt
-            return trace
-
-        before = sys.gettrace()
-        sys.settrace(trace)
-        try:
-            call()
-            break
-        except KeyboardInterrupt:
-            count, line = count + 1, line + int(rng.integers(1, 80))
-        finally:
-            sys.settrace(before)
-    return count
-
-
-def test_an_interrupted_call_happened_or_did_not(monkeypatch):
-    """Landmarks come and go, leave the state and come back; the camera turns through the angles' singularity."""
-    monkeypatch.setattr("backends.ekf.state._MOST", 40)
-    monkeypatch.setattr("backends.ekf.state._LEAST", 30)
-    data, rng = scene(path(12, 0.1, 0.7 * FORWARD, 0.3 * YAW + 1.5 * ROLL), points=400), np.random.default_rng(0)
-    whole, often, known, count = EkfBackend(RIG, MODELS), EkfBackend(RIG, MODELS), set(), 0
-    for stamp, _, seen in data:
-        seen = seen.select(rng.permutation(len(seen))[:20])
-        old = np.array([i in known for i in seen.ids.tolist()], bool)
-        new = seen.select(~old & np.isfinite(RIG.triangulate(seen.uv_left, seen.uv_right)).all(axis=1))
-        known.update(new.ids.tolist())
-        gone = rng.permutation(sorted(known))[: len(known) // 8]
-        known.difference_update(gone.tolist())
-        steps = ("predict", stamp), ("update", seen.select(old)), ("add", new), ("remove", gone)
-        for name, argument in steps:
-            getattr(whole, name)(argument)
-            count += interrupted(often, partial(getattr(often, name), argument), rng)
-    assert count > 100
-    np.testing.assert_array_equal(often.trajectory().poses, whole.trajectory().poses)
-    np.testing.assert_array_equal(often.trajectory().stamps, whole.trajectory().stamps)
-    np.testing.assert_array_equal(dense(often.state.covariance), dense(whole.state.covariance))
-    np.testing.assert_array_equal(often.estimate().positions, whole.estimate().positions)

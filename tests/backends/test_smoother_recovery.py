@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import count
 
 import gtsam
@@ -110,57 +109,6 @@ def test_impossible_measurements_do_not_end_a_run():
     assert np.abs(off[3:]).max() < 0.2 and np.abs(off[:3]).max() < 0.05
 
 
-def interrupt(call, number: int) -> bool:
-    """Whether a call was interrupted at the `number`-th function called within the smoother's modules."""
-    left = number
-
-    def profile(frame, event, _):
-        nonlocal left
-        if event == "call" and "backends/smoother/" in frame.f_code.co_filename.replace("\\", "/"):
-            left -= 1
-            if not left:
-                raise KeyboardInterrupt
-
-    before = sys.getprofile()
-    sys.setprofile(profile)
-    try:
-        call()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.setprofile(before)
-    return False
-
-
-@pytest.mark.parametrize("lag", [None, 12])
-def test_a_call_that_is_interrupted_did_not_happen(lag):
-    """A KeyboardInterrupt at any function call within the smoother: the same call again, and the run goes on."""
-    data, known = drive(26), set()
-    backend = SmootherBackend(RIG, MODELS, lag=lag)
-    rng, interrupted = np.random.default_rng(0), 0
-    for k, (stamp, _, seen) in enumerate(data):
-        old = np.isin(seen.ids, list(known))
-        calls = (
-            lambda stamp=stamp: backend.predict(stamp),
-            lambda seen=seen, old=old: backend.update(seen.select(old)),
-            lambda seen=seen, old=old: backend.add(seen.select(~old)),
-            lambda: backend.estimate(),
-            lambda: backend.revise(lambda z: z),
-        )
-        for call in calls:
-            before = backend.state
-            if k > 2 and interrupt(call, int(rng.integers(1, 60))):
-                interrupted += 1
-                assert backend.state is before
-                call()
-            elif k <= 2:
-                call()
-        known.update(seen.ids.tolist())
-        assert len(backend.trajectory()) == k + 1
-    assert interrupted > 10
-    near_the_truth(backend, data)
-
-
 # --- a camera that has lost its way is seated again among the landmarks, without a guess ---
 
 
@@ -191,7 +139,11 @@ def test_a_camera_that_was_moved_while_it_saw_nothing(lag):
 
 @pytest.mark.parametrize(("lag", "seed"), [(None, 0), (None, 1), (14, 2)])
 def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(lag, seed):
-    """Two landmarks, then six seconds in the dark: no linearisation in the world holds for what is seen then."""
+    """Two landmarks, then six seconds in the dark: no linearisation in the world holds for what is seen then.
+
+    The problem begins anew once. How the camera is turned in the world stays unknown, and with every frame it began
+    anew: nothing was smoothed any more.
+    """
     rng = np.random.default_rng(seed)
     models = EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=4.0)
     turns = 0.3 * np.cumsum(rng.standard_normal((160, 3)), axis=0) * np.sqrt(DT)
@@ -201,16 +153,17 @@ def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(lag, seed
     poses = np.array(poses)
     points = np.concatenate([cloud(poses[:1], 2, rng), cloud(poses[80:], 60, rng, 2.0, 6.0)])
     backend = SmootherBackend(RIG, models, lag=lag)
-    known, found, rejected = set(), [], 0
+    known, found, begun, rejected = set(), [], set(), 0
     for k, T in enumerate(poses):
         seen = observe(T, points, 4.0, rng, 12)
         seen = seen.select((seen.ids < 2) & (k < 10) if k < 70 else seen.ids >= 0)
         rejected += len(step(backend, k * DT, seen, known).rejected)
         found.append(backend.estimate(landmarks=False).T_world_left)
+        begun.add(backend.state.begun)
     moved = se3.inverse(np.array(found[90:-10])) @ np.array(found[100:])
     truth = se3.inverse(poses[90:-10]) @ poses[100:]
     off = np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=1)
-    assert np.sqrt((off**2).mean()) < 0.1 and rejected < 60
+    assert np.sqrt((off**2).mean()) < 0.1 and rejected < 60 and len(begun) <= 2, begun
 
 
 def test_a_few_wrong_matches_that_agree_by_chance_move_nothing():

@@ -1,4 +1,4 @@
-"""The same features and descriptors as OpenCV's own SURF, kept in surf_reference.npz, and as a plain detector's."""
+"""The same features and descriptors as OpenCV's own SURF, kept in surf_reference.npz."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import pytest
 from scipy.spatial import cKDTree
 
 from frontends.surf import Surf
-from tests.frontends.plain_detector import plain_keypoints
-from tests.frontends.scenes import photograph, texture
 
 CASES = [
     (image, layers, mode, threshold)
@@ -42,36 +40,3 @@ def test_reference(reference, image, layers, mode, threshold):
     cosine = (descriptors[nearest] * expected).sum(axis=1)
     assert np.median(cosine) >= 0.995
     assert np.percentile(cosine, 1) >= 0.965
-
-
-def checkers():
-    """A chessboard, turned and noisy: corners in place of blobs, and saturated areas."""
-    y, x = np.mgrid[:113, :147]
-    squares = ((0.9 * x + 0.4 * y) // 13 + (0.9 * y - 0.4 * x) // 13) % 2
-    return photograph(squares * 300 - 20, noise=6)
-
-
-IMAGES = {
-    "texture": lambda: photograph(texture(96, 131, seed=5)),
-    "fine texture": lambda: photograph(texture(101, 90, seed=6, finest=0.7), noise=3),
-    "noise": lambda: np.random.default_rng(7).integers(0, 256, (80, 123)).astype(np.uint8),
-    "checkers": checkers,
-    "16 bit": lambda: photograph(texture(96, 131, seed=8)).astype(np.uint16) * 257,
-}
-
-
-@pytest.mark.parametrize("name", IMAGES)
-@pytest.mark.parametrize(("octaves", "layers", "threshold"), [(2, 2, 50), (4, 3, 0)])
-def test_plain_detector(name, octaves, layers, threshold):
-    image = IMAGES[name]()
-    expected = plain_keypoints(image if image.dtype == np.uint8 else image // 257, threshold, octaves, layers)
-    found = Surf(threshold, octaves, layers).detect(image)
-    rows = np.c_[found.uv, found.size, found.response, found.laplacian, found.octave]
-    scaled = np.array([1, 1, 1e3, 0, 0, 1e4])  # a size or an octave away is never the nearest
-    distance, nearest = cKDTree(rows * scaled).query(expected * scaled)
-    same = (distance < 0.01) & (rows[nearest, 4] == expected[:, 4])
-    same &= np.abs(rows[nearest, 3] / expected[:, 3] - 1) < 1e-4
-    assert len(expected) > 20
-    # Responses are single precision here, so a maximum by less than that may go either way.
-    assert same.mean() >= 0.995
-    assert abs(len(rows) - len(expected)) <= 0.005 * len(expected)

@@ -75,7 +75,7 @@ def test_setters_change_what_is_found():
     surf.setNOctaveLayers(nOctaveLayers=2)
     surf.setUpright(upright=1)
     surf.setExtended(extended=False)
-    keypoints, descriptors = surf.detectAndCompute(IMAGE)
+    keypoints, descriptors = surf.detectAndCompute(IMAGE, None, None, False)
     other, same = Surf(5000, 2, 2).detectAndCompute(IMAGE)
     assert 0 < len(keypoints) < many
     assert len(other) == len(keypoints) and np.array_equal(descriptors, same)
@@ -97,11 +97,5 @@ def test_what_this_surf_does_not_have_is_refused(name, value, words):
     with pytest.raises(ConfigurationError, match=words):
         getattr(surf, f"set{name}")(value)
     assert getattr(surf, f"get{name}")() == getattr(frontends.surf.create(), f"get{name}")()
-
-
-def test_detect_and_compute_takes_opencv_s_arguments():
-    surf = Surf(100)
-    every, plain = surf.detectAndCompute(IMAGE, None, None, False), surf.detectAndCompute(IMAGE)
-    assert np.array_equal(every[1], plain[1])
     with pytest.raises(ConfigurationError, match="use compute"):
         surf.detectAndCompute(IMAGE, None, useProvidedKeypoints=True)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -115,15 +112,6 @@ def test_threshold_keeps_the_number_of_features():
     assert thresholds[14] == thresholds[15]
 
 
-def test_features_are_spread():
-    busy = BLACK.copy() + 120
-    busy[:, :100] = LEFT[:, :100]
-    busy[:, 100:] = (120 + 0.3 * (LEFT[:, 100:].astype(float) - 120)).astype(np.uint8)
-    features = SurfFrontend(RIG, features=120).extract(StereoFrame(0, 0.0, busy, None))
-    share = (features.uv_left[:, 0] < 100).mean()
-    assert share < 0.6  # a third of the area; without the grid it takes nearly all
-
-
 @pytest.mark.parametrize(
     ("left", "right", "says"),
     [
@@ -163,24 +151,3 @@ def test_without_a_folder_for_the_cache_kernels_still_run(monkeypatch, caplog):
     monkeypatch.setattr(compilation, "njit", no_folder)
     assert compilation.kernel(lambda x: x + 1)(2) == 3
     assert "set NUMBA_CACHE_DIR" in caplog.text
-
-
-FIRST_USE = """
-import logging
-import numpy as np
-logging.basicConfig()
-from frontends.surf import Surf
-image = np.random.default_rng(0).integers(0, 255, (40, 40), np.uint8)
-assert len(Surf(0, octaves=1).detect(image)) > 0
-"""
-
-
-@pytest.mark.slow
-def test_first_use_says_why_it_takes_long_and_later_ones_do_not(tmp_path):
-    run = [sys.executable, "-c", FIRST_USE]
-    environment = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": ":".join(filter(None, sys.path))}
-    first, second = (
-        subprocess.run(run, env=environment, capture_output=True, text=True, check=True).stderr for _ in range(2)
-    )
-    assert first.count("WARNING") == first.count("compiling kernels") == 1
-    assert "compiling" not in second

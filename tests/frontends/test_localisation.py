@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from frontends.surf import Surf
-from tests.frontends.plain_detector import DXX, DXY, DYY
 from tests.frontends.scenes import photograph, texture
+
+#: Lobes (left, top, right, bottom, weight) of the filters, in ninths of the size.
+DXX = ((0, 2, 3, 7, 1), (3, 2, 6, 7, -2), (6, 2, 9, 7, 1))
+DYY = tuple((top, left, bottom, right, w) for left, top, right, bottom, w in DXX)
+DXY = ((1, 1, 4, 4, 1), (5, 1, 8, 4, -1), (1, 5, 4, 8, -1), (5, 5, 8, 8, 1))
 
 
 def plain_response(sums: np.ndarray, x: float, y: float, size: float) -> float:

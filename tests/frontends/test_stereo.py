@@ -58,14 +58,6 @@ def test_unlike_rows_need_a_wider_band():
     assert np.nanmedian((features.uv_right - features.uv_left)[:, 1]) == pytest.approx(4.0, abs=0.05)
 
 
-def test_repeated_texture_gives_no_match():
-    tile = photograph(texture(240, 40, seed=3))
-    wall = np.tile(tile, (1, 8))
-    features = SurfFrontend(RIG, features=200).extract(StereoFrame(0, 0.0, wall, np.roll(wall, -12, axis=1)))
-    assert len(features) > 60
-    assert features.has_stereo.mean() < 0.05
-
-
 def grid(period, half, size, shift, noise, seed):
     """Photograph of lines along and across the rows, shifted to the left [px]."""
     v, u = np.mgrid[: size[1], : size[0]] * 1.0

@@ -30,7 +30,7 @@ MODELS = EstimatorModels(
 #: By how much an estimate may differ from the reference's: in the reference's standard deviations, for each of the
 #: numbers of a pose or a point, and by a factor of the variance in any direction. A filter linearises once. The
 #: smoother is none of them: landmarks that are first seen in a frame without a measurement, which is no pose of its
-#: graph, count for less there (`tests/backends/test_agreement.py` compares it where every frame is measured).
+#: graph, count for less there (`tests/backends/test_all_backends.py` compares it where every frame is measured).
 TOLERANCES = {"ekf": (0.5, 1.4), "window": (0.05, 1.4), "batch": (0.05, 1.4)}
 
 

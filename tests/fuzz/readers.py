@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import slam
-from slam.sequences.captures import quiet_libraries
+from slam.sequences.images import quiet_libraries
 from tests import recordings
 from tests.fuzz.files import Files, mutate
 from tests.fuzz.harness import Broken, Subject

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import slam
-from backends.ekf.filter import EkfConfig
+from backends.ekf import EkfConfig
 from backends.smoother.config import SmootherConfig
 from slam.config import SystemConfig
 from slam.data import StereoFeatures

@@ -9,7 +9,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from backends.ekf.filter import EkfConfig
+from backends.ekf import EkfConfig
 from backends.smoother.config import SmootherConfig
 from frontends.surf.config import SurfConfig
 from slam.bodies.config import ObjectsConfig
@@ -51,11 +51,11 @@ def test_json_and_back(kind):
         ("maps.max_landmarks=3", "unknown section 'maps' (did you mean 'map.max_landmarks'?); known: models"),
         ("max_landmarks=3", "unknown key"),
         ("map.max_landmarks", "not of the form"),
-        ("models.pixel_sigma=abc", "models.pixel_sigma: must be a number, got 'abc'"),
-        ("map.max_landmarks=many", "map.max_landmarks: must be a whole number, got 'many'"),
-        ("association.align=often", "association.align: must be true or false, got 'often'"),
-        ("map.grid=3", "map.grid: must be a list, got 3"),
-        ("models.T_world_left=[1]", "models.T_world_left.0: must be a list, got 1"),
+        ("models.pixel_sigma=abc", "models.pixel_sigma must be a number, got 'abc'"),
+        ("map.max_landmarks=many", "map.max_landmarks must be a whole number, got 'many'"),
+        ("association.align=often", "association.align must be true or false, got 'often'"),
+        ("map.grid=3", "map.grid must be a list"),
+        ("models.T_world_left=[1]", "models.T_world_left must be a (4, 4) pose"),
         ("models.pixel_sigma=-1", "pixel_sigma must be positive"),
         ("models.pixel_sigma=NaN", "pixel_sigma must be positive and finite"),
         ("map.grid=[1]", "map.grid"),

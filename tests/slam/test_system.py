@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import slam
-from slam.bodies.detector import ObjectDetector
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SequenceError
@@ -152,12 +151,3 @@ def test_two_arrays_and_a_time_are_a_frame():
     for thing in (["a list has an index method"], "and so has a text"):
         with pytest.raises(MeasurementError, match=r"a frame must be a StereoFrame, got (list|str)"):
             list(by_arrays.run([thing]))
-
-
-def test_another_detector_takes_the_place_of_the_first_one():
-    cloud, system = Cloud(150), StereoSlam(RIG, None, "ekf", config=CONFIG)
-    system.process_features(cloud.features(np.eye(4), 0.0, 0.3)[0])
-    system.objects = ObjectDetector()
-    suspects = system.objects.suspects = system.landmarks.ids[:6].copy()
-    result = system.process_features(cloud.features(np.eye(4), 0.1, 0.3)[0])
-    assert len(result.matched) > 20 and not np.isin(suspects, result.matched).any()

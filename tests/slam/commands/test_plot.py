@@ -1,16 +1,12 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.evaluation.truth_error import truth_covariances
-from slam.geometry.se3 import adjoint, inverse
-from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.run.options import RunOptions
 from slam.run.plots import KINDS
 from slam.run.plots import plot_folders as plot_runs
@@ -65,34 +61,6 @@ def test_the_error_of_the_rotation_is_drawn_beside_that_of_the_position(runs):
     summary = run_.summary["accuracy"]["online"]
     assert np.sqrt(np.mean(error[:, 1] ** 2)) == pytest.approx(summary["rotation RMSE from start [deg]"], rel=1e-3)
     assert (error[1:, 1] < 5 * sigma[1:, 1]).all() and (sigma[1:, 1] > 0).all()
-
-
-def test_the_band_has_the_truth_s_own_errors_as_the_verdict_has_them(runs):
-    run_ = RunData.read(runs / "a", "a")
-    _, error, claimed = pose_errors(run_)
-    noise = TruthNoise(rotation=0.01, translation=0.1)
-    _, same, both = pose_errors(replace(run_, truth_noise=noise))
-    np.testing.assert_array_equal(same, error)
-    own, true = run_.online, run_.truth
-    first, last = np.zeros(len(own), np.intp), np.arange(len(own))
-    A = adjoint(inverse(inverse(own.poses[first]) @ own.poses))
-    P = truth_covariances(true, noise, first, last, A)
-    np.testing.assert_allclose(
-        both[:, 1] ** 2 - claimed[:, 1] ** 2, np.degrees(1) ** 2 * np.trace(P[:, :3, :3], 0, 1, 2)
-    )
-    assert (both[1:] > claimed[1:]).all()
-
-
-def test_a_recorded_truth_of_a_straight_path_is_not_turned_about_it(runs):
-    """Places in a line do not tell a turn about that line."""
-    run_ = RunData.read(runs / "a", "a")
-    straight = np.tile(np.eye(4), (len(run_.online), 1, 1))
-    straight[:, 2, 3] = np.arange(len(straight))
-    off = straight.copy()
-    off[:, :2, 3] += 1e-3 * np.random.default_rng(0).standard_normal((len(off), 2))
-    made = (Trajectory(run_.online.stamps, poses) for poses in (off, straight))
-    _, error, _ = pose_errors(replace(run_, online=next(made), truth=next(made), truth_is_exact=False))
-    assert error.max() < 0.01
 
 
 def test_truth_that_was_not_measured_is_no_error_in_the_picture(runs, monkeypatch):

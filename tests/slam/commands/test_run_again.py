@@ -87,17 +87,6 @@ def test_a_prior_map_is_found_again(here):
     assert (here / "second/trajectory.txt").read_bytes() == (here / "third/trajectory.txt").read_bytes()
 
 
-def test_all_that_a_run_writes_is_named(here):
-    words = ["--record", "a.npz", "--save-map", "a.map", "--draw", "drawn", "--out", "first", "--no-picture"]
-    assert "Files: first, a.npz, a.map, drawn" in slam("run", WORLD, "--frames", "0:2", *words)
-    assert all((here / name).exists() for name in ("first", "a.npz", "a.map", "drawn"))
-
-
-def test_the_list_says_what_each_back_end_is():
-    printed = " ".join(slam("list").split())
-    assert "ekf Extended Kalman filter" in printed and "batch Levenberg-Marquardt" in printed
-
-
 GOOD = {"frames": [0, None], "settings": {}, "frontend": "surf", "backend": "ekf"}
 
 
@@ -122,13 +111,3 @@ def test_a_bad_config_is_one_line(tmp_path, text, words):
         slam("run", WORLD, "--config", tmp_path, "--kind", "driving")
     with pytest.raises(SlamError, match="name a sequence"):
         slam("run")
-
-
-def test_another_run_is_not_overwritten_without_being_told(here):
-    run(WORLD, "--frames", "0:2", "--out", "mine")
-    for words in ([WORLD, "--frames", "0:3"], ["--config", "mine"]):
-        with pytest.raises(SlamError, match=r"config\.json: is (there already|an input)"):
-            run(*words, "--out", "mine")
-    assert json.loads((here / "mine/config.json").read_text())["frames"] == [0, 2]
-    run(WORLD, "--frames", "0:3", "-o", "mine", "--overwrite")
-    assert json.loads((here / "mine/config.json").read_text())["frames"] == [0, 3]

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import fields
 from functools import reduce
 from operator import getitem
 
@@ -72,42 +71,12 @@ def test_a_mistyped_setting_is_answered_with_those_that_can_be_set(setting, word
         require_settable(["frontend.feature=3"], SystemConfig().to_json(), "surf")
 
 
-def test_settings_may_be_a_dict():
-    given = {"map.max_landmarks": 300, "objects.mode": "off", "backend.lag": 8}
-    texts = [f"{key}={value}" for key, value in given.items()]
-    assert SystemConfig().with_settings(given) == SystemConfig().with_settings(texts)
-    assert SystemConfig().with_settings({}) == SystemConfig()
-    for wrong in ({"map.colour": 1}, {3: 1}, {"map.max_landmarks": "many"}):
-        with pytest.raises(ConfigurationError, match="setting"):
-            SystemConfig().with_settings(wrong)
-
-
 def test_a_kind_beside_a_configuration_is_refused():
     """It was ignored, also where the configuration was that of another kind."""
     config = SystemConfig.for_kind("driving")
     with pytest.raises(ConfigurationError, match="kind does not go with config"):
         slam.StereoSlam(RIG, kind="handheld", config=config)
     assert slam.StereoSlam(RIG, config=config).config.map == config.map
-
-
-def test_a_setting_of_an_earlier_version_is_one_line():
-    gone = r"^setting {}: there is no such setting in this version$".format
-    for tree, words in (
-        ({"association": {"hypotheses": 50}}, gone(r"association\.hypotheses")),
-        ({"map": {"colour": 1}}, gone(r"map\.colour")),
-        *((bad, "setting") for bad in ([], "x", {"map": {"__doc__": 1}}, {"association": {"hypotheses": [1]}})),
-    ):
-        with pytest.raises(ConfigurationError, match=words):
-            SystemConfig.from_json(tree)
-
-
-@pytest.mark.parametrize("role", ["frontend", "backend"])
-def test_options_of_front_ends_and_back_ends_are_there(every, role):
-    for name in registry.names(f"{role}s"):
-        part = registry.create(f"{role}s", name, RIG)
-        options = fields(part.config) if name != "batch" else ()  # which has none
-        wanted = {f"{role}.{f.name}" for f in options if can_be_set(f"{role}.{f.name}", name)}
-        assert {s.key for s in every if s.owner == name and s.key.startswith(role)} == wanted
 
 
 OWN = """
@@ -144,7 +113,3 @@ def test_an_unknown_section(read):
         list(listing("mapp", 80))
     with pytest.raises(SlamError, match=r"there is map\.max_landmarks"):
         list(listing("max_landmarks", 80))
-
-
-def test_a_back_end_without_options_is_known():
-    assert list(listing("batch", 80)) == ["batch has no options."]

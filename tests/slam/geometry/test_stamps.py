@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam.geometry.stamps import increasing, pair, trim
+from slam.geometry.stamps import increasing, pair
 
 STAMPS = st.lists(st.integers(0, 40), max_size=9)
 KEYS = st.lists(st.integers(0, 60), unique=True, max_size=12).map(sorted)
@@ -46,17 +46,3 @@ def test_pairs_are_near_and_unique_and_none_is_forgotten(left: list[int], right:
                 break
         else:
             assert not len(c)
-
-
-def test_the_nearer_of_two_rivals_wins() -> None:
-    assert pair(np.array([0, 3, 10]), np.array([2, 10]), 5).tolist() == [-1, 0, 1]
-    assert pair(np.array([7]), np.array([3]), 4).tolist() == [0]
-    assert pair(np.array([7]), np.array([2]), 4).tolist() == [-1]
-    assert pair(np.array([7]), np.array([], int), 4).tolist() == [-1]
-    assert pair(np.array([], int), np.array([7]), 4).tolist() == []
-
-
-def test_trim_keeps_what_lies_between_pairs() -> None:
-    assert trim(np.array([-1, 0, -1, 2, -1, -1])) == slice(1, 4)
-    assert trim(np.array([-1, -1])) == slice(0, 0)
-    assert trim(np.array([], int)) == slice(0, 0)

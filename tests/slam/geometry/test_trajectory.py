@@ -77,14 +77,6 @@ def test_evo_reads_what_is_written(tmp_path: Path) -> None:
         assert np.abs(theirs.timestamps - trajectory.stamps).max() < 3e-7
 
 
-def test_comments_and_further_columns_do_not_count(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("#timestamp,p,q,v\n1000000000,1,2,3,1,0,0,0,9,9,9\n2000000000,1,2,4,1,0,0,0,9,9,9\n")
-    read = Trajectory.read_euroc(path)
-    assert np.allclose(read.stamps, [1, 2])
-    assert np.allclose(read.positions, [[1, 2, 3], [1, 2, 4]])
-
-
 READERS = [
     (Trajectory.read_tum, "1 0 0 0 0 0 0 1"),
     (Trajectory.read_kitti, "1 0 0 0 0 1 0 0 0 0 1 0"),

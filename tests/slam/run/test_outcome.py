@@ -10,11 +10,9 @@ import pytest
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.models import MotionModel
-from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
+from slam.run.outcome import motion_doubt, outcome, scale_doubt
 from slam.run.results import rows
 from slam.run.summary import RunRecord
-from tests.slam.scene import RIG as SCENE_RIG
-from tests.slam.scene import Cloud
 
 RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
 
@@ -67,14 +65,6 @@ def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, mo
     assert said.startswith(f"no frame after the first was tracked; likely cause: {words}")
 
 
-def test_a_baseline_that_no_hand_carries_is_the_cause_unless_it_is_a_vehicle_s():
-    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 7.5, 320, 240)
-    run = replace(record(0), depths=[110.0] * 11)
-    words = "likely cause: by the calibration the cameras are 7.5 m apart and what they see is 110 m away"
-    assert words in outcome(run, rig)
-    assert "no hand" not in outcome(run, rig, driving=True)
-
-
 def moving(times_too_short: float, frames: int = 40) -> RunRecord:
     """A camera in a hand: its velocity changes as the motion model says, its stamps may be wrong."""
     rng = np.random.default_rng(0)
@@ -104,13 +94,6 @@ def test_missing_right_images_are_the_cause_where_most_of_these_frames_have_none
     run = record(10)
     run.without_right.extend(range(5))
     assert "no right image" not in outcome(run, RIG)
-
-
-def test_the_median_depth_of_a_frame():
-    features, _ = Cloud(151).features(np.eye(4), 0.0)
-    depths = SCENE_RIG.triangulate(features.uv_left, features.uv_right)[:, 2]
-    assert median_depth(features, SCENE_RIG) == pytest.approx(np.median(depths), rel=0.05)
-    assert np.isnan(median_depth(replace(features, uv_right=features.uv_right * np.nan), SCENE_RIG))
 
 
 def along(step, times=30, **more):

@@ -110,21 +110,3 @@ def test_one_front_end_used_from_two_threads_says_so():
     slow.go.set()
     thread.join()
     assert len(results) == 3
-
-
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_a_free_for_all_breaks_nothing(backend):
-    """Four threads take frames as they come: each step either happens or is refused."""
-    system, done = StereoSlam(SEQUENCE.rig, None, backend), []
-
-    def work(first):
-        for k in range(first, 12, 4):
-            try:
-                done.append(system.process_features(SEQUENCE.observations(FIRST + k)).index)
-            except SlamError as error:
-                assert "another thread" in str(error) or "not later" in str(error)
-
-    assert in_threads(*(lambda k=k: work(k) for k in range(4))) == [None] * 4
-    assert sorted(done) == list(range(len(done))) and done
-    assert system.process_features(SEQUENCE.observations(FIRST + 13)).index == len(done)
-    assert sorted(system.estimate().ids) == sorted(system.landmarks.ids)

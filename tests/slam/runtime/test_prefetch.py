@@ -12,7 +12,7 @@ from slam.runtime.threads import prefetch
 
 
 def threads() -> set[threading.Thread]:
-    return {thread for thread in threading.enumerate() if thread.name == "prefetch"}
+    return {thread for thread in threading.enumerate() if thread.name.startswith("prefetch")}
 
 
 def test_an_item_is_made_while_the_one_before_is_used():

@@ -18,7 +18,6 @@ import pytest
 import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.sequences import camera, is_live
-from slam.sequences import captures as devices
 from slam.sequences.rigs import write_opencv
 
 WIDTH, HEIGHT = 160, 120
@@ -70,7 +69,7 @@ def played(monkeypatch: pytest.MonkeyPatch):
                 raise SequenceError(f"camera:{address}: cannot be opened")
             return Played(images[address])
 
-        monkeypatch.setattr(devices, "open_device", open_device)
+        monkeypatch.setattr(camera, "open_device", open_device)
 
     return put
 
@@ -168,7 +167,7 @@ def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
         played({"1": [grey(0, 320)]})
         len(slam.open_sequence("camera:1"))
     (tmp_path / "calibration.yaml").unlink()
-    words = r"camera:1: there is no calibration.yaml.* name the file: 'camera:1\?calibration=FILE'"
+    words = r"calibration\.yaml: the calibration is missing: add calibration=FILE"
     with pytest.raises(CalibrationError, match=words):
         slam.open_sequence("camera:1")
 
@@ -212,7 +211,7 @@ def test_ctrl_c_ends_a_run_from_a_stuck_camera_with_all_its_files(rig_here, scen
         return True, image ^ np.uint8(next(taken) % 2)  # noise: equal images would be no measurement
 
     watched = SimpleNamespace(grab=grab, retrieve=retrieve, release=lambda: None)
-    monkeypatch.setattr(devices, "open_device", lambda *_: watched)
+    monkeypatch.setattr(camera, "open_device", lambda *_: watched)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has its background jobs ignore it
     try:
         done = slam_command("run", "camera:0?wait=0", "--out", out, "--no-picture")

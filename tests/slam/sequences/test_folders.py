@@ -16,7 +16,7 @@ import slam
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.input.features import outside_masks
 from slam.sequences import open_sequence, with_mask
-from slam.sequences.faults import said_before
+from slam.sequences.base import said_before
 from slam.sequences.names import keys_of, of_sides
 from tests.recordings import FIVE, rename, seeds
 
@@ -105,7 +105,10 @@ def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
         (lambda i, _: f"{1_700_000_000}_{50 * i:03d}", "_000.png is taken as 1700000000.000000 s"),
         (lambda i, _: f"{33 * i}", "33 apart and taken as frame numbers; if they are times, see times="),
         (lambda i, _: ("3fa9c10", "3fa9c25", "5e1b", "71", "8ac0", "9")[i], "their order does"),
-        (lambda i, _: "preview" if i == 5 else f"{i}", "1 of 6 images are named unlike the others .first: preview.png"),
+        (
+            lambda i, _: "preview" if i == 5 else f"{i}",
+            "1 of 6 images are named unlike the others, .*first: preview.png",
+        ),
     ):
         for side in ("left", "right"):
             rename(two_folders / side, lambda i, form=form, side=side: form(i, side[::2]) + ".png")
@@ -117,7 +120,7 @@ def test_images_in_two_formats_are_taken_once(two_folders: Path) -> None:
         path.with_suffix(".bmp").write_bytes(path.read_bytes())
     sequence = open_sequence(two_folders)
     assert seeds(sequence) == PAIRS
-    assert "6 of 12 images are there in another format, too" in sequence.warnings[0]
+    assert "6 of 12 images are named unlike the others, or there in another format, too" in sequence.warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -238,7 +241,7 @@ def test_kitti_s_calib_txt_beside_the_images_is_read_and_another_one_named(two_f
     assert sequence.rig.baseline == pytest.approx(0.5)
     assert any("calib.txt: the images are taken as its cameras' 0 and 1" in line for line in sequence.warnings)
     (two_folders / "calib.txt").write_text("cam0=[50 0 31.5; 0 50 23.5; 0 0 1]\n")
-    with pytest.raises(CalibrationError, match=r"the calibration is missing \(calib.txt is not of KITTI's form\)"):
+    with pytest.raises(CalibrationError, match=r"calib\.txt: no calibration in this file"):
         open_sequence(two_folders)
 
 
@@ -362,7 +365,7 @@ def test_features_under_a_mask_are_not_used(tmp_path: Path, two_folders: Path) -
     assert np.isfinite(outside_masks(features, frame, sequence.rig).uv_right[:, 0]).tolist() == [False] * 3 + [True] * 4
     cv2.imwrite(str(two_folders / "m.png"), np.eye(48, 64, dtype=np.uint8))
     frame = next(iter(open_sequence(f"{two_folders}?mask=m.png")))
-    assert frame.left_mask is frame.right_mask and frame.left_mask.sum() == 48
+    assert (frame.left_mask == frame.right_mask).all() and frame.left_mask.sum() == 48
 
 
 # ------------------------------------------------------------------------------------------------ videos

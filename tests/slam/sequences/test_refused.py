@@ -110,7 +110,7 @@ def test_options_that_are_none(two_folders, query, error, words):
 
 def test_options_of_other_formats(kitti, euroc):
     refused(f"{kitti}?tolerance=0.1", ConfigurationError, r"option 'tolerance' does nothing here: .* is read as kitti")
-    refused(f"{kitti}?rectified=yes", ConfigurationError, "does nothing here")
+    refused(f"{kitti}?unit=mm", ConfigurationError, r"'unit' does nothing with .*calib\.txt, which is KITTI's")
     refused(f"{euroc}?tolerance=-1", ConfigurationError, "tolerance must be a number from 0 to 10")
     with pytest.raises(UnknownNameError, match="unknown format 'movie'; known: ros, euroc, kitti-raw, kitti"):
         open_sequence(kitti, format="movie")
@@ -166,11 +166,17 @@ def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
         for path in folder.rglob("*.png"):
             build.write_image(path, 0, width=74, height=58)
     refused(euroc, SequenceError, r"images are 74x58, but .*sensor\.yaml is for 64x48")
-    refused(raw, CalibrationError, r"cam_to_cam.*images are 74x58.*64x48.*unrectified \(extract\) drive")
+    refused(raw, SequenceError, r"images are 74x58, but .*cam_to_cam\.txt is for 64x48")
+    extract = raw.rename(raw.parent / raw.name.replace("sync", "extract"))
+    refused(extract, SequenceError, r"an unrectified \(extract\) drive: take the rectified")
     lines = (kitti / "calib.txt").read_text().splitlines()
     for row in ("P1: 0 0 0 0 0 0 0 0 0 0 0 0", "P1: 50 1 31.5 -25 0 50 23.5 0 0 0 1 0", "P1: 1 2 3"):
         (kitti / "calib.txt").write_text("\n".join([lines[0], row]))
-        refused(kitti, CalibrationError, r"calib\.txt: (not a rectified projection|P1 is no matrix of shape)")
+        refused(
+            kitti,
+            CalibrationError,
+            r"calib\.txt: (not a rectified projection|P1 is no matrix of shape)|holds no baseline",
+        )
 
 
 def test_lists_that_are_none_are_named_with_the_row(euroc, kitti, raw, two_folders):

@@ -7,9 +7,9 @@ from slam.data import StereoFeatures
 from slam.tracks.config import MapConfig
 from slam.tracks.mapper import (
     MapView,
-    doubled_landmarks,
+    depth_is_known,
+    duplicates,
     expected_landmarks,
-    features_of_landmarks,
     new_landmarks,
     redundant_landmarks,
     surplus_landmarks,
@@ -32,7 +32,8 @@ def features_at(uv, depth=3.0, response=None):
 
 def chosen(features, occupied=(), config=CONFIG, free=None):
     free = np.ones(len(features), bool) if free is None else free
-    return new_landmarks(features, free, np.asarray(occupied, float).reshape(-1, 2), RIG, 1.0, config)
+    deep = depth_is_known(RIG, features, np.arange(len(features)), 1.0, config.max_depth_error)
+    return new_landmarks(features, free & deep, np.asarray(occupied, float).reshape(-1, 2), RIG, config)
 
 
 def rows_with(**columns):
@@ -42,17 +43,12 @@ def rows_with(**columns):
     return LandmarkTable(np.arange(n), np.zeros((n, 16), np.float32), np.ones(n, np.int8), **base)
 
 
-def test_as_many_as_wanted_and_the_strongest_of_a_cell():
+def test_empty_regions_come_first_and_none_lies_close_to_another():
     rng = np.random.default_rng(0)
     uv = rng.uniform((10, 10), (310, 230), (300, 2))
-    features = features_at(uv, response=rng.random(300))
-    new = chosen(features)
-    assert len(new) == 20
+    new = chosen(features_at(uv, response=rng.random(300)))
     gaps = np.linalg.norm(uv[new][:, None] - uv[new][None], axis=2) + 1e9 * np.eye(20)
     assert gaps.min() >= 5.0
-
-
-def test_empty_regions_come_first():
     left = [(20.0 + 8 * i, 100.0 + 8 * j) for i in range(5) for j in range(5)]
     right = [(300.0, 100.0), (300.0, 110.0)]
     features = features_at(left + right, response=[10.0] * 25 + [0.1] * 2)
@@ -65,11 +61,7 @@ def test_features_on_landmarks_and_without_depth_are_left_out():
     features.uv_right[2] = np.nan
     free = np.array([True, True, True, False])
     assert chosen(features, occupied=[(51, 51)], free=free).tolist() == [1]
-
-
-def test_uncertain_depth_is_left_out():
     # f B = 36 px m: at 3 m the disparity is 12 px and 1.4 px of noise are 12 %; at 6 m they are 24 %.
-    assert len(chosen(features_at([(100, 100)], depth=3.0))) == 1
     assert len(chosen(features_at([(100, 100)], depth=6.0))) == 0
 
 
@@ -132,35 +124,26 @@ def test_out_of_view_the_map_is_thinned_to_the_best_seen():
     assert not redundant_landmarks(unknown, positions, config).any()
 
 
-def seen_from_the_origin(positions, features):
-    return MapView.of(RIG, np.eye(4), np.asarray(positions, float), features, 1.0)
-
-
 def like(features, rows, seen):
     """Landmarks that look like some of the features."""
-    n, none = len(rows), np.zeros(len(rows), np.int64)
+    none = np.zeros(len(rows), np.int64)
     looks, signs = features.descriptors[rows], features.laplacian[rows]
-    return LandmarkTable(np.arange(n), looks, signs, np.asarray(seen), none, none, none)
+    return LandmarkTable(np.arange(len(rows)), looks, signs, np.asarray(seen), none, none, none)
 
 
-def test_a_feature_that_is_a_landmark_already_is_known():
+def test_features_and_landmarks_that_are_a_landmark_already_are_known():
     features = features_at([(100, 100), (200, 100), (250, 50)], depth=3.0)
-    points = RIG.triangulate(features.uv_left, features.uv_right)
-    landmarks = like(features, [0, 1, 1], [1, 1, 1])
+    a, b, c = RIG.triangulate(features.uv_left, features.uv_right)
     # The first: 0.2 m deeper, within the uncertainty of 12 %. The second: as deep, but 20 px away. The third looks
     # like another feature.
-    positions = [points[0] * 1.07, points[1] + [0.2, 0, 0], points[2]]
-    view = seen_from_the_origin(positions, features)
-    assert features_of_landmarks(view, landmarks, features, CONFIG).tolist() == [True, False, False]
-
-
-def test_of_doubled_landmarks_the_one_seen_less_goes():
-    features = features_at([(100, 100), (200, 100)], depth=3.0)
-    points = RIG.triangulate(features.uv_left, features.uv_right)
-    landmarks = like(features, [0, 0, 1, 1, 0], [5, 9, 4, 4, 3])
-    positions = [points[0], points[0] + 0.01, points[1], points[1] - 0.005, points[0] + [0, 0, 0.1]]
-    view = seen_from_the_origin(positions, features)
-    assert doubled_landmarks(view, landmarks, CONFIG).tolist() == [True, False, False, True, False]
+    landmarks, positions = like(features, [0, 1, 1], [1, 1, 1]), np.array([a * 1.07, b + np.array([0.2, 0, 0]), c])
+    view = MapView.of(RIG, np.eye(4), positions, features, 1.0)
+    assert duplicates(view, landmarks, features, CONFIG)[1].tolist() == [True, False, False]
+    # Of those at one place the one seen less goes, else the younger; the last one lies deeper by 10 cm.
+    landmarks, positions = like(features, [0, 0, 1, 1, 0], [5, 9, 4, 4, 3]), np.array([a, a + 0.01, b, b - 0.005, a])
+    positions[4, 2] += 0.1
+    view = MapView.of(RIG, np.eye(4), positions, features, 1.0)
+    assert duplicates(view, landmarks, features, CONFIG)[0].tolist() == [True, False, False, True, False]
 
 
 def test_hidden_landmarks_are_not_expected():

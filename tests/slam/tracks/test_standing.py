@@ -93,7 +93,7 @@ def test_a_rest_lasts_while_something_hides_all_that_stays_for_some_frames():
     assert not frames[-1]
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf"])
 def test_a_truck_that_passes_does_not_take_the_camera_along(backend):
     """Nine of ten features are its, and it goes 6 m; noise of the frames before the rest is noticed makes 3 mm."""
     scene, farthest = Scene(0.9), 0.0

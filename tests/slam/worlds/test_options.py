@@ -13,7 +13,7 @@ from slam.errors import SequenceError, SlamError
         ("isle", r"unknown world 'isle' \(did you mean 'aisle'\?\); known: aisle, box, boxes"),
         ("aisle?sead=3", r"world 'aisle' has no option 'sead' \(did you mean 'seed'\?\); known: baseline, .*seed"),
         ("aisle?frames=many", "frames must be a whole number, got 'many'"),
-        ("aisle?frames=-1", r"frames must lie in 0\.\."),
+        ("aisle?frames=-1", r"frames must lie in 1\.\."),
         ("aisle?sigma=nan", "sigma must lie in"),
         ("aisle?rig=crooked", "rig must be one of rectified, toedin, got 'crooked'"),
         ("aisle?seed=1&seed=2", "'seed' is given twice"),

@@ -99,30 +99,6 @@ def test_rendering_twice_gives_the_same_bytes_whatever_the_order_and_the_threads
     assert alone.left.dtype == np.uint8 and alone.left.shape == (240, 320)
 
 
-def test_depth_is_that_of_the_landmarks_and_of_the_stereo_pair():
-    sequence = open_world("startup?rig=toedin&frames=2")
-    depth = sequence.depth(0)
-    assert depth.dtype == np.float32 and depth.shape == (240, 320)
-    seen = visible_landmarks(sequence.world, 0)
-    u, v = np.rint(seen.uv_left).astype(int).T
-    assert np.abs(depth[v, u] - seen.points[:, 2]).max() < 2e-3  # half a pixel on a wall at right angles
-
-
-def test_object_image_is_where_the_object_is():
-    sequence = open_world("box?camera=still")
-    ids = sequence.object_ids(30)
-    assert np.unique(ids).tolist() == [0, 1]
-    T, size = sequence.objects(30)[0], np.array([0.24, 0.16, 0.20])
-    corner = np.array([[-size[0], 0, -size[2]], [0, 0, 0]])  # of its front, at rest in B0
-    world = corner @ T[:3, :3].T + T[:3, 3]
-    camera = sequence.ground_truth.poses[30]
-    uv = sequence.rig.left.project((world - camera[:3, 3]) @ camera[:3, :3])
-    rows, columns = np.nonzero(ids)
-    assert columns.min() == pytest.approx(uv[0, 0], abs=1)
-    # The right side and, the box being above the camera, the bottom are seen, too: only two sides are the front's.
-    assert rows.min() == pytest.approx(uv[1, 1], abs=1)
-
-
 def test_no_pixel_of_a_room_is_without_a_surface():
     for query in ("aisle", "desk", "field", "boxes"):
         sequence = open_world(query)

@@ -7,42 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import BACK, DOWN, RIGHT, Parts, Rectangle, crate, cuboid, rectangle
-from slam.worlds.paths import camera_poses, clock, placed, smooth_step, sway, yaw_pitch_roll
-from slam.worlds.surfaces import Facade, Material
+from slam.geometry.se3 import Array
+from slam.worlds.drives import EYE, PACE, STEP, Road
+from slam.worlds.geometry import Parts, Rectangle, crate
+from slam.worlds.paths import camera_poses, clock, placed, smooth_step, sway
+from slam.worlds.streets import Streets, car
+from slam.worlds.surfaces import Material
 
-PACE = 8.0  #: driving speed [m/s]
-EYE = 1.65  #: height of the camera above the ground [m]
 TURN_AT, TURN_LENGTH = 104.0, 30.0  #: where the turn to the left begins and how long it is [m along the path]
-EAST, WEST = 7.0, -9.0  #: house fronts right and left of the path [m]
-END = -150.0  #: end of the second street [m]
+_LENGTH = 250.0  #: of the streets along the way [m]
 _LANE = 3.2  #: to the oncoming lane [m]
-
-#: The two boxes of a car: size, lowest corner [m], and materials of its back, its front and its sides.
-_CAR = (
-    ((1.75, 4.3, 0.75), (-0.875, -2.15, 0.2), ("car_back", "car_front", "car_side")),
-    ((1.5, 2.3, 0.55), (-0.75, -1.35, 0.95), ("cabin_end", "cabin_end", "cabin_side")),
-)
-
-
-def car(T: Array, seed: int, body: int = 0) -> list[Rectangle]:
-    """A car of two boxes; its frame: origin on the ground in its middle, y ahead."""
-    out = []
-    for size, corner, (rear, fore, side) in _CAR:
-        x, y, z = size
-        sides = {"front": (rear, x, z), "back": (fore, x, z), "left": (side, y, z), "right": (side, y, z)}
-        faces = {face: Material(a, b, name, seed, 12, (0.05, 0.25)) for face, (name, a, b) in sides.items()}
-        faces["top"] = Material(x, y, "car_top", seed, 1, (0.05, 0.2))
-        out += cuboid(faces, size, corner, body, T)
-    return out
-
-
-def post(T: Array, size: tuple[float, float, float], material: str, seed: int) -> list[Rectangle]:
-    """A box that stands on the ground; its frame: origin on the ground in its middle."""
-    looks = Material(0, 0, material, 10 * seed, 12, (0.05, 0.25))
-    corner = (-size[0] / 2, -size[1] / 2, 0)
-    return crate(size, looks, corner, T_body_box=T, sides=("front", "back", "left", "right"))
 
 
 def street(values: Mapping[str, Any]) -> Parts:
@@ -87,54 +61,10 @@ def path(s: Array, across: Array | float = 0.0) -> tuple[Array, Array]:
 
 
 def surroundings(layout: int) -> list[Rectangle]:
-    """What stands still: houses, road and pavement of both streets, parked cars."""
-    y2, width = float(path(np.array([TURN_AT + TURN_LENGTH]))[0][0, 1]), EAST - WEST  # y of the second street
-    rows = [  # from, to, along which front's upper edge runs to the right as seen from the street
-        ((WEST, -30.0), (WEST, y2 + WEST)),
-        ((EAST, y2 + EAST), (EAST, -30.0)),
-        ((END, y2 + EAST), (EAST, y2 + EAST)),
-        ((WEST, y2 + WEST), (END, y2 + WEST)),
-        ((END, y2 + WEST), (END, y2 + EAST)),
-    ]
-    out = [
-        house for number, row in enumerate(rows) for house in _houses(*row, np.random.default_rng([layout, 44, number]))
-    ]
-    first = Material(width, y2 + 30 + EAST, "road", layout, 0.3, (0.05, 0.3))
-    second = Material(-END + WEST, width, "road_across", layout + 1, 0.3, (0.05, 0.3))
-    out += [rectangle(m, (x, y2 + EAST, 0), RIGHT, BACK) for m, x in ((first, WEST), (second, END))]
-    return out + _parked_cars(layout)
-
-
-def _houses(a: tuple[float, float], b: tuple[float, float], rng: np.random.Generator) -> list[Rectangle]:
-    """House fronts from one place to another."""
-    start, direction = np.array(a), np.subtract(b, a)
-    length = float(np.linalg.norm(direction))
-    direction = direction / length
-    at, out = 0.0, []
-    while at < length - 1e-6:
-        width = float(min(rng.uniform(9, 18), length - at))
-        width = length - at if length - at - width < 5 else width
-        height = float(rng.uniform(7, 12))
-        house = Facade(width, height, int(rng.integers(1 << 30)))
-        out.append(rectangle(house, (*(start + at * direction), height), (*direction, 0), DOWN, occludes=True))
-        at += width
-    return out
-
-
-def _parked_cars(layout: int) -> list[Rectangle]:
-    """Cars at both kerbs."""
-    rng, out = np.random.default_rng([layout, 45]), []
-    for side in (-3.9, 6.6):  # to the right, and to the left beyond the oncoming lane
-        s, number = -5.0, 0
-        while s < 230:
-            s += rng.uniform(6, 14)
-            number += 1
-            if not TURN_AT - 9 < s < TURN_AT + TURN_LENGTH + 9:
-                place, heading = path(np.array([s]), side)
-                turn = heading[0] + (np.pi if side > 0 else 0.0) + rng.normal(0, 0.02)
-                T = pose(yaw_pitch_roll(turn, 0, 0), np.array([*place[0], 0.0]))
-                out += car(T, 100 * layout + 1000 * (side > 0) + number)
-    return out
+    """What stands still beside the way, and the ground."""
+    along = np.arange(0.0, _LENGTH, STEP)
+    places = np.column_stack([path(along)[0], np.full(len(along), EYE)])
+    return Streets(Road.along(places), layout).rectangles()
 
 
 def _drive(t: Array, number: int) -> Array:

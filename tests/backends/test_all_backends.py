@@ -1,0 +1,212 @@
+"""What all back ends assume alike: poses, how unsure they are, rest, and walks without end."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+
+import numpy as np
+import pytest
+
+import backends
+from backends.smoother.landmarks import SmootherLandmarks
+from experiments.long_run import Corridor, table
+from experiments.long_run import run as walk
+from slam.data import Observations
+from slam.geometry import se3
+from slam.models import EstimatorModels, MotionModel
+from tests.backends.scenes import RIG, path, run, scene, step
+
+SURE = EstimatorModels(
+    MotionModel(0.3, 0.3), pixel_sigma=0.05, initial_position_sigma=1e-6, initial_rotation_sigma=1e-7
+)
+OTHERS = [name for name in backends.names() if name != "ekf"]
+
+
+def deviations(backend) -> np.ndarray:
+    return np.sqrt(np.diag(backend.estimate().covariance))
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_pose_and_its_covariance_are_the_filters(name):
+    # With so little noise the measurements are linear over their uncertainty; what differed would be the models. The
+    # start is known better than they could tell: else what a filter believes to learn by linearising again counts.
+    sigma = 0.003
+    models = EstimatorModels(
+        MotionModel(0.3, 0.3), pixel_sigma=sigma, initial_position_sigma=1e-6, initial_rotation_sigma=1e-7
+    )
+    poses = path(8, 0.1, np.array([0.05, 0.0, 0.3]), np.array([0.0, 0.05, 0.0]))
+    data = scene(poses, points=60, sigma=sigma, limit=20)
+    estimates = []
+    for each in ("ekf", name):
+        backend = backends.create(each, RIG, models=models)
+        run(backend, data)
+        estimates.append(backend.estimate())
+    filtered, other = estimates
+    deviation = np.sqrt(np.diag(filtered.covariance))
+    difference = se3.log(se3.inverse(filtered.T_world_left) @ other.T_world_left) / deviation
+    assert np.abs(difference).max() < 1e-3  # standard deviations
+    np.testing.assert_allclose(np.sqrt(np.diag(other.covariance)), deviation, rtol=1e-3)
+    marginals = [np.sqrt(np.diagonal(e.covariances, axis1=1, axis2=2)) for e in estimates]
+    np.testing.assert_allclose(marginals[1], marginals[0], rtol=0.02)
+    assert (np.abs(other.positions - filtered.positions) / marginals[0]).max() < 5e-3
+
+
+def test_the_smoother_gives_what_least_squares_does_where_velocities_are_well_known():
+    """The motion model ties three poses: as a prediction of the third it would count twice what the first two tell."""
+    models = EstimatorModels(MotionModel(0.02, 0.02), pixel_sigma=0.3)
+    poses = path(16, 0.1, np.array([0.05, 0.0, 0.3]), np.array([0.0, 0.05, 0.0]))
+    data = scene(poses, points=60, sigma=0.3, limit=8)
+    estimates = []
+    for name, options in (
+        ("batch", {}),
+        ("smoother", {"track": 1000, "lag": None}),
+    ):  # it leaves nothing out
+        backend = backends.create(name, RIG, models=models, **options)
+        run(backend, data)
+        estimates.append(backend.estimate())
+    best, ours = estimates
+    deviation = np.sqrt(np.diag(best.covariance))
+    difference = se3.log(se3.inverse(best.T_world_left) @ ours.T_world_left) / deviation
+    assert np.abs(difference).max() < 0.05  # standard deviations
+    np.testing.assert_allclose(np.sqrt(np.diag(ours.covariance)), deviation, rtol=0.03)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_frames_that_see_nothing_at_uneven_times_leave_the_same_uncertainty(name):
+    """The motion model alone: its derivatives by both earlier poses count, and the lengths of the intervals."""
+    data = scene(path(6, 0.1, np.array([0.05, 0.0, 0.3]), np.array([0.0, 0.05, 0.0])), 60, 0.05, limit=20)
+    filtered, other = (backends.create(each, RIG, models=SURE) for each in ("ekf", name))
+    for backend in (filtered, other):
+        known: set[int] = set()
+        for stamp, _, seen in data:
+            step(backend, stamp, seen, known)
+        for stamp in (0.75, 0.85, 1.35):
+            backend.predict(stamp)
+            backend.update(data.observations[-1].select(np.zeros(0, int)))
+    np.testing.assert_allclose(deviations(other), deviations(filtered), rtol=0.02)
+    off = se3.log(se3.inverse(filtered.estimate().T_world_left) @ other.estimate().T_world_left)
+    assert np.abs(off / deviations(filtered)).max() < 0.02
+
+
+@pytest.mark.parametrize("dark", [{4}, {3}, {3, 4}], ids=str)
+def test_few_landmarks_after_dark_frames_leave_the_optimums_uncertainty(dark):
+    """The velocity before a gap counts once: the smoother was as sure as 0.72 of the deviations with two landmarks."""
+    data, found = scene(path(7, 0.1, np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.02, 0.0])), 60, seed=3), []
+    for name in ("batch", "smoother", "window"):
+        backend = backends.create(name, RIG, models=EstimatorModels(MotionModel(0.1, 0.1), pixel_sigma=0.5))
+        known = data.observations[0].ids
+        for k, (stamp, _, seen) in enumerate(data):
+            backend.predict(stamp)
+            if not k:
+                backend.add(seen)
+                continue
+            seen = seen.select(np.arange(len(seen)) < (0 if k in dark else 2 if k > 4 else len(seen)))
+            backend.update(seen.select(np.isin(seen.ids, known)))
+        found.append(deviations(backend))
+    for others in found[1:]:
+        assert (others / found[0] > 0.98).all() and (others / found[0] < 1.06).all(), others / found[0]
+
+
+def test_drift_adds_up_while_a_landmark_is_not_seen():
+    none, certain = np.zeros((1, 3, 3)), 1e-4 * np.eye(3)[None]
+    marks = SmootherLandmarks.of(
+        np.array([0]), 0, np.array([[0.0, 0.0, 5.0]]), certain, none, False, np.zeros((1, 3, 0))
+    )
+    unseen, drift = np.zeros(0, np.intp), np.diag([1e-6, 2e-6, 3e-6, 1e-5, 2e-5, 3e-5])
+    once = marks.left_behind(unseen, np.eye(4), drift)
+    twice = once.left_behind(unseen, np.eye(4), drift)
+    assert np.trace(once.away[0]) > 1e-5
+    np.testing.assert_allclose(twice.away, 2 * once.away)
+    np.testing.assert_allclose(twice.from_newest, certain + twice.away)
+
+
+@pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "window"])
+def test_at_rest_neither_the_pose_nor_its_covariance_changes_and_the_velocity_is_zero(name):
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (30, 2)), rng.uniform(2, 5, 30)])
+    backend, ids = backends.create(name, RIG), np.arange(30)
+
+    def seen(T: np.ndarray) -> Observations:
+        z, _ = RIG.project_stereo(se3.transform(se3.inverse(T), points), jacobian=False)
+        return Observations(ids, z[:, :2], z[:, [2, 1]])
+
+    backend.predict(0.0)
+    backend.add(seen(np.eye(4)))
+    for k in range(1, 5):
+        backend.predict(0.1 * k)
+        backend.update(seen(se3.exp(k * np.array([0, 0, 0, 0.02, 0, 0]))))
+    before = backend.estimate(landmarks=False)
+    rests = backend.predict_at_rest(0.5)
+    np.testing.assert_allclose(rests.T_world_left, before.T_world_left, atol=1e-12)
+    np.testing.assert_allclose(backend.estimate(landmarks=False).covariance, before.covariance, rtol=1e-6, atol=3e-10)
+    np.testing.assert_allclose(backend.predict(0.6).T_world_left, before.T_world_left, atol=1e-12)
+    backend.update(seen(before.T_world_left))  # it is no motion that begins again
+    np.testing.assert_allclose(backend.estimate(landmarks=False).T_world_left, before.T_world_left, atol=1e-3)
+    assert len(backend.trajectory().stamps) == 7
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
+def test_a_walk_in_which_the_map_is_replaced_again_and_again(name):
+    """In short: nothing may decay or grow while landmarks come and go."""
+    checkpoints = list(walk(name, 60, 20, Corridor(density=4, speed=4.0)))
+    assert [c.frame for c in checkpoints] == [20, 40, 60]
+    for c in checkpoints:
+        assert c.failed == 0 and c.least > 0 and c.nees < 20
+        assert c.landmarks <= 4 * 8 + 4  # those of 24 m were in the map in all
+        assert c.error < 0.3  # of 24 m
+    assert "failed updates: 0." in table(checkpoints)
+
+
+def interrupt(call, number: int) -> bool:
+    """Whether a call was interrupted at the `number`-th function called within the back ends."""
+    left = number
+
+    def profile(frame, event, _):
+        nonlocal left
+        if event == "call" and "backends/" in frame.f_code.co_filename.replace("\\", "/").split("tests")[0]:
+            left -= 1
+            if not left:
+                raise KeyboardInterrupt
+
+    before = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(before)
+    return False
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # interrupted while a generator closes
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("ekf", {}), ("iekf", {}), ("smoother", {"lag": None}), ("smoother", {"lag": 12}), ("window", {})],
+)
+def test_a_call_that_is_interrupted_did_not_happen(name, options, monkeypatch):
+    """A KeyboardInterrupt at any function call within a back end: the same call again, and the run goes on.
+
+    Landmarks come and go, and of the filters' some leave the state and come back.
+    """
+    monkeypatch.setattr("backends.ekf.state._MOST", 40)
+    monkeypatch.setattr("backends.ekf.state._LEAST", 30)
+    data = scene(path(20, 0.1, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.3, 0.0])), points=150)
+    models, rng, known, count = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5), np.random.default_rng(0), [], 0
+    often, plain = (backends.create(name, RIG, models=models, **options) for _ in range(2))
+    for k, (stamp, _, seen) in enumerate(data):
+        old = np.isin(seen.ids, known)
+        gone = rng.permutation(np.setdiff1d(known, seen.ids))[:3].astype(np.int64)
+        calls = ("predict", stamp), ("update", seen.select(old)), ("add", seen.select(~old)), ("remove", gone)
+        for method, argument in (*calls, ("estimate", True), ("revise", lambda z: z)):
+            for backend in (often, plain):
+                call = partial(getattr(backend, method), argument)
+                if backend is plain or k < 3 or interrupt(call, int(rng.integers(1, 60))):
+                    count += backend is often and k > 2
+                    call()
+        known = np.setdiff1d(np.union1d(known, seen.ids), gone)
+        assert len(often.trajectory()) == k + 1
+    assert count > 20
+    off = se3.log(se3.inverse(plain.trajectory().poses) @ often.trajectory().poses)
+    assert np.abs(off).max() < (0.01 if name == "smoother" else 1e-12)  # its graph was built anew, linearised elsewhere
