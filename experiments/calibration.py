@@ -22,6 +22,7 @@ from experiments.common import recordings, script_options
 from experiments.loops import ate
 from experiments.tables import show
 from slam.calibration.posterior import RigPosterior
+from slam.commands.calibrate import unit_of
 from slam.config import SystemConfig
 from slam.naming import count
 from slam.run.calibrating import calibrate
@@ -91,8 +92,8 @@ def show_drives(drives: Mapping[str, Path], out: Path, frames: int | None) -> No
     rows = []
     for k, row in enumerate(found["parameters"]):
         if found["apart"] is not None and np.isfinite(found["apart"][k]):
-            factor, unit = (1.0, "") if row["unit"] == "1" else (1e3, f"10⁻³ {row['unit']}")
-            cells = (f"{factor * one[k]['mean']:.3f} ± {factor * one[k]['sigma']:.3f}" for one in alone)
+            factor, unit = unit_of(row, found["rig"]["focal"])
+            cells = (f"{factor * one[k]['mean']:.2f} ± {factor * one[k]['sigma']:.2f}" for one in alone)
             rows.append([row["name"], unit, *cells, f"{found['apart'][k]:.1f}"])
     header = ("parameter", "unit", *drives, "apart [sigma]")
     show(out / "drives.json", header, rows, 2, found["agreement"] or "")

@@ -25,7 +25,7 @@ from frontends.surf import Surf
 from slam.compare.plan import Plan, Variant
 from slam.compare.statistics import difference
 from slam.compare.sweep import sweep
-from slam.compare.wording import shown_p
+from slam.compare.tables import shown_p
 from slam.run.results import BY_KEY
 from slam.runtime.threads import available_cores
 

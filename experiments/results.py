@@ -25,7 +25,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments import loops
-from slam.run.repeat import versions
+from slam.run.options import versions
 
 ROOT = Path(__file__).resolve().parents[1]
 

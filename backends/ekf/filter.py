@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from backends.ekf.covariance import CAMERA, POSE, Covariance, positive
-from backends.ekf.landmarks import Coordinates, FilterLandmarks, distant_anchors
+from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from backends.ekf.motion import Motion, motion_noise
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import UnsolvableError, Update
@@ -27,6 +27,8 @@ from slam.window.consensus import landmarks_pose
 from slam.window.gating import INFLATION
 from slam.window.stereo import TOO_LATE, Field, RectifiedMeasurement
 
+#: Standard deviations of a known point between it and its anchor: its coordinates are linear there, it stays Gaussian.
+_STAND_OFF = 100.0
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 
 
@@ -53,8 +55,9 @@ class LandmarkFilter:
 
     def __init__(
         self, rig: StereoRig, models: EstimatorModels, camera: Any, P: Array, coordinates: Coordinates, iterations: int,
-        stereo: bool = True,
+        stereo: bool = True, /,
     ) -> None:  # fmt: skip
+        # by position alone: they are no options of a back end
         self.rig, self.models = rig, models
         self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
         self._measure = RectifiedMeasurement(rig, models)
@@ -135,7 +138,9 @@ class LandmarkFilter:
         s = self.state
         known = known_landmarks(self.name, s.landmarks, ids, positions, covariances, False)
         ids, positions, covariances = known
-        anchors = distant_anchors(positions, covariances)
+        anchors = np.tile(np.eye(3, 4), (len(ids), 1, 1))
+        anchors[:, :, 3] = positions
+        anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
         new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame)
         D = self._coordinates.inverse_jacobian(anchors, new.c)
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
@@ -202,28 +207,24 @@ class LandmarkFilter:
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
     def _predicted(self, stamp: float, moved: Callable[[Any, float], Motion]) -> Prediction:
-        """Go to a time; `moved` says what the camera does meanwhile."""
+        """Go to a time; `moved` says what the camera does meanwhile. What is in the angle of view then."""
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, measured=False)
         else:
             after = s.advanced(float(stamp), moved(s.camera, stamp - s.stamp))
-        prediction = self._prediction(after)
+        T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)
+        marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
+        toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
+        A = -toward @ (marks.gauge @ after.camera.world())  # derivatives (M, 3, 6) of them, seen from the camera
+        seen = (A @ after.covariance.pose + 2 * toward @ cross) @ A.transpose(0, 2, 1)
+        seen = 0.5 * (seen + seen.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
+        left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], seen)
+        prediction = Prediction(after.stamp, T.copy(), after.pose_covariance(), marks.ids, left, right, S)
         self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []
         self.state = after
         return prediction
-
-    def _prediction(self, s: FilterState) -> Prediction:
-        """Pose, and what is in the angle of view with its innovation covariance."""
-        T, rows = s.pose, self._measure.visible(s.pose, s.landmarks.points)
-        marks, (blocks, cross) = s.landmarks.select(rows), s.covariance.marginals(rows)
-        toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
-        A = -toward @ (marks.gauge @ s.camera.world())  # derivatives (M, 3, 6) of where they are, seen from the camera
-        seen = (A @ s.covariance.pose + 2 * toward @ cross) @ A.transpose(0, 2, 1)
-        seen = 0.5 * (seen + seen.transpose(0, 2, 1)) + toward @ blocks @ toward.transpose(0, 2, 1)
-        left, right, S = self._measure.pixels((marks.points - T[:3, 3]) @ T[:3, :3], seen)
-        return Prediction(s.stamp, T.copy(), s.pose_covariance(), marks.ids, left, right, S)
 
     def _updated(
         self, s: FilterState, observations: Observations, guess: Array | None

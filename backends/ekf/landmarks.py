@@ -21,7 +21,6 @@ from slam.geometry.se3 import Array, hat
 _FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _LEFT = 0.1  # share of its inverse depth that a landmark keeps at least in an update
 _ASIDE = 1e3  # guard: largest |x/z|, |y/z|; 89.9 degrees from the axis of the camera that saw it first
-_STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
 
 class InverseDepth:
@@ -129,14 +128,3 @@ def gauge_jacobian(coordinates: Coordinates, anchors: Array, c: Array, points: A
     """Derivatives (M, 3, 6) of coordinates c (M, 3) by a displacement of the world; see `FilterLandmarks`."""
     inverse = coordinates.inverse_jacobian(anchors, c)
     return np.concatenate([inverse, -inverse @ hat(points)], axis=2)
-
-
-def distant_anchors(points: Array, covariances: Array) -> Array:
-    """Anchors (M, 3, 4) of points (M, 3) known as Gaussians in the world, by their covariances (M, 3, 3).
-
-    They are so many standard deviations away that the coordinates are linear in the position: it stays Gaussian.
-    """
-    anchors = np.tile(np.eye(3, 4), (len(points), 1, 1))
-    anchors[:, :, 3] = points
-    anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
-    return anchors

@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -52,12 +53,10 @@ def agreement(update: Update, noises: Iterable[Array], search: Search) -> Poster
         far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
         sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
         there = replace(update, guess=T).wider(np.diag(np.repeat(np.array(sigmas, float) ** 2, 3)))
-        try:
+        with suppress(UnsolvableError):
             restarted = solve(gate(there, at_guess=True))
             if restarted is not None and restarted.used.sum() >= least:
                 return restarted
-        except UnsolvableError:
-            pass
     if found is None and error is not None:
         raise error
     return found
@@ -70,14 +69,12 @@ def _gated(update: Update, noises: Iterable[Array], majority: int) -> Iterable[G
     """
     first = gate(update)
     if len(update.z) >= majority > first.used.sum():
-        places = (False, True)[: 1 + (update.guess is not None)]
-        wider = ((one, at_guess) for one in map(update.wider, noises) for at_guess in places)
-        tries = itertools.chain(((update, at_guess) for at_guess in places[1:]), wider)
-        for one, at_guess in tries:
-            gated = gate(one, at_guess)
-            if gated.used.sum() >= majority:
-                yield gated
-                break
+        places = (False, True) if update.guess is not None else (False,)
+        priors = itertools.chain([update], map(update.wider, noises))
+        tries = (gate(prior, at_guess) for prior in priors for at_guess in places if at_guess or prior is not update)
+        enough = next((gated for gated in tries if gated.used.sum() >= majority), None)
+        if enough is not None:
+            yield enough
     yield first
 
 

@@ -135,16 +135,13 @@ class Graph:
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
         points, linearised = (
             np.array([v.atPoint3(landmark_key(n)) for n in kept]).reshape(-1, 3)
-            for v in (values, self._solver.getLinearizationPoint())
+            for v in (values, self._solver.getLinearizationPoint() if kept else values)
         )
         joint = self._joint(list(range(max(oldest, s.number - 1), s.number + 1)))
-        solved = Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint)
-        if not (np.isfinite(poses).all() and np.isfinite(solved.covariance).all()):
-            raise ValueError("the solution is not finite")
-        if (np.diag(solved.covariance) <= 0).any():
-            raise ValueError("a variance is not positive")
+        if not (np.isfinite(poses).all() and np.isfinite(joint).all() and (np.diag(joint) > 0).all()):
+            raise ValueError("the solution is not finite, or a variance not positive")
         self._number = s.number
-        return solved
+        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint)
 
     def joint_covariance(self, s: SmootherState, first: int | None = None) -> tuple[int, Array]:
         """Number of the first pose, and the joint covariance (6 K, 6 K) of all poses from there on.

@@ -85,7 +85,11 @@ class Steps(RectifiedMeasurement):
             return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         try:
             one = self._problem(s, rows, z)
-            found = self._agreement(s, one, rows, z, guess)
+            R, start = s.poses[-1][:3, :3], one.predicted if guess is None else guess
+            lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[-1][:3, :3] @ R.T - s.turned)
+            found = agreement(
+                one, start, lambda: landmarks_pose(self, one.points, z, one.predicted, s.number), s.contradicted, lost
+            )
             s = replace(s, contradicted=found.contradicted)
             if not found.used.any():
                 return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
@@ -104,18 +108,6 @@ class Steps(RectifiedMeasurement):
         P = s.covariance if s.inside or marks.world[rows].any() else s.own
         probability = self.models.gate_probability
         return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
-
-    def _agreement(
-        self, s: SmootherState, one: pose_only.PoseProblem, rows: IndexArray, z: Array, guess: Array | None
-    ) -> Agreement:
-        """Initial value of the newest pose, and which measurements agree with it."""
-
-        def search() -> Array | None:
-            return landmarks_pose(self, one.points, z, one.predicted, s.number)
-
-        R = s.poses[-1][:3, :3]
-        lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(R @ s.spread[-1][:3, :3] @ R.T - s.turned)
-        return agreement(one, one.predicted if guess is None else guess, search, s.contradicted, lost)
 
     def _corrected(
         self, s: SmootherState, graph: Graph, one: pose_only.PoseProblem, found: Agreement, rows: IndexArray, z: Array
@@ -300,10 +292,10 @@ def _by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field:
 
     The errors move the landmarks in the world by `by_rig` (M, 3, m), and measurements by `field` (M, 3, m).
     """
-    H = one.stereo.project((one.points - T[:3, 3]) @ T[:3, :3])[1] @ T[:3, :3].T
-    W = one.whiteners
-    F = W @ np.nan_to_num(field - H @ by_rig)
-    return (W @ one.derivatives(T)).reshape(-1, 6), F.reshape(3 * len(F), F.shape[2])
+    local = (one.points - T[:3, 3]) @ T[:3, :3]
+    D = one.whiteners @ one.stereo.project(local)[1]
+    F = one.whiteners @ np.nan_to_num(field) - D @ T[:3, :3].T @ by_rig
+    return (D @ points_by_pose(local)).reshape(-1, 6), F.reshape(3 * len(F), F.shape[2])
 
 
 def _landmarks_by_rig(

@@ -10,6 +10,7 @@ from backends.window.slide import problem, slid
 from backends.window.state import WindowConfig, WindowLandmarks, WindowState
 from slam.chi_square import chi_square_limits
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
+from slam.geometry.arrays import among
 from slam.geometry.kernels import seen
 from slam.geometry.se3 import Array, points_by_pose
 from slam.window import chart_kernels, motion, pose_only
@@ -57,7 +58,8 @@ class Steps(RectifiedMeasurement):
         J[:, -12:] = by_last[:, -6 * K :]
         cross = J @ s.covariance
         own = cross @ J.T + noise
-        P = np.block([[s.covariance, cross.T], [cross, 0.5 * (own + own.T)]])
+        P = np.empty((6 * K + 6, 6 * K + 6))
+        P[:-6, :-6], P[-6:, :-6], P[:-6, -6:], P[-6:, -6:] = s.covariance, cross, cross.T, 0.5 * (own + own.T)
         moves = s.motion
         if begins or rests or s.frames[-1] == s.frames[-2] + 1:  # else the velocity before has left the window
             one = np.array([[-1 if unknown else K - 2, K - 1, K]])
@@ -159,10 +161,10 @@ class Steps(RectifiedMeasurement):
         poses = np.concatenate([s.poses[:-1], found.T[None]])
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
         s = replace(s, poses=poses, rows=before.joined(self._rows(s, points[used], z[used])))
-        w = problem(s, self.stereo)
+        w = replace(problem(s, self.stereo), asked=among(len(s.landmarks), points[used]))
         for again in range(_SOLVED_AGAIN + 1):
             solution = solve(replace(w, rows=s.rows))
-            covariances = solution.point_covariances(len(poses) - 1, s.landmarks.ids >= 0)
+            covariances = solution.point_covariances(len(poses) - 1)
             its = covariances[0][points[used]]
             distances = solution.left_out_distances(-1, points[used], z[used], its, self.models.pixel_sigma, _TESTED)
             bad = distances > limits[used]
@@ -246,8 +248,7 @@ def _after(
 ) -> WindowState:  # fmt: skip
     """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
     marks, w, (local, world) = s.landmarks, solution.window, covariances
-    first, _ = w.by_point
-    part = (w.place >= 0) | (first[1:] > first[:-1])
+    part = (w.layout.place >= 0) | (np.diff(w.layout.first) > 0)
     there = replace(s, poses=w.poses, covariance=solution.pose_covariance, by_rig=by_rig[0])
     known = part & (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
     others, last = np.flatnonzero(~known & (marks.ids >= 0)), marks.last.copy()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -12,36 +11,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.runtime.threads import available_cores
-
 _SMALLEST_SHARE = 32  # cost: items that are worth a task
 
 
 class Workers:
-    """A few threads, the caller's own included, for kernels that let go of Python's global lock.
-
-    Where the caller is not the main thread, as in a run that works ahead, one core is left for what is done beside.
-    """
+    """A few threads, the caller's own included, for kernels that let go of Python's global lock."""
 
     def __init__(self, threads: int) -> None:
-        self._most = threads
+        self._threads = threads
         self._pool: ThreadPoolExecutor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy holds: no threads; it starts its own."""
         return {**vars(self), "_pool": None}
 
-    def _threads(self) -> int:
-        """How many threads are worth a task now."""
-        beside = threading.current_thread() is not threading.main_thread()
-        return min(self._most, max(available_cores() - 1, 1)) if beside else self._most
-
     def run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         """Results of independent tasks, in their order."""
-        if self._threads() == 1 or len(tasks) < 2:
+        if self._threads == 1 or len(tasks) < 2:
             return [task() for task in tasks]
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(self._most - 1, thread_name_prefix="surf")
+            self._pool = ThreadPoolExecutor(self._threads - 1, thread_name_prefix="surf")
         futures = [self._pool.submit(task) for task in tasks[1:]]
         first = tasks[0]()
         # The caller takes what nobody has begun yet, from the far end.
@@ -50,7 +39,7 @@ class Workers:
 
     def over(self, count: int, function: Callable[[int, int], tuple[NDArray, ...]]) -> list[NDArray]:
         """The arrays of ``function(first, last)`` of consecutive shares of `count` items, put together."""
-        shares = max(1, min(self._threads(), count // _SMALLEST_SHARE))
+        shares = 1 if self._threads == 1 else max(1, min(self._threads, count // _SMALLEST_SHARE))
         edges = [count * k // shares for k in range(shares + 1)]
         found = self.run([partial(function, a, b) for a, b in pairwise(edges)])
         return list(found[0]) if shares == 1 else [np.concatenate(parts) for parts in zip(*found)]

@@ -9,9 +9,8 @@ import numpy as np
 from slam.atlas.config import AtlasConfig
 from slam.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.data import StereoFeatures
-from slam.geometry.kernels import residuals
 from slam.geometry.rig import StereoRig, measurement_rows
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, points_by_pose
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.table import LandmarkTable
 from slam.window.problem import Rows, Window
@@ -71,7 +70,10 @@ def refined_pose(
 def _jackknife(w: Window, P: Array) -> Array:
     """Covariance (6, 6) of the second pose, P by pixel noise, by leaving out each point in turn, to first order."""
     e, n, T = linearised(w), len(w.points), w.poses[1]
-    r, J = residuals(w.stereo.intrinsics, w.points, w.rows.z[n:], T)
+    local = (w.points - T[:3, 3]) @ T[:3, :3]
+    z, D = w.stereo.project(local)
+    r = w.rows.z[n:] - z
+    J = D @ points_by_pose(local)
     J[np.isnan(r)] = 0  # what is not measured
     r, G = (w.rows.root[n:] @ np.nan_to_num(r)[:, :, None])[:, :, 0], w.rows.root[n:] @ J
     by_pose, gain = np.swapaxes(G, 1, 2), e.cross[n:] @ e.inverse  # of a point, which is eliminated

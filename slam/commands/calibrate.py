@@ -12,7 +12,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam.calibration.posterior import SIGMAS
 from slam.commands.display import progress
 from slam.config import SystemConfig
 from slam.data import FrameResult
@@ -66,6 +65,12 @@ def calibrate(
     print(f"Use it: slam run SEQUENCE --calibration {out}" if found["worth_correcting"] else f"File: {out}")
 
 
+def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
+    """What a parameter is multiplied by for people, and its unit then; `row` is its row of the file."""
+    share = row["name"].removeprefix("left_").removeprefix("right_") in _SHARES
+    return (100.0, "%") if share else _SHOWN.get(row["unit"], (focal, "px"))
+
+
 def _print(found: dict[str, Any]) -> None:
     """The table, and what it says."""
     console, apart, recordings = Console(), found["apart"], found["recordings"]
@@ -80,13 +85,12 @@ def _print(found: dict[str, Any]) -> None:
     for name in ("all", *numbers, *(["apart"] if apart else []), "usual"):
         table.add_column(name, justify="right", no_wrap=True)
     for k, row in enumerate(found["parameters"]):
-        lens = row["name"].removeprefix("left_").removeprefix("right_")
-        factor, unit = (100.0, "%") if lens in _SHARES else _SHOWN.get(row["unit"], (found["rig"]["focal"], "px"))
+        factor, unit = unit_of(row, found["rig"]["focal"])
         own = [row, *(one["parameters"][k] for one in shown)]
         cells = [f"{factor * one['mean']:.2f} ± {factor * one['sigma']:.2f}" for one in own]
         if apart:
             cells.append(f"{apart[k]:.1f} σ" if np.isfinite(apart[k]) else "–")
-        table.add_row(row["name"], unit, *cells, f"± {factor * SIGMAS[lens]:.2g}")
+        table.add_row(row["name"], unit, *cells, f"± {factor * found['usual'][k]:.2g}")
     console.print(table)
     console.print(_SIGN, highlight=False)
     for number, one in enumerate(recordings, 1):

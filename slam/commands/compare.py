@@ -11,9 +11,8 @@ from slam import registry
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import write_report
 from slam.compare.sweep import Run, check, is_done, run_jobs, sweep
-from slam.compare.tables import groups, most_tests, write_tables
+from slam.compare.tables import caution, groups, most_tests, write_tables
 from slam.compare.trial import COMPLETED, RESULT
-from slam.compare.wording import caution
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, UnknownNameError
 from slam.files import read_object

@@ -71,25 +71,25 @@ def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
 
 def print_conclusions(every: Sequence[Group], caution: str) -> None:
     """What may be concluded of each group, in the words of the report, and what so few trials can show at best."""
-    from slam.compare import wording
+    from slam.compare import tables
 
     used = set()
     for group in every:
         _say(f"\n{group.name}", "bold")
-        for text in wording.sentences(group):
+        for text in tables.sentences(group):
             _say(text)
         table = _table("", group.runs)
         for metric in group.metrics:
             if not metric.main:
                 continue
-            first, *others = wording.row(group, metric)
+            first, *others = tables.row(group, metric)
             used |= {cell["verdict"] for cell in others if cell["direction"]}
             cells = [f"{cell['mean']} [{_COLOURS[cell['direction']]}]{cell['badge']}[/]" for cell in others]
             table.add_row(escape(metric.title), first["mean"], *cells)
         _console.print(table, highlight=False)
-        for text in wording.honesty(group):
+        for text in tables.honesty(group):
             _say(text)
-    if meanings := [meaning for verdict, meaning in wording.STRENGTH.items() if verdict in used]:
+    if meanings := [meaning for verdict, meaning in tables.STRENGTH.items() if verdict in used]:
         _say(f"Better or worse than {next(iter(every[0].runs))}: {'; '.join(meanings)}.")
     if caution:
         _say(caution)

@@ -19,10 +19,9 @@ from slam.commands.display import print_summary
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
-from slam.run.options import RunOptions, parse_frames
+from slam.run.options import RunOptions, changed_versions, load, parse_frames, versions
 from slam.run.plots import leave_picture
 from slam.run.recording import Recording
-from slam.run.repeat import changed_versions, load, versions
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live, open_sequence
 from slam.settings import require_settable

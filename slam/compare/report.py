@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slam.compare import wording
+from slam.compare import tables
 from slam.compare.plan import Plan, is_world
 from slam.compare.statistics import FEWEST, LEVEL, Verdict
 from slam.compare.sweep import SWEEP, Run
-from slam.compare.tables import Group, count_tests, most_tests
+from slam.compare.tables import Group
 from slam.files import read_object, write_text
 from slam.run.plots import backend_colours, drawn
 from slam.run.results import BY_KEY
@@ -50,10 +50,10 @@ def write_report(
         plan=plan,
         runs=runs,
         groups=every,
-        words=wording,
-        caution=wording.caution(max(group.trials for group in every), most_tests(plan)),
-        tests=count_tests(every),
-        strengths={verdict.value: wording.STRENGTH[verdict] for verdict in (Verdict.CERTAIN, Verdict.LIKELY)},
+        words=tables,
+        caution=tables.caution(max(group.trials for group in every), tables.most_tests(plan)),
+        tests=tables.count_tests(every),
+        strengths={verdict.value: tables.STRENGTH[verdict] for verdict in (Verdict.CERTAIN, Verdict.LIKELY)},
         fewest=FEWEST,
         level=round(100 * LEVEL),
         sections=[(own, list(_pictures(own[0]))) for own in modes],

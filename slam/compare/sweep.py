@@ -25,8 +25,8 @@ from slam.errors import SlamError
 from slam.files import noting_inputs, read_object
 from slam.input.features import Rectification
 from slam.outputs import Output, require_outputs
+from slam.run.options import changed_versions, running_code
 from slam.run.outputs import naming_folder, write_json
-from slam.run.repeat import changed_versions, running_code
 from slam.sequences import open_sequence
 from slam.sequences.base import said_before
 

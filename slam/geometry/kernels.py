@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.linear import assign, squared_distance, trace, turn, whitener
-from slam.kernels.se3 import between, transform_back
-from slam.kernels.stereo import by_pose, offsets, residual
+from slam.kernels.se3 import between, point_by_motion, transform_back
+from slam.kernels.stereo import offsets, residual
 from slam.runtime.compilation import helper, kernel
 
 
@@ -99,19 +99,6 @@ def _distorted(coefficients, a, b, D):
 
 
 @kernel
-def residuals(camera, points, z, T):
-    """Measured less predicted (M, 3), NaN where missing or behind, and the prediction's Jacobians (M, 3, 6) by T."""
-    r, J = np.empty((len(points), 3)), np.empty((len(points), 3, 6))
-    local, by_local = np.empty(3), np.empty((3, 3))
-    for m in range(len(points)):
-        transform_back(T, points[m], local)
-        residual(camera, local, z[m], r[m], by_local)
-        for i in range(3):
-            by_pose(by_local[i], local, J[m, i])
-    return r, J
-
-
-@kernel
 def errors(camera, points, z, poses):
     """Largest error of uL, vL, uR (H, M) [px] under each pose (H, 4, 4); NaN behind the camera."""
     out, local, r, J = np.empty((len(poses), len(points))), np.empty(3), np.empty(3), np.empty((3, 3))
@@ -167,10 +154,7 @@ def seen(T, before, points, covariances, motion):
     for m in range(len(points)):
         transform_back(T, points[m], local[m])
         turn(R, covariances[m], out[m])
-        x, y, z = local[m]
-        G[0, 1], G[0, 2], G[1, 2] = -z, y, -x
-        G[1, 0], G[2, 0], G[2, 1] = z, -y, x
-        G[0, 3] = G[1, 4] = G[2, 5] = -1.0
+        point_by_motion(local[m], -1.0, G)
         for i in range(3):
             for j in range(6):
                 GM[i, j] = 0.0

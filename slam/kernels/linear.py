@@ -81,6 +81,13 @@ def _subtract_four(v, w, x0, x1, x2, x3, a, b):
         w[i] -= b0 * y0 + b1 * y1 + b2 * y2 + b3 * y3
 
 
+@disjoint_vector_helper
+def subtract(v, x, row):
+    """``v − x row`` (n,), in place."""
+    for j in range(len(v)):
+        v[j] -= x * row[j]
+
+
 @helper
 def invert_symmetric(M, ridge, out):
     """Inverse (3, 3) of a symmetric matrix (3, 3) with `ridge` added to its diagonal, by ``L D Lᵀ``."""

@@ -61,6 +61,6 @@ def add_velocity_rows(J, r, triple, column, H, b):
             if to < 0 or to > at:
                 continue
             for i in range(6):
-                for j in range(6):
+                for j in range(6 if to < at else i + 1):
                     for k in range(6):
                         H[at + i, to + j] += J[k, 6 * p + i] * J[k, 6 * o + j]

@@ -11,7 +11,7 @@ import numpy as np
 
 from slam.calibration import RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
-from slam.calibration.posterior import RigEvidence, factory_prior
+from slam.calibration.posterior import SIGMAS, RigEvidence, factory_prior
 from slam.calibration.saved import CERTAIN, agreement, agreement_in_words, joint_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult
@@ -52,10 +52,11 @@ def calibrate(
     """Run a range of frames of recordings of one rig; returns what they say of it, which is also written to `out`.
 
     Besides the keys of `slam.calibration.SavedCalibration` it has ``recordings``, what each says alone; ``apart``, by
-    how many standard deviations two differ at most in each parameter (null for a single recording); ``agreement`` and
-    ``judgement``, the same and how good the calibration was, in words; ``worth_correcting``, whether correcting is
-    expected to help; and ``warnings``. `opencv` is a file for the corrected calibration in that form, which is off by
-    ``opencv_off_px`` (RMS). `inputs` are never replaced. Raises SlamError on bad input, before anything is run.
+    how many standard deviations two differ at most in each parameter (null for a single recording); ``usual``, how far
+    good calibrations are off in each; ``agreement`` and ``judgement``, how good the calibration was, in words;
+    ``worth_correcting``, whether correcting is expected to help; and ``warnings``. `opencv` is a file for the corrected
+    calibration in that form, which is off by ``opencv_off_px`` (RMS). `inputs` are never replaced. Raises SlamError on
+    bad input, before anything is run.
     """
     rig = sequences[0].rig
     for sequence in sequences:
@@ -88,6 +89,7 @@ def calibrate(
         judgement, worth = _judged(model, kept.posterior, configs[0].models.pixel_sigma, matched, apart)
     found = kept.to_json() | {
         "recordings": recordings,
+        "usual": [SIGMAS[name.removeprefix("left_").removeprefix("right_")] for name in model.names],
         "apart": None if apart is None else apart.tolist(),
         "agreement": None if apart is None else agreement_in_words(apart),
         "judgement": judgement,

@@ -1,18 +1,30 @@
-"""What to run, with what, and where the files go."""
+"""What to run, with what, and where the files go; and what it takes to repeat it, in the run's ``config.json``."""
 
 from __future__ import annotations
 
+import hashlib
+import math
+import os
+import platform
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from slam.calibration import load_calibration
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.files import noting_inputs
+from slam.files import noting_inputs, read_object
 from slam.outputs import Output
 from slam.run.outputs import NAMES
 
 _MOST_FRAMES = 10**12  # of a sequence: more than any has
+CONFIG = "config.json"
+_NO_FILES = ("synthetic:", "camera:")
+_PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
 
 @dataclass(frozen=True)
@@ -65,3 +77,110 @@ def parse_frames(text: str | None) -> tuple[int, int | None]:
     if start < 0 or max(start, stop or 0) > _MOST_FRAMES:
         raise SlamError(f"frames {text!r}: numbers of frames go from 0 to {_MOST_FRAMES}")
     return start, stop
+
+
+def origin(options: RunOptions) -> dict[str, Any]:
+    """What ``config.json`` says besides names and settings: the command, and files by absolute path."""
+    if not options.source:  # of a recording, or a sequence made in Python
+        return {"command": options.command}
+    files = {"prior_map": options.prior_map, "calibration": options.calibration}
+    return {
+        "command": options.command,
+        "source": options.source if options.format in ("synthetic", "camera") else _place(options.source),
+        "source_format": options.format,
+        "kind": options.kind,
+        "mono": options.mono,
+        **{key: file and _place(str(file)) for key, file in files.items()},
+    }
+
+
+def load(
+    path: Path, source: str | None = None, prior_map: Path | None = None, calibration: Path | None = None
+) -> tuple[RunOptions, dict[str, str]]:
+    """Read the ``config.json`` of a run: its options, and the versions that it was made with.
+
+    `path` is the file, or the run's folder; the others are taken in place of the run's own. The sequence is where it is
+    found now; empty where it is not known. Raises SlamError where it cannot be read, is none of a run of a sequence, or
+    a file of its is not found any more, and ConfigurationError where its settings are not those of this version.
+    """
+    file = path / CONFIG if os.path.isdir(path) else path  # noqa: PTH112 unlike Path's, without errors
+    try:
+        tree = _restored(read_object(file))
+        if str(tree.get("command", "")).startswith("slam replay"):
+            raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
+        start, stop = tree["frames"]
+        files = {"source": source, "prior_map": prior_map, "calibration": calibration}
+        places = {key: str(given or tree.get(key) or "") for key, given in files.items()}
+        for key, place in places.items():
+            there = place.startswith(_NO_FILES) or any(map(os.path.exists, (place, place.rpartition("?")[0])))
+            if place and not (files[key] or there or tree.get("source_format") in ("synthetic", "camera")):
+                raise SlamError(f"{file}: {place} is no longer there: give its new place beside --config")
+        options = RunOptions(
+            str(tree["backend"]), str(tree["frontend"]), SystemConfig.from_json(tree["settings"]), Path(), int(start),
+            None if stop is None else int(stop), mono=bool(tree.get("mono", False)), source=places["source"],
+            format=tree.get("source_format"), kind=str(tree.get("kind", "handheld")),
+            prior_map=Path(places["prior_map"]) if places["prior_map"] else None,
+            calibration=Path(places["calibration"]) if places["calibration"] else None,
+        )  # fmt: skip
+        return options, dict(tree.get("versions", {}))
+    except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
+        raise SlamError(f"{file}: not the config.json of a run: {error!r}") from error
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that shape a result."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+@cache
+def running_code() -> dict[str, str]:
+    """`versions`, and twelve hex digits for the sources of this distribution as ``code``; looked up once."""
+    digest = hashlib.sha256()
+    for name in ("slam", "frontends", "backends"):
+        spec = find_spec(name)
+        for root in () if spec is None else map(Path, spec.submodule_search_locations or ()):
+            for path in sorted(root.rglob("*.py")):
+                place = f"{root.name}/{path.relative_to(root).as_posix()}"
+                digest.update(f"{place}\0".encode() + path.read_bytes() + b"\0")
+    return {**versions(), "code": digest.hexdigest()[:12]}
+
+
+def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """What differs between two sets of versions, in words."""
+    return [f"{name} {old}, now {now.get(name)}" for name, old in then.items() if now.get(name) != old]
+
+
+def portable(tree: Any) -> Any:
+    """The tree with infinite numbers, which JSON does not have, as ``"Infinity"`` and ``"-Infinity"``."""
+    if isinstance(tree, Mapping):
+        return {key: portable(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [portable(value) for value in tree]
+    if isinstance(tree, float) and math.isinf(tree):
+        return "Infinity" if tree > 0 else "-Infinity"
+    return tree
+
+
+def _restored(tree: Any) -> Any:
+    """The inverse of `portable`."""
+    if isinstance(tree, dict):
+        return {key: _restored(value) for key, value in tree.items()}
+    if isinstance(tree, list):
+        return [_restored(value) for value in tree]
+    return float(tree) if tree in ("Infinity", "-Infinity") else tree
+
+
+def _place(text: str) -> str:
+    """A sequence or file by its absolute path, options behind it included; what is no file as it was given."""
+    if text.startswith(_NO_FILES):
+        return text
+    name, mark, query = text.rpartition("?")
+    if not mark or Path(text).expanduser().exists():
+        name, mark, query = text, "", ""
+    return f"{os.path.abspath(Path(name).expanduser())}{mark}{query}"  # noqa: PTH100 without following links

@@ -21,11 +21,10 @@ from slam.geometry.trajectory import Trajectory
 from slam.input.features import Rectification
 from slam.interfaces import Frontend
 from slam.outputs import require_outputs
-from slam.run.options import RunOptions
+from slam.run.options import RunOptions, origin, portable, versions
 from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
 from slam.run.outputs import RunFiles, write_json, write_trajectory
 from slam.run.recording import RecordedFrame, Recording, save_recording
-from slam.run.repeat import origin, portable, versions
 from slam.run.replay import replay
 from slam.run.schema import schema
 from slam.run.settings_reference import in_force

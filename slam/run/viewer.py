@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from slam.data import FrameResult, StereoFrame
-from slam.errors import SlamError
+from slam.errors import SlamError, one_line, text_of
 from slam.files import noting_inputs, require_utf8
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, quaternion
@@ -60,8 +60,10 @@ class Viewer:
             self._recording.flush()
         except RuntimeError as error:  # a window that was closed or never opened takes nothing from the run
             if kind is None and self._target != LIVE:
-                raise SlamError(f"viewer {self._target}: {_first_line(error)}") from error
-            logging.getLogger(__name__).warning("viewer %s: not all was shown: %s", self._target, _first_line(error))
+                raise SlamError(f"viewer {self._target}: {one_line(text_of(error))}") from error
+            logging.getLogger(__name__).warning(
+                "viewer %s: not all was shown: %s", self._target, one_line(text_of(error))
+            )
 
     def show(self, frame: StereoFrame, result: FrameResult, system: StereoSlam) -> None:
         """One more frame, right after its step."""
@@ -159,10 +161,5 @@ def _open(rr: Any, target: str) -> Any:
             Path(target).parent.mkdir(parents=True, exist_ok=True)
             recording.save(target)
     except (OSError, RuntimeError) as error:
-        raise SlamError(f"viewer {target}: {_first_line(error)}") from error
+        raise SlamError(f"viewer {target}: {one_line(text_of(error))}") from error
     return recording
-
-
-def _first_line(error: BaseException) -> str:
-    """What an exception says, without the advice that follows."""
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)

@@ -75,7 +75,8 @@ def match_everywhere(
 def pairs_near(centres: Array, reach: float, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Pairs of rows of centres (M, 2) and of pixels (N, 2) within `reach` of them either way, by ascending centre."""
     order = np.argsort(uv[:, 0], kind="stable")  # so that few pairs have to be tested
-    rows, found, count = _pairs_near(np.ascontiguousarray(centres), reach, np.ascontiguousarray(uv), order)
+    boxes = np.ascontiguousarray(centres), float(reach), np.ascontiguousarray(uv), order
+    rows, found, count = _pairs_near(*boxes)
     return rows[:count], found[:count]
 
 

@@ -217,7 +217,8 @@ def new_landmarks(
     starts = np.searchsorted(cells[order], np.arange(columns * lines))
     rank = np.empty(len(rows), int)
     rank[order] = np.arange(len(rows)) - starts[cells[order]]
-    return apart(uv, rows[np.argsort(rank + load[cells], kind="stable")], wanted, separation)
+    queue = rows[np.argsort(rank + load[cells], kind="stable")]
+    return apart(np.ascontiguousarray(uv), queue, wanted, float(separation))
 
 
 def depth_is_known(

@@ -12,6 +12,7 @@ it is predicted depends on them, and they have neither a depth nor a prediction 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ class Standing:
     T_world_left: Array = field(default_factory=lambda: np.eye(4))  # the camera's last pose (4, 4)
     blind: int = 0  # number of frames in which too little of what stays was seen to tell, as something hides it
 
-    @property
+    @cached_property
     def stands(self) -> bool:
         """Whether the camera stands for certain."""
         return self.frames > _FRAMES

@@ -7,37 +7,35 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import assign, row_times, turn
-from slam.kernels.se3 import transform_back
-from slam.kernels.stereo import by_pose
+from slam.kernels.linear import assign, row_times, subtract, turn
+from slam.kernels.se3 import point_by_motion, transform_back
 from slam.runtime.compilation import helper, kernel
-from slam.window.terms import ELIMINATED, KNOWN, whitened_residual
+from slam.window.terms import ELIMINATED, KNOWN, row_jacobians, whitened_residual
 
 
 @kernel
-def point_relations(
-    T, points, asked, place, E, pose_of, cross, first, order, column, inverse, X, P_poses, newest, prior
-):  # fmt: skip
+def point_relations(T, points, asked, layout, E, cross, inverse, X, P_poses, newest, skipped):
     """Covariances of points in the coordinates of a pose T (4, 4), and in the world (N, 3, 3) each, of those `asked`.
 
-    T's unknowns begin at `newest`, −1 where it is fixed; `X` (n, n) is ``L⁻¹`` of the normal equations' Cholesky
-    factor, `P_poses` (6 F, 6 F) the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse`
-    is by `eliminate`.
+    T's unknowns begin at `newest`, negative where it is fixed. `X` (x, x) is the last part of ``L⁻¹`` of the normal
+    equations' Cholesky factor, without the first `skipped` unknown points, which are not asked for.
+    `P_poses` (6 F, 6 F) is the joint covariance of the free poses, `inverse` that of `slam.window.kernels`.
     """
+    column, place, basis, _, pose_of, first, order = layout
+    prior, mine = 3 * len(basis), 3 * (len(basis) - skipped)
     size, at = len(P_poses), newest - prior
     camera, world = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 3))
     own, by = np.empty((3, 3)), np.zeros((3, 6))
-    blocks = _covariances(X, prior, newest)
+    blocks = _covariances(X, mine, mine + at if newest >= 0 else -1)
     A, AP = np.zeros((3, size)), np.zeros((3, size))
     q, D, G, M = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 6))
     for p in range(len(points)):
-        d = place[p]
         if not asked[p]:
             continue
-        if d >= 0:
-            assign(blocks[d, :, :3], own)
-            assign(blocks[d, :, 3:], by)
-        elif d == ELIMINATED and inverse[p, 0, 0] > 0.0:
+        if place[p] >= 0:
+            assign(blocks[place[p] - skipped, :, :3], own)
+            assign(blocks[place[p] - skipped, :, 3:], by)
+        elif place[p] == ELIMINATED and inverse[p, 0, 0] > 0.0:
             for i in range(3):
                 for a in range(size):
                     A[i, a] = AP[i, a] = 0.0
@@ -72,9 +70,7 @@ def point_relations(
         turn(D, own, camera[p])
         if newest < 0:
             continue
-        G[0, 1], G[0, 2], G[1, 2] = -q[2], q[1], -q[0]
-        G[1, 0], G[2, 0], G[2, 1] = q[2], -q[1], q[0]
-        G[0, 3] = G[1, 4] = G[2, 5] = -1.0
+        point_by_motion(q, -1.0, G)
         for i in range(3):
             for j in range(6):
                 M[i, j] = row_times(D, i, by[:, j])
@@ -103,24 +99,13 @@ def _covariances(X, unknown, newest):
 
 
 @kernel
-def rig_columns(
-    camera, poses, column, points, place, E, rows, field, prior, by_first, members, unknown, pose_of, cross, first,
-    order, inverse, n,
-):  # fmt: skip
-    """How ``H x = b`` depends on m errors of the rig, which displace measurements by `field` (M, 3, m): B (n, m).
+def rig_columns(camera, poses, points, layout, E, rows, field, cross, inverse, B):
+    """How ``H x = b`` depends on m errors of the rig, which displace measurements by `field` (M, 3, m), added to B.
 
-    `prior` are the derivatives of the prior's η, `by_first` those of its numbers by the first pose; `members` of the
-    `unknown` points are the prior's. Second, ``inverse gradient`` (N, 3, m) of the points that are eliminated.
+    Returns ``inverse gradient`` (N, 3, m) of the points that are eliminated.
     """
-    pose, point, z, root = rows
-    m, mine, shift = field.shape[2], 3 * members, 3 * (unknown - members)
-    B = np.zeros((n, m))
-    for i in range(len(prior)):
-        for k in range(m):
-            if i < mine or i >= mine + 6:
-                B[i + (shift if i >= mine else 0), k] += prior[i, k]
-            for a in range(6):
-                B[mine + shift + a, k] += by_first[i, a] * prior[i, k]
+    (pose, point, z, root), m = rows, field.shape[2]
+    column, place, _, _, pose_of, first, order = layout
     gradient, own = np.zeros((len(points), 3, m)), np.zeros((len(points), 3, m))
     q, r, D, F = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, m))
     J, Jp = np.empty((3, 6)), np.empty((3, 3))
@@ -129,15 +114,12 @@ def rig_columns(
         transform_back(T, points[p], q)
         if root[row, 0, 0] == 0.0 or not whitened_residual(camera, q, z[row], root[row], r, D):
             continue
+        row_jacobians(T, E[p], q, D, J, Jp)
         for i in range(3):
             for k in range(m):
                 F[i, k] = 0.0
                 for j in range(i + 1 if D[i, i % 2] != 0.0 else 0):  # none of what is not measured
                     F[i, k] += root[row, i, j] * field[row, j, k]
-            by_pose(D[i], q, J[i])
-            x, y, h = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
-            for a in range(3):
-                Jp[i, a] = x * E[p, 0, a] + y * E[p, 1, a] + h * E[p, 2, a]
         for k in range(m):
             for i in range(3):
                 for a in range(6 if at >= 0 else 0):
@@ -159,15 +141,16 @@ def rig_columns(
                 for k in range(m):
                     for i in range(3):
                         B[at + a, k] -= cross[order[o], a, i] * own[p, i, k]
-    return B, own
+    return own
 
 
 @kernel
-def rig_points(column, place, E, pose_of, cross, first, order, inverse, own, X):
+def rig_points(layout, E, cross, inverse, own, X):
     """Derivatives (N, 3, m) of points in the world by errors of the rig, given those of the unknowns X (n, m).
 
     `own` (N, 3, m) is by `rig_columns`.
     """
+    column, place, _, _, pose_of, first, order = layout
     m = X.shape[1]
     out, d = np.zeros((len(place), 3, m)), np.empty((3, m))
     for p in range(len(place)):
@@ -193,55 +176,36 @@ def rig_points(column, place, E, pose_of, cross, first, order, inverse, own, X):
 
 @kernel
 def schur_complement(H, b, gone, stay):
-    """Marginalise the unknowns `gone` (g,), ascending, out of ``H x = b``; the others are `stay` (s,), in any order.
+    """Marginalise the unknowns `gone` (g,) out of ``H x = b``; the others are `stay` (s,), both ascending.
 
     Returns ``H_ss − H_sg H_gg⁻¹ H_gs`` (s, s), ``b_s − H_sg H_gg⁻¹ b_g`` (s,), ``H_gg⁻¹ b_g`` (g,) and ``H_gg⁻¹ H_gs``
-    (g, s), all symmetric parts whole; NaN where H_gg is not positive definite.
+    (g, s), all symmetric parts whole; NaN where H_gg is not positive definite. By Gauss and Jordan's elimination.
     """
     g, s = len(gone), len(stay)
-    L, W, v = np.empty((g, g)), np.empty((g, s)), np.empty(g)
+    M, cross = np.empty((g, g + s)), np.empty((s, g))
+    mean, vector, information = np.empty(g), np.empty(s), np.empty((s, s))
     for i in range(g):
-        for j in range(i + 1):
-            L[i, j] = H[gone[i], gone[j]]
-        L[i, i] *= 1.0 + 1e-13  # numerics: keeps what nothing measures positive
-        v[i] = b[gone[i]]
+        mean[i] = b[gone[i]]
+        for j in range(g):
+            M[i, j] = H[gone[max(i, j)], gone[min(i, j)]]
+        M[i, i] *= 1.0 + 1e-13  # numerics: keeps what nothing measures positive
         for j in range(s):
-            W[i, j] = H[gone[i], stay[j]] if gone[i] >= stay[j] else H[stay[j], gone[i]]
-    for i in range(g):  # Cholesky's factor, and L⁻¹ times the rest
-        for j in range(i + 1):
-            total = L[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
-        for k in range(i):
-            _subtract_row(v, W, i, k, L[i, k])
-        _scale_row(v, W, i, 1.0 / L[i, i])
-    information, vector = np.dot(W.T, -W), np.empty(s)
+            M[i, g + j] = cross[j, i] = H[max(gone[i], stay[j]), min(gone[i], stay[j])]
+    for k in range(g):
+        pivot = M[k, k] if M[k, k] > 0.0 else np.nan
+        mean[k] /= pivot
+        for j in range(k + 1, g + s):
+            M[k, j] /= pivot
+        for i in range(g):
+            if i != k:
+                mean[i] -= M[i, k] * mean[k]
+                subtract(M[i, k + 1 :], M[i, k], M[k, k + 1 :])
+    gain = M[:, g:].copy()
+    taken = np.dot(cross, gain)
     for i in range(s):
-        total = b[stay[i]]
+        vector[i] = b[stay[i]]
         for k in range(g):
-            total -= W[k, i] * v[k]
-        vector[i] = total
-        for j in range(s):
-            information[i, j] += H[stay[i], stay[j]] if stay[i] >= stay[j] else H[stay[j], stay[i]]
-    for i in range(g - 1, -1, -1):
-        for k in range(i + 1, g):
-            _subtract_row(v, W, i, k, L[k, i])
-        _scale_row(v, W, i, 1.0 / L[i, i])
-    return information, vector, v, W
-
-
-@helper
-def _subtract_row(v, W, i, k, x):
-    """Row i of v (G,) and W (G, S), less x times row k."""
-    v[i] -= x * v[k]
-    for j in range(W.shape[1]):
-        W[i, j] -= x * W[k, j]
-
-
-@helper
-def _scale_row(v, W, i, x):
-    """Row i of v (G,) and W (G, S), times x."""
-    v[i] *= x
-    for j in range(W.shape[1]):
-        W[i, j] *= x
+            vector[i] -= cross[i, k] * mean[k]
+        for j in range(i + 1):
+            information[i, j] = information[j, i] = H[stay[i], stay[j]] - taken[i, j]
+    return information, vector, mean, gain

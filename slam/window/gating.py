@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import gammainc
 
 from slam.chi_square import chi_square_limit
+from slam.geometry import kernels
 from slam.geometry.se3 import Array
 
 MIN_OBSERVATIONS = 6  #: fewest observations whose agreement is tested
@@ -31,17 +32,5 @@ def squared_distances(residuals: Array, covariances: Array) -> Array:
     Where uR is NaN the left pixel alone is tested. Of the covariances S (M, 3, 3) [px²] lower triangles count. A row
     that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
     """
-    from slam.geometry import kernels
-
     distance = kernels.squared_distances(np.ascontiguousarray(residuals), np.ascontiguousarray(covariances))
     return np.asarray(np.where(np.isfinite(distance), distance, np.inf))
-
-
-def whiteners(covariances: Array) -> Array:
-    """``W = L⁻¹`` (M, 3, 3) with ``S = L Lᵀ`` (M, 3, 3): W ν has covariance I; LinAlgError if S is not definite."""
-    from slam.geometry import kernels
-
-    W = np.asarray(kernels.whiteners(np.ascontiguousarray(covariances)))
-    if not np.isfinite(W).all():
-        raise np.linalg.LinAlgError("a covariance is not positive definite")
-    return W

@@ -1,15 +1,13 @@
 """Gauss-Newton of the window, compiled: normal equations with landmarks eliminated, steps back to poses and points.
 
 Poses are ``T_world_left`` with perturbations on the right, [rotation, translation]. A point's perturbation is in a
-chart of inverse distance (`slam.window.chart_kernels`). Unknowns stand in the order: points of the prior, points that
+chart of inverse distance (`slam.window.chart_kernels`). Unknowns stand in the order: points of the prior and those that
 join them, free poses.
 
-Arrays that many loops take: `poses` (K, 4, 4) and `column`, their first unknowns (K,), −1 for a fixed one; `points`
-(N, 3) and `place`, what each is to the solver (N,), see `KNOWN`; `E`, their derivatives by their charts' coordinates
-(N, 3, 3); `pose_of`, the poses of all rows, then of all places; `first` and `order`, these by point, see `by_point`;
-`H` (n, n), lower triangle, and `b` (n,), which are added to; `information` (N, 3, 3) and `gradient` (N, 3) of each
-point by its rows; `cross`, what each row or place tells of pose and point together (M + Q, 6, 3). `rows`, `places`,
-`motion` and `prior` are tuples of the arrays of the classes of that name in `slam.window.problem`.
+Arrays that many loops take: `poses` (K, 4, 4) and `points` (N, 3); `layout`, see `slam.window.problem.Layout`; `E`,
+derivatives of the points by their charts' coordinates (N, 3, 3); `H` (n, n), lower triangle, and `b` (n,), which are
+added to; `information` (N, 3, 3) and `gradient` (N, 3) of each point by its rows; `cross`, what each row or place tells
+of pose and point together (M + Q, 6, 3). `knowledge` is that of `slam.window.problem.Window`.
 """
 
 from __future__ import annotations
@@ -28,25 +26,22 @@ _NEAR = 50.0  # numerics: a step with a factor of its own is the last at this ma
 
 
 @helper
-def _equations(
-    camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first, order, huber,
-    whole, H,
-):  # fmt: skip
+def _equations(camera, poses, points, layout, knowledge, centre, huber, whole, H):
     """The equations at some poses and points; H, which is filled in, is undefined unless `whole`."""
+    column, place, basis, to, pose_of = layout[:5]
+    rows, places, own, motion, prior = knowledge
     b, information, gradient = np.zeros(len(H)), np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     cross = np.zeros((len(pose_of), 6, 3))
     E = charts(poses, centre, points, place, basis)
     for i in range(len(H)):
         for j in range(i + 1):
             H[i, j] = 0.0
-    cost, A = add_prior(poses, points, 3 * len(basis), prior, whole, H, b)
-    cost += add_rows(
-        camera, poses, column, points, place, E, rows, places, huber, whole, H, b, information, gradient, cross
-    )
+    cost, A = add_prior(poses, points, to, 3 * len(basis), prior, whole, H, b)
+    cost += add_rows(camera, poses, points, layout, E, rows, places, huber, whole, H, b, information, gradient, cross)
     if len(own[0]):
         cost += add_own_priors(points, place, E, own[0], own[1], information, gradient)
     cost += add_motion(poses, column, motion, H, b)
-    inverse = _eliminate(column, place, pose_of, cross, first, order, information, gradient, whole, H, b)
+    inverse = _eliminate(layout, cross, information, gradient, whole, H, b)
     return b, cost, A, E, inverse, gradient, cross
 
 
@@ -75,8 +70,9 @@ def _solve(L, b, gradient, inverse, x):
 
 
 @helper
-def _stepped(column, place, pose_of, first, order, start, x):
+def _stepped(layout, start, x):
     """Poses (K, 4, 4) and points (N, 3) after a step x (n,) of the unknowns; eliminated points follow."""
+    column, place, _, _, pose_of, first, order = layout
     poses, points, E, inverse, gradient, cross = start
     new, to = poses.copy(), points.copy()
     for k in range(len(poses)):
@@ -106,11 +102,12 @@ def _stepped(column, place, pose_of, first, order, start, x):
 
 
 @helper
-def _eliminate(column, place, pose_of, cross, first, order, information, gradient, whole, H, b):
+def _eliminate(layout, cross, information, gradient, whole, H, b):
     """Take points into H and b: those of the prior as unknowns, the others eliminated.
 
     Returns inverses (N, 3, 3) of the information of points that are eliminated.
     """
+    column, place, _, _, pose_of, first, order = layout
     inverse, W, v = np.zeros_like(information), np.empty((6, 3)), np.empty(3)
     for p in range(len(place)):
         d = place[p]
@@ -152,7 +149,7 @@ def _eliminate(column, place, pose_of, cross, first, order, information, gradien
                     if to < 0 or to > at:
                         continue
                     for i in range(6):
-                        for j in range(6):
+                        for j in range(6 if to < at else i + 1):
                             H[at + i, to + j] -= (
                                 W[i, 0] * cross[m2, j, 0] + W[i, 1] * cross[m2, j, 1] + W[i, 2] * cross[m2, j, 2]
                             )
@@ -160,17 +157,13 @@ def _eliminate(column, place, pose_of, cross, first, order, information, gradien
 
 
 @kernel
-def gauss_newton(
-    camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first,
-    order, n, huber, close, steps,
-):  # fmt: skip
+def gauss_newton(camera, poses, points, layout, knowledge, centre, n, huber, close, steps):
     """Gauss-Newton with halved steps on a window's normal equations ``H x = b`` (n,), its points eliminated.
 
-    `camera` (7,) is as in `slam.kernels.stereo`; `basis` (D + J, 3, 3) are charts of the points that are unknowns, in
-    the first pose's axes; inverse distances of all others count from the pose `centre`; `own` are independent means
-    (N, 3) and information (N, 3, 3) of points in world coordinates, or of none. A whitened residual beyond `huber`
-    pulls no more than one there. A step that lessens the cost by less than `close` is the last; it is taken with the
-    factor of the step before. `steps` are most with a factor of their own; without any, there is no factor at all.
+    `camera` (7,) is as in `slam.kernels.stereo`; `layout` ends with `order`. Inverse distances of points that are
+    eliminated count from the pose `centre`. A whitened residual beyond `huber` pulls no more than one there. A step
+    that lessens the cost by less than `close` is the last; it is taken with the factor of the step before. `steps` are
+    most with a factor of their own; without any, there is no factor at all.
 
     Returns poses, points, and the cost there, NaN where H is not positive definite or a step not finite; whether it is
     a minimum; the factor L (n, n); H; and of both, where they were linearised: poses, points, E, the inverse
@@ -182,9 +175,8 @@ def gauss_newton(
     whole, minimum, best, halvings, taken = True, False, np.inf, 0, 0
     while True:
         b, cost, A, E, inverse, gradient, cross = _equations(
-            camera, poses, column, points, place, basis, centre, rows, places, own, motion, prior, pose_of, first,
-            order, huber, whole, H,
-        )  # fmt: skip
+            camera, poses, points, layout, knowledge, centre, huber, whole, H
+        )
         if whole or cost <= best + 1e-9 * abs(best) + 1e-12:
             start = poses, points, E, inverse, gradient, cross
             if whole:
@@ -209,7 +201,7 @@ def gauss_newton(
             if halvings == _HALVINGS:
                 poses, points, cost = linearised[0], linearised[1], best
                 break
-        poses, points = _stepped(column, place, pose_of, first, order, start, x)
+        poses, points = _stepped(layout, start, x)
         if minimum:
             cost -= rest
             break
@@ -220,14 +212,12 @@ def gauss_newton(
 @kernel
 def by_point(point, count):
     """Rows by point: those of point p are ``order[first[p]:first[p + 1]]``."""
-    first, order = np.zeros(count + 1, np.int64), np.empty(len(point), np.int64)
+    first, order, at = np.zeros(count + 1, np.int64), np.empty(len(point), np.int64), np.empty(count, np.int64)
     for m in range(len(point)):
         first[point[m] + 1] += 1
     for p in range(count):
-        first[p + 1] += first[p]
-    at = np.empty(count, np.int64)
-    for p in range(count):
         at[p] = first[p]
+        first[p + 1] += first[p]
     for m in range(len(point)):
         order[at[point[m]]] = m
         at[point[m]] += 1

@@ -72,15 +72,13 @@ def marginalised(
     by_rig = B[~gone] - gain.T @ B[gone]
     if not (np.isfinite(mean).all() and np.isfinite(e.cost)):
         raise np.linalg.LinAlgError("what leaves a window cannot be marginalised")
-    E = e.E[w.members]
-    conditional = Conditional(mean, gain, E[points], E[~points])
-
-    members, stay = w.members[~points], w.poses[~gone_poses]
-    D = len(members)
+    all_members = np.concatenate([w.prior.points, w.joining])
+    E, members, stay = e.E[all_members], all_members[~points], w.poses[~gone_poses]
+    conditional, D = Conditional(mean, gain, E[points], E[~points]), len(members)
     if reference:
         basis, _ = chart_kernels.relative_charts(stay[0], w.points[members])
     else:
-        basis = w.basis[~points]
+        basis = w.layout.basis[~points]
     origin, change, by = chart_kernels.chart_changes(stay[0], w.points[members], basis, conditional.stayed)
     if not np.isfinite(origin).all():
         raise np.linalg.LinAlgError("a point of the prior is behind its chart")

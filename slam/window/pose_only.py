@@ -16,7 +16,6 @@ from slam.data import BoolArray
 from slam.geometry import kernels
 from slam.geometry.se3 import Array
 from slam.window import solver
-from slam.window.gating import whiteners
 from slam.window.problem import RelativePrior, Rows, Window
 from slam.window.solver import row_distances
 from slam.window.stereo import RectifiedStereo
@@ -46,18 +45,19 @@ class PoseProblem:
 
     @cached_property
     def whiteners(self) -> Array:
-        """What scales residuals to unit variance (M, 3, 3); the third row is zero where there is no right pixel."""
-        W = whiteners(self.noise)
+        """What scales residuals to unit variance (M, 3, 3); the third row is zero where there is no right pixel.
+
+        With ``S = L Lᵀ`` the noise, ``L⁻¹``. Raises LinAlgError where S is not positive definite.
+        """
+        W = np.asarray(kernels.whiteners(self.noise))
+        if not np.isfinite(W).all():
+            raise np.linalg.LinAlgError("a covariance is not positive definite")
         W[np.isnan(self.z[:, 2]), 2] = 0
         return W
 
     def distances(self, T: Array) -> Array:
         """Squared distance of each measurement (M,) from what a pose (4, 4) predicts, see `row_distances`."""
         return row_distances(self.window(T))
-
-    def derivatives(self, T: Array) -> Array:
-        """Of the predictions (M, 3, 6) by the pose (4, 4)."""
-        return np.asarray(kernels.residuals(self.stereo.intrinsics, self.points, self.z, T)[1])
 
 
 def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam.geometry.arrays import Array, IndexArray, Table
-from slam.window import chart_kernels, kernels, terms
+from slam.geometry.arrays import Array, BoolArray, IndexArray, Table
+from slam.window import chart_kernels, terms
+from slam.window.kernels import by_point
 from slam.window.stereo import RectifiedStereo
 
 KNOWN, ELIMINATED = terms.KNOWN, terms.ELIMINATED
@@ -130,6 +131,29 @@ class RelativePrior:
         return cls(*none, np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)))
 
 
+class Layout(NamedTuple):
+    """Where a window's unknowns stand: points of the prior and those that join, then free poses; and its rows by point.
+
+    Rows are those of measurements, then those of `Places`; of point p they are ``order[first[p]:first[p + 1]]``.
+    """
+
+    column: IndexArray  # first unknown of each pose (K,), −1 for a fixed one
+    place: IndexArray  # what each point is to the solver (N,): `KNOWN`, `ELIMINATED`, or its place among the unknowns
+    basis: Array  # charts of points that are unknowns, in the first pose's axes (D + J, 3, 3)
+    prior: IndexArray  # unknown of each of the prior's numbers (m,)
+    pose_of: IndexArray  # pose of each row (M + Q,)
+    first: IndexArray  # (N + 1,)
+    order: IndexArray  # (M + Q,)
+    poses: int  # where the poses' unknowns begin
+    asked: int  # where those of points begin whose covariances are asked for
+    free: int  # how many poses are unknown
+
+    @property
+    def unknowns(self) -> int:
+        """How many there are, without the points that are eliminated."""
+        return self.poses + 6 * self.free
+
+
 @dataclass(frozen=True, eq=False)
 class Window:
     """A few poses, many points, and what is known of them.
@@ -147,72 +171,63 @@ class Window:
         motion: constant velocity between successive poses, or of what the points belong to.
         prior: what is known of the first poses and of some points together.
         joining: points that are unknowns beside those of the prior (J,), instead of being eliminated.
+        asked: of which points covariances will be asked for (N,); None for all. Each costs time.
     """
 
     stereo: RectifiedStereo
     poses: Array
     points: Array
     rows: Rows
-    free: np.ndarray | None = None
-    known: np.ndarray | None = None
+    free: BoolArray | None = None
+    known: BoolArray | None = None
     mean: Array | None = None
     information: Array | None = None
     places: Places = field(default_factory=Places.none)
     motion: Motion = field(default_factory=Motion.none)
     prior: RelativePrior = field(default_factory=RelativePrior.none)
     joining: IndexArray = field(default_factory=lambda: np.zeros(0, np.intp))
+    asked: BoolArray | None = None
 
     @cached_property
-    def members(self) -> IndexArray:
-        """Points that are unknowns: those of the prior, then those that join (D + J,)."""
-        return np.concatenate([self.prior.points, self.joining])
-
-    @cached_property
-    def basis(self) -> Array:
-        """Charts of `members` in the first pose's axes (D + J, 3, 3)."""
-        if not len(self.joining):
-            return self.prior.basis
-        return np.concatenate(
-            [self.prior.basis, chart_kernels.relative_charts(self.poses[0], self.points[self.joining])[0]]
-        )
-
-    @cached_property
-    def place(self) -> IndexArray:
-        """What each point is to the solver (N,), see `slam.window.kernels`."""
+    def layout(self) -> Layout:
+        """Where unknowns stand, and which rows are of which point."""
+        prior, joining = self.prior, self.joining
+        members, basis = prior.points, prior.basis
+        if len(joining):
+            own, _ = chart_kernels.relative_charts(self.poses[0], self.points[joining])
+            members, basis = np.concatenate([members, joining]), np.concatenate([basis, own])
+        skipped = 0
+        if self.asked is not None:
+            asked = self.asked[members]
+            order, skipped = np.argsort(asked, kind="stable"), len(asked) - int(np.count_nonzero(asked))
+            members, basis = members[order], basis[order]
         place = np.full(len(self.points), ELIMINATED)
         if self.known is not None:
             place[self.known] = KNOWN
-        place[self.members] = np.arange(len(self.members))
-        return place
+        place[members] = np.arange(len(members))
+        at, free = 3 * len(members), len(self.poses)
+        column = at + 6 * np.arange(free)
+        if self.free is not None:
+            free = int(np.count_nonzero(self.free))
+            column = np.where(self.free, at + 6 * np.cumsum(self.free) - 6, -1)
+        of_points = 3 * place[prior.points][:, None] + np.arange(3)
+        of_poses = at + np.arange(6 * len(prior.relative))
+        rows, places = self.rows, self.places
+        first, order = by_point(np.concatenate([rows.point, places.point]), len(place))
+        return Layout(
+            column, place, basis, np.concatenate([of_points.ravel(), of_poses]),
+            np.concatenate([rows.pose, places.pose]), first, order, at, 3 * skipped, free,
+        )  # fmt: skip
 
-    @cached_property
-    def column(self) -> IndexArray:
-        """First unknown of each pose (K,), −1 for a fixed one."""
-        first = 3 * len(self.members)
-        if self.free is None:
-            return first + 6 * np.arange(len(self.poses))
-        column = np.full(len(self.poses), -1)
-        column[self.free] = first + 6 * np.arange(int(self.free.sum()))
-        return column
-
-    @cached_property
-    def unknowns(self) -> int:
-        """Number of unknowns, without the points that are eliminated."""
-        return 3 * len(self.members) + 6 * int((self.column >= 0).sum())
-
-    @cached_property
-    def by_point(self) -> tuple[IndexArray, IndexArray]:
-        """Rows, then places, by point: see `slam.window.kernels.by_point`."""
-        first, order = kernels.by_point(np.concatenate([self.rows.point, self.places.point]), len(self.points))
-        return first, order
-
-    @cached_property
-    def pose_of(self) -> IndexArray:
-        """Pose of each row, then of each place."""
-        return np.concatenate([self.rows.pose, self.places.pose])
+    @property
+    def knowledge(self) -> tuple[Any, ...]:
+        """What compiled code adds up: rows, places, priors of points in the world, motion, prior."""
+        mean = np.zeros((0, 3)) if self.mean is None else self.mean
+        information = np.zeros((0, 3, 3)) if self.information is None else self.information
+        return self.rows.arrays, self.places.arrays, (mean, information), self.motion.arrays, self.prior.arrays
 
     def at(self, poses: Array, points: Array, rows: Rows | None = None) -> Window:
         """With other values of the poses and points, and other measurements from the same poses of the same points."""
-        moved = object.__new__(Window)  # what was derived does not depend on these
+        moved = object.__new__(Window)  # the layout does not depend on these
         moved.__dict__.update(self.__dict__, poses=poses, points=points, rows=self.rows if rows is None else rows)
         return moved

@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg.lapack import dpotrs, dtrtri
 
-from slam.geometry.arrays import Array, BoolArray, IndexArray
+from slam.geometry.arrays import Array, IndexArray
 from slam.window import covariance_kernels, kernels
 from slam.window.problem import ELIMINATED, Window
 
@@ -24,7 +24,7 @@ class NormalEquations:
     """A window linearised at its present values: ``H x = b``, points eliminated."""
 
     window: Window  # what was linearised
-    H: Array  # information of the unknowns (n, n), lower triangle; of `linearised` alone
+    H: Array  # information of the unknowns (n, n), lower triangle
     E: Array  # derivatives of points by their charts' coordinates (N, 3, 3)
     inverse: Array  # inverse information of each eliminated point (N, 3, 3)
     gradient: Array  # of each point by its own rows (N, 3)
@@ -39,12 +39,15 @@ class NormalEquations:
         `field` (M, 3, m) are those of the rows' true measurements.
         """
         w = self.window
-        prior = w.prior.by_rig if len(w.prior.vector) else np.zeros((0, field.shape[2]))
-        return covariance_kernels.rig_columns(
-            w.stereo.intrinsics, w.poses, w.column, w.points, w.place, self.E, w.rows.arrays, field, prior,
-            self.by_first, len(w.prior.points), len(w.members), w.pose_of, self.cross, *w.by_point, self.inverse,
-            w.unknowns,
+        B, to, at = np.zeros((len(self.b), field.shape[2])), w.layout.prior, slice(w.layout.poses, w.layout.poses + 6)
+        if len(to):
+            B[to] = w.prior.by_rig
+            B[at] = self.by_first.T @ w.prior.by_rig
+        own = covariance_kernels.rig_columns(
+            w.stereo.intrinsics, w.poses, w.points, w.layout[:7], self.E, w.rows.arrays, field, self.cross,
+            self.inverse, B,
         )  # fmt: skip
+        return B, own
 
 
 def linearised(w: Window, centre: int = 0) -> NormalEquations:
@@ -65,13 +68,14 @@ class Solution:
 
     @cached_property
     def inverse_factor(self) -> Array:
-        """``L⁻¹`` (n, n), lower triangular."""
-        return np.asarray(_upper_inverse(self.factor.T).T)
+        """``L⁻¹`` of the points that are asked for and of the poses, lower triangular: the last part of the whole."""
+        at = self.window.layout.asked
+        return np.asarray(_upper_inverse(self.factor[at:, at:].T).T)
 
     @cached_property
     def pose_covariance(self) -> Array:
         """Joint covariance (6 F, 6 F) of the free poses, perturbed on the right."""
-        first = 3 * len(self.window.members)
+        first = len(self.inverse_factor) - 6 * self.window.layout.free
         X = self.inverse_factor[first:, first:]
         return np.asarray(X.T @ X)
 
@@ -83,25 +87,21 @@ class Solution:
         Args:
             field: derivatives (M, 3, m) of the rows' true measurements.
         """
-        w, e = self.window, self.equations
+        e, layout = self.equations, self.window.layout
         B, own = e.by_rig(field)
-        X = self.inverse_factor.T @ (self.inverse_factor @ B)
-        points = covariance_kernels.rig_points(
-            w.column, w.place, e.E, w.pose_of, e.cross, *w.by_point, e.inverse, own, X
-        )
-        return X[3 * len(w.members) :], points
+        X = dpotrs(self.factor, B, lower=1)[0] if B.size else B
+        return X[layout.poses :], covariance_kernels.rig_points(layout[:7], e.E, e.cross, e.inverse, own, X)
 
-    def point_covariances(self, pose: int, asked: BoolArray | None = None) -> tuple[Array, Array]:
+    def point_covariances(self, pose: int) -> tuple[Array, Array]:
         """Covariances (N, 3, 3) of the points in the coordinates of a pose, and in the world.
 
-        They are zero for points that are known, and for those that are not `asked` for (N,); None for all.
+        They are zero for points that are known, that nothing measures, or that are not asked for.
         """
-        e = self.equations
-        w = e.window
-        asked = np.ones(len(w.points), bool) if asked is None else asked
+        e, w = self.equations, self.equations.window
+        asked = np.ones(len(w.points), bool) if w.asked is None else w.asked
         return covariance_kernels.point_relations(
-            w.poses[pose], w.points, asked, w.place, e.E, w.pose_of, e.cross, *w.by_point, w.column, e.inverse,
-            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members),
+            w.poses[pose], w.points, asked, w.layout[:7], e.E, e.cross, e.inverse, self.inverse_factor,
+            self.pose_covariance, int(w.layout.column[pose]), w.layout.asked // 3,
         )  # fmt: skip
 
     def left_out_distances(
@@ -119,12 +119,12 @@ class Solution:
             sigma: noise of the rows [px].
             least: share of its noise that a row's residual must have to be tested; the distance is 0 where it has less.
         """
-        w, then, first = self.window, self.equations.window, self.window.by_point[0]
+        w, then, first = self.window, self.equations.window, self.window.layout.first
         distances = kernels.left_out_distances(
             w.stereo.intrinsics, w.poses[pose], w.points[points], z, local, sigma, least, then.poses[pose],
             then.points[points],
         )  # fmt: skip
-        alone = (first[points + 1] - first[points] == 1) & (w.place[points] == ELIMINATED)
+        alone = (first[points + 1] - first[points] == 1) & (w.layout.place[points] == ELIMINATED)
         if w.information is not None:
             alone &= w.information[points, 0, 0] == 0
         return np.where(alone, 0.0, distances)
@@ -149,12 +149,9 @@ def solve(window: Window, close: float = CLOSE, huber: float = np.inf, steps: in
 
 
 def _gauss_newton(w: Window, centre: int, huber: float, close: float, steps: int) -> tuple[Any, ...]:
-    own = (
-        (np.zeros((0, 3)), np.zeros((0, 3, 3))) if w.mean is None or w.information is None else (w.mean, w.information)
-    )
     found: tuple[Any, ...] = kernels.gauss_newton(
-        w.stereo.intrinsics, w.poses, w.column, w.points, w.place, w.basis, centre, w.rows.arrays, w.places.arrays, own,
-        w.motion.arrays, w.prior.arrays, w.pose_of, *w.by_point, w.unknowns, huber, close, steps,
+        w.stereo.intrinsics, w.poses, w.points, w.layout[:7], w.knowledge, centre, w.layout.unknowns, huber, close,
+        steps,
     )  # fmt: skip
     return found
 

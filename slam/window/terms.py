@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import multiply, row_times
+from slam.kernels.linear import multiply, row_times, subtract
 from slam.kernels.se3 import adjoint, between, compose, log, transform_back
 from slam.kernels.stereo import by_pose, residual
 from slam.kernels.velocities import add_velocity_rows, velocity_change
@@ -21,14 +21,14 @@ _BEHIND = 100.0  # numerics: whitened residual of a point that is behind its cam
 
 
 @helper
-def add_prior(poses, points, D, prior, whole, H, b):
-    """Add the prior ``δᵀ Λ δ − 2 ηᵀ δ``; poses begin at the unknown D. Returns its value, and δ's derivatives A (m, 6).
+def add_prior(poses, points, to, D, prior, whole, H, b):
+    """Add the prior ``δᵀ Λ δ − 2 ηᵀ δ``, whose numbers are of the unknowns `to` (m,); poses begin at the unknown D.
 
-    The reference pose changes all of δ, the others and the points only their own.
+    The reference pose changes all of δ, the others and the points only their own. Returns the cost, and δ's derivatives
+    A (m, 6) by the reference.
     """
-    members, information, vector = prior[0], prior[5], prior[6]
-    n, mine = len(vector), 3 * len(members)
-    shift = D - mine  # of the poses, behind points that join
+    information, vector, at = prior[5], prior[6], 3 * len(prior[0])
+    n = len(vector)
     delta, A = np.empty(n), np.empty((n, 6))
     if n == 0:
         return 0.0, A
@@ -36,43 +36,28 @@ def add_prior(poses, points, D, prior, whole, H, b):
         return np.inf, A
     cost, pull, V = 0.0, vector.copy(), np.zeros((6, n))
     for i in range(n):
-        _subtract(pull, information[i], delta[i])
+        subtract(pull, delta[i], information[i])
         for a in range(6 if whole else 0):
-            _subtract(V[a], information[i], -A[i, a])
+            subtract(V[a], -A[i, a], information[i])
     for i in range(n):
         cost -= delta[i] * (pull[i] + vector[i])
         for a in range(6):
             b[D + a] += A[i, a] * pull[i]
-        if i < mine or i >= mine + 6:
-            b[i + (shift if i >= mine else 0)] += pull[i]
+        if i < at or i >= at + 6:
+            b[to[i]] += pull[i]
     for i in range(n if whole else 0):
-        row = i + (shift if i >= mine else 0)
-        if i < mine:
-            for a in range(6):
-                H[D + a, row] = V[a, i]
-        elif i >= mine + 6:
-            for a in range(6):
-                H[row, D + a] = V[a, i]
-        else:
+        row = to[i]
+        if i >= at and i < at + 6:
+            for c in range(i - at + 1):
+                for j in range(n):
+                    H[row, D + c] += A[j, i - at] * V[c, j]
             continue
-        for j in range(min(mine, i + 1)):
-            H[row, j] = information[i, j]
-        for j in range(mine + 6, i + 1):
-            H[row, j + shift] = information[i, j]
-    for a in range(6 if whole else 0):
-        for c in range(a + 1):
-            total = 0.0
-            for i in range(n):
-                total += A[i, a] * V[c, i]
-            H[D + a, D + c] = total
+        for a in range(6):
+            H[max(D + a, row), min(D + a, row)] = V[a, i]
+        for j in range(i + 1):
+            if j < at or j >= at + 6:
+                H[max(row, to[j]), min(row, to[j])] = information[i, j]
     return cost, A
-
-
-@helper
-def _subtract(v, row, x):
-    """``v − x row``, in place."""
-    for j in range(len(v)):
-        v[j] -= x * row[j]
 
 
 @helper
@@ -108,12 +93,12 @@ def _prior_rows(poses, points, prior, delta, A):
 
 
 @helper
-def add_rows(camera, poses, column, points, place, E, rows, places, huber, whole, H, b, information, gradient, cross):
+def add_rows(camera, poses, points, layout, E, rows, places, huber, whole, H, b, information, gradient, cross):
     """Add measurements, then points known relative to a pose: ``root ((α, β, ρ) − origin)`` is unit noise.
 
     Returns the sum of squares, of what a measurement has beyond `huber` as Huber (1964) counts it.
     """
-    pose, point, z, root = rows
+    (pose, point, z, root), column, place = rows, layout[0], layout[1]
     cost, q, r, D = 0.0, np.empty(3), np.empty(3), np.empty((3, 3))
     s, S, J, Jp = np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
     for m in range(len(cross)):
@@ -177,31 +162,33 @@ def whitened_residual(camera, q, z, root, r, D):
 
 
 @helper
-def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, whole, H, b, information, gradient, cross):
-    """Add one row: residual r (3,), predicted numbers that change by D (3, 3) with the point q in the camera."""
-    T = poses[k]
-    free = place[p] != KNOWN
-    if free:
-        for i in range(3):
-            x, y, z = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
-            for j in range(3):
-                Jp[i, j] = x * E[p, 0, j] + y * E[p, 1, j] + z * E[p, 2, j]
-        for a in range(3):
-            gradient[p, a] += Jp[0, a] * r[0] + Jp[1, a] * r[1] + Jp[2, a] * r[2]
-            for c in range(3):
-                information[p, a, c] += Jp[0, a] * Jp[0, c] + Jp[1, a] * Jp[1, c] + Jp[2, a] * Jp[2, c]
-    at = column[k]
-    if at < 0:
-        return
+def row_jacobians(T, E, q, D, J, Jp):
+    """Derivatives of numbers that change by D (3, 3) with a point q in the camera: J (3, 6) by the camera's pose T.
+
+    And Jp (3, 3) by the coordinates of the chart in which the point has the derivatives E (3, 3).
+    """
     for i in range(3):
         by_pose(D[i], q, J[i])
-    for a in range(6):
+        x, y, z = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
+        for j in range(3):
+            Jp[i, j] = x * E[0, j] + y * E[1, j] + z * E[2, j]
+
+
+@helper
+def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, whole, H, b, information, gradient, cross):
+    """Add one row: residual r (3,), predicted numbers that change by D (3, 3) with the point q in the camera."""
+    row_jacobians(poses[k], E[p], q, D, J, Jp)
+    at, free = column[k], place[p] != KNOWN
+    for a in range(3 if free else 0):
+        gradient[p, a] += Jp[0, a] * r[0] + Jp[1, a] * r[1] + Jp[2, a] * r[2]
+        for c in range(3):
+            information[p, a, c] += Jp[0, a] * Jp[0, c] + Jp[1, a] * Jp[1, c] + Jp[2, a] * Jp[2, c]
+    for a in range(6 if at >= 0 else 0):
         b[at + a] += J[0, a] * r[0] + J[1, a] * r[1] + J[2, a] * r[2]
         for c in range(a + 1 if whole else 0):
             H[at + a, at + c] += J[0, a] * J[0, c] + J[1, a] * J[1, c] + J[2, a] * J[2, c]
-        if free:
-            for c in range(3):
-                cross[a, c] = J[0, a] * Jp[0, c] + J[1, a] * Jp[1, c] + J[2, a] * Jp[2, c]
+        for c in range(3 if free else 0):
+            cross[a, c] = J[0, a] * Jp[0, c] + J[1, a] * Jp[1, c] + J[2, a] * Jp[2, c]
 
 
 @helper

@@ -16,7 +16,6 @@ from slam.errors import ConfigurationError, MeasurementError
 from slam.interfaces import Backend
 from slam.testing import BACKEND_CHECKS, RIG, RIGHT, RUNS, check_backend, findings, hostile
 from slam.testing.__main__ import main
-from tests.backends.scenes import path, scene
 
 ROOT = Path(__file__).parents[2]
 
@@ -180,23 +179,3 @@ def test_the_command_prints_how_far_a_back_end_comes(capsys, monkeypatch):
     for name in ("nothing", "no_such_module:Backend", "pose_fit:Missing"):
         assert main([name]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
-
-
-@pytest.mark.parametrize("name", backends.names())
-def test_a_question_between_predict_and_update_changes_nothing(name):
-    data = scene(path(4, 0.1, np.array([0.2, 0.0, 0.5]), np.array([0.0, 0.05, 0.0])))
-    asked, plain = (backends.create(name, RIG) for _ in range(2))
-    for backend in (asked, plain):
-        known: set[int] = set()
-        for k, (stamp, _, seen) in enumerate(data):
-            prediction = backend.predict(stamp)
-            if backend is asked:
-                assert backend.trajectory().stamps.tolist() == data.stamps[: k + 1].tolist()
-                for T in (backend.trajectory().poses[-1], backend.estimate().T_world_left):
-                    near = 1e-4 if name == "batch" else 0.0  # it solves for all poses, where the prediction does not
-                    assert np.allclose(T, prediction.T_world_left, rtol=0, atol=near)
-            old = np.isin(seen.ids, sorted(known))
-            assert len(backend.update(seen.select(old)).used) == old.sum()
-            backend.add(seen.select(~old))
-            known |= set(seen.ids.tolist())
-    assert np.allclose(asked.estimate().T_world_left, plain.estimate().T_world_left, atol=1e-6)

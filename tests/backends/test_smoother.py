@@ -320,26 +320,6 @@ def test_landmarks_that_are_variables_outlast_more_than_a_lag_of_frames_that_mea
     assert errors(after.T_world_left, poses[-1])[0] < 3 * deviations[1]
 
 
-# --- the last poses together ---
-
-
-def test_the_last_poses_have_a_joint_covariance():
-    data = drive(30)
-    backend = tracked(data)
-    for ahead in (False, True):
-        if ahead:
-            backend.predict(3.0)
-        found, path_now, last = backend.recent(6), backend.trajectory(), backend.estimate(landmarks=False)
-        assert found.stamps.tolist() == path_now.stamps[-6:].tolist()
-        np.testing.assert_allclose(found.poses, path_now.poses[-6:], atol=1e-12)
-        np.testing.assert_allclose(found.covariance[-6:, -6:], last.covariance, rtol=1e-6, atol=1e-12)
-        assert np.linalg.eigvalsh(found.covariance).min() > 0
-    P = backend.recent(3).covariance[:12, :12]
-    A = se3.adjoint(se3.inverse(found.poses[-2]) @ found.poses[-3])
-    step_covariance = A @ P[:6, :6] @ A.T + P[6:, 6:] - A @ P[:6, 6:] - (A @ P[:6, 6:]).T
-    assert 0 < np.trace(step_covariance[3:, 3:]) < 0.7 * np.trace(P[9:, 9:]), "errors that poses share cancel"
-
-
 # --- measurements that are mended ---
 
 

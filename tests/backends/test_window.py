@@ -186,6 +186,22 @@ def test_blind_for_longer_than_the_window_landmarks_become_as_uncertain_as_in_th
     assert deviations["window"] == pytest.approx(deviations["smoother"], rel=0.05)
 
 
+def test_landmarks_that_no_frame_measures_for_a_while_are_as_uncertain_as_in_the_smoother():
+    """Others are measured; the covariances of these are not computed anew, but follow the camera's motion."""
+    deviations = {}
+    for name in ("smoother", "window"):
+        rng, known = np.random.default_rng(0), set()
+        poses = path(40, 0.1, np.array([0.02, 0.0, 0.05]), np.array([0.0, 0.02, 0.0]))
+        points = cloud(poses[:1], 60, rng, 3, 8)
+        backend = backends.create(name, RIG, models=EstimatorModels(MotionModel(0.3, 0.3), pixel_sigma=0.5))
+        for k, T in enumerate(poses):
+            seen = observe(T, points, 0.5, rng, 60)
+            step(backend, 0.1 * k, seen.select((k < 30) | (seen.ids % 3 > 0)), known)
+        prediction = backend.predict(4.0)
+        deviations[name] = np.trace(prediction.innovation, axis1=1, axis2=2)[prediction.ids % 3 == 0]
+    np.testing.assert_allclose(deviations["window"], deviations["smoother"], rtol=0.05)
+
+
 def test_landmarks_known_in_the_world_stay_known_beyond_the_priors_limit():
     deviations = []
     for limit in (5, 150):

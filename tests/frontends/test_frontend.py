@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -54,7 +56,10 @@ def test_same_bytes_whatever_the_threads(options):
     for threads in (1, 2, 5):
         frontend = SurfFrontend(RIG, threads=threads, **options)
         runs.append([bytes_of(frontend.extract(StereoFrame(k, float(k), LEFT, RIGHT))) for k in range(3)])
-    assert runs[0] == runs[1] == runs[2]
+    frontend, frames = SurfFrontend(RIG, **options), [StereoFrame(k, float(k), LEFT, RIGHT) for k in range(3)]
+    with ThreadPoolExecutor(1) as ahead:  # as in a run with overlap
+        runs.append([bytes_of(ahead.submit(frontend.extract, frame).result()) for frame in frames])
+    assert runs[0] == runs[1] == runs[2] == runs[3]
 
 
 def test_nothing_to_see():

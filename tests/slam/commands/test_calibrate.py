@@ -14,7 +14,7 @@ from slam.commands.cli import app
 from slam.errors import SlamError
 from slam.run import calibrating
 from slam.run.calibrating import _judged
-from slam.run.repeat import load
+from slam.run.options import load
 
 WORLD = "synthetic:aisle?frames=6&speed=16&turn_error=1"
 QUIET = ("-q", "--no-picture")

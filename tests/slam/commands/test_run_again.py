@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from slam.commands.cli import app
 from slam.errors import SlamError
-from slam.run.repeat import load
+from slam.run.options import load
 
 WORLD = "synthetic:aisle?frames=6&width=160&height=120"
 SAME = ("trajectory.txt", "trajectory_final.txt", "landmarks.csv", "objects.csv", "truth.txt", "schema.json")

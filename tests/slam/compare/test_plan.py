@@ -9,8 +9,7 @@ from slam.commands.compare import compare, variants_of
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
 from slam.compare.statistics import fewest
 from slam.compare.sweep import check
-from slam.compare.tables import most_tests
-from slam.compare.wording import caution
+from slam.compare.tables import caution, most_tests
 from slam.errors import ConfigurationError
 
 WORLDS = ("synthetic:aisle?frames=30", "synthetic:box")

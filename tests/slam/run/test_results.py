@@ -6,8 +6,7 @@ import pytest
 
 from slam.compare.plan import Plan, Trial, Variant
 from slam.compare.sweep import Run
-from slam.compare.tables import groups
-from slam.compare.wording import honesty
+from slam.compare.tables import groups, honesty
 from slam.run.results import figures, rows, verdict, verdict_of_run
 
 TEN, ONE, START, HUNDRED = "nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof", "nees_100m_per_dof"

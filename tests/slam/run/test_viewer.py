@@ -15,7 +15,7 @@ from slam.sequences import open_sequence
 
 def test_without_rerun_one_line_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(SlamError, match=r"pip install 'surf-stereo-slam\[viewer\]'"):
+    with pytest.raises(SlamError, match=r"pip install rerun-sdk"):
         Viewer(str(tmp_path / "a.rrd"))
 
 

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from slam.window.gating import squared_distances, whiteners
+from slam.window.gating import squared_distances
 from slam.window.pose_only import PoseProblem, solve
 from slam.window.stereo import RectifiedStereo
 from tests.slam.scene import RIG
@@ -41,12 +43,13 @@ def test_what_cannot_be_judged_does_not_pass(residual, covariance):
 
 
 def test_whitened_residuals_have_unit_covariance():
-    S = covariances(50, np.random.default_rng(2))
-    W = whiteners(S)
+    S, stereo = covariances(50, np.random.default_rng(2)), RectifiedStereo.of(RIG)
+    problem = PoseProblem(stereo, np.ones((50, 3)), np.ones((50, 3)), S, np.eye(4), np.eye(6), 0.99)
+    W = problem.whiteners
     np.testing.assert_allclose(W @ S @ np.swapaxes(W, 1, 2), np.broadcast_to(np.eye(3), S.shape), atol=1e-9)
     S[7] *= -1
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        whiteners(S)
+        _ = replace(problem, noise=S).whiteners
 
 
 def test_a_left_pixel_alone_is_gated_with_two_degrees_of_freedom():

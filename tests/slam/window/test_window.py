@@ -61,7 +61,8 @@ def cost(w):
 
 def after(e, x):
     """The window after a step of the unknowns, and of the points that are eliminated to what is best without it."""
-    w, members = e.window, e.window.members
+    w = e.window
+    members = np.concatenate([w.prior.points, w.joining])
     points = w.points + (e.E @ (e.inverse @ e.gradient[:, :, None]))[:, :, 0]
     mine = 3 * len(members)
     points[members] = w.points[members] + (e.E[members] @ x[:mine].reshape(-1, 3, 1))[:, :, 0]
@@ -101,6 +102,26 @@ def test_covariances_are_those_of_dense_least_squares():
         J = np.zeros((3, len(P)))
         J[:, n - 6 : n], J[:, own] = by_pose[m], T[:3, :3].T
         np.testing.assert_allclose(local[m], J @ P @ J.T, rtol=1e-3, atol=1e-3 * np.trace(J @ P @ J.T))
+
+
+def test_covariances_that_are_asked_for_are_those_of_all():
+    """Unknown points that nobody asks for stand first; nothing else changes."""
+    w = solve(window(prior=RelativePrior.of_pose(truth()[0][0], START, np.zeros((6, 2))))).window
+    part = replace(w, rows=w.rows.select(w.rows.pose == 0), joining=np.arange(8))
+    prior = marginalised(part, [0], np.zeros(0, bool), np.ones((POINTS, 3, 2)))[0]
+    rest = w.rows.select(w.rows.pose > 0)
+    w = Window(STEREO, w.poses[1:], w.points, replace(rest, pose=rest.pose - 1), prior=prior)
+    asked = np.arange(POINTS) % 3 == 0
+    one, other = solve(w), solve(replace(w, asked=asked))
+    scale = np.sqrt(np.diag(one.pose_covariance))
+    np.testing.assert_allclose(one.window.points, other.window.points, rtol=1e-9)
+    np.testing.assert_allclose(other.pose_covariance / np.outer(scale, scale),
+                               one.pose_covariance / np.outer(scale, scale), atol=1e-6)  # fmt: skip
+    for mine, its in zip(one.point_covariances(-1), other.point_covariances(-1)):
+        np.testing.assert_allclose(its[asked], mine[asked], rtol=1e-5, atol=1e-9)
+        assert not its[~asked].any() and mine[~asked].any()
+    for mine, its in zip(one.by_rig(np.ones((len(rest), 3, 2))), other.by_rig(np.ones((len(rest), 3, 2)))):
+        np.testing.assert_allclose(its, mine, rtol=1e-5, atol=1e-9)
 
 
 def test_distances_of_rows_are_those_of_leaving_each_out():
@@ -183,11 +204,11 @@ def test_gradient_is_the_costs_derivative():
         np.array([(0, 1, 2), (1, 2, 3)]), np.full((2, 2), 0.1), np.zeros((2, 6)), np.full((2, 6), 1 / 9)))  # fmt: skip
     for _ in range(12):  # only the points move: what is left is the gradient of the poses
         e = linearised(w)
-        w = after(e, np.zeros(w.unknowns))
+        w = after(e, np.zeros(w.layout.unknowns))
     e = linearised(w)
-    numeric = np.empty(w.unknowns)
-    for i in range(w.unknowns):
-        x = np.zeros(w.unknowns)
+    numeric = np.empty(w.layout.unknowns)
+    for i in range(w.layout.unknowns):
+        x = np.zeros(w.layout.unknowns)
         x[i] = 1e-6
         numeric[i] = -(cost(after(e, x)) - cost(after(e, -x))) / 2e-6 / 2
     np.testing.assert_allclose(numeric, e.b, rtol=1e-3, atol=1e-3 * np.abs(e.b).max())
@@ -197,7 +218,7 @@ def test_a_solution_with_each_kind_of_knowledge_is_a_minimum():
     found, rng = solve(with_everything()), np.random.default_rng(1)
     e = linearised(found.window)
     for _ in range(20):
-        x = 1e-3 * rng.standard_normal(found.window.unknowns)
+        x = 1e-3 * rng.standard_normal(found.window.layout.unknowns)
         assert cost(after(e, x)) > found.cost - 1e-6
 
 
