@@ -25,8 +25,10 @@ SCATTERED = [case for case in RECORDED if case.name in ("KITTI 06", "raw 0001", 
 
 @pytest.mark.parametrize("case", [case for case in RECORDED if case not in SCATTERED], ids=lambda case: case.name)
 def test_errors_are_those_measured(slam_data, case):
-    """All frames are tracked with the newest OpenCV. With 4.10, which rectifies to other last digits, `ekf` misses three
-    of V1_01 and then finds the place again: in the largest turn 7 to 14 matches agree, and 8 are needed.
+    """All frames are tracked with the newest OpenCV.
+
+    With 4.10, which rectifies to other last digits, `ekf` misses three of V1_01 and then finds the place again: in the
+    largest turn 7 to 14 matches agree, and 8 are needed.
     """
     sequence = open_sequence(slam_data / case.path)
     frontend = create("surf", sequence.rig, **SystemConfig.for_kind(sequence.kind).frontend)
