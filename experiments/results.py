@@ -268,7 +268,7 @@ def page_head(name: str, quick: bool) -> str:
 def first_page() -> str:
     """A screen: the README's table of recordings; pictures; the pages."""
     text = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Results\n")[2].partition("\n## ")[0]
-    recordings = text.strip().partition("\n\nAll frames")[0].replace("](docs/", "](")
+    recordings = text.strip().partition("\n\n| on these drives")[0].replace("](docs/", "](")
     captions = {(e.name, name): said for e in EXPERIMENTS for name, said in (e.pictures or {}).items()}
     pictures = [f"![{captions.get(shown, shown[0])}](images/results/{'_'.join(shown)}.png)" for shown in SHOWN]
     pages = [f"- [{title}](results/{name}.md): {question}" for name, (title, question, _) in PAGES.items()]

@@ -18,16 +18,17 @@ from slam.sequences import open_sequence
 
 pytestmark = pytest.mark.slow
 
-#: Single runs differ by a factor of two on raw 0001, and of four in the library, without what recognises a place.
-SCATTERED = [case for case in RECORDED if case.name in ("raw 0001", "library")]
+#: Single runs differ by a factor of 1.7 on KITTI 06, of two on raw 0001, and of four in the library, without what
+#: recognises a place.
+SCATTERED = [case for case in RECORDED if case.name in ("KITTI 06", "raw 0001", "library")]
 
 
 @pytest.mark.parametrize("case", [case for case in RECORDED if case not in SCATTERED], ids=lambda case: case.name)
 def test_errors_are_those_measured(slam_data, case):
-    """Plain stereo odometry on OpenCV's ORB or SIFT has 0.36 and 0.20 m on KITTI 06.
+    """All frames are tracked with the newest OpenCV.
 
-    All frames are tracked with the newest OpenCV. With 4.10, which rectifies to other last digits, `ekf` misses three
-    of V1_01 and then finds the place again: in the largest turn 7 to 14 matches agree, and 8 are needed.
+    With 4.10, which rectifies to other last digits, `ekf` misses three of V1_01 and then finds the place again: in the
+    largest turn 7 to 14 matches agree, and 8 are needed.
     """
     sequence = open_sequence(slam_data / case.path)
     frontend = create("surf", sequence.rig, **SystemConfig.for_kind(sequence.kind).frontend)
@@ -41,7 +42,10 @@ def test_errors_are_those_measured(slam_data, case):
 
 @pytest.mark.parametrize("case", SCATTERED, ids=lambda case: case.name)
 def test_the_median_is_that_measured_where_single_runs_scatter(slam_data, case):
-    """Of three trials with all back ends: errors over the medians of their own back end."""
+    """Of three trials with all back ends: errors over the medians of their own back end.
+
+    Plain stereo odometry on OpenCV's ORB or SIFT has 0.36 and 0.20 m on KITTI 06.
+    """
     sequence, ratios = open_sequence(slam_data / case.path), []
     for trial in range(3):
         seen = perturbed(case, sequence, trial)
