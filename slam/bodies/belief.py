@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.bodies.config import MIN_POINTS
 from slam.data import BoolArray, IdArray, RecentPoses
-from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, transform
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
@@ -32,8 +32,6 @@ _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
 
 
 _FAR = 3.0  # so many times the median distance from the median point is no part of the body
-MIN_POINTS = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
-MAX_REJECTIONS = 3  #: so many running, and a point restarts
 _STEPS = 3  # numerics: of Gauss-Newton; the prior is weak where depth is known well
 
 

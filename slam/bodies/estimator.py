@@ -15,8 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.bodies.belief import (
-    MAX_REJECTIONS,
-    MIN_POINTS,
     BodyBelief,
     Points,
     Shape,
@@ -29,6 +27,7 @@ from slam.bodies.belief import (
     window,
     with_shape,
 )
+from slam.bodies.config import MIN_POINTS, RUN
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, Observations, RecentPoses
 from slam.geometry.arrays import isin
@@ -240,7 +239,7 @@ class BodyEstimator:
         failures, unseen, sights, ids = p.failures.copy(), p.unseen.copy(), p.sights.copy(), p.ids.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
         unseen[rows], sights[rows] = 0, sights[rows] + used
-        ids[failures >= MAX_REJECTIONS] = -1
+        ids[failures >= RUN] = -1
         w = solution.window
         return replace(
             b, poses=w.poses, covariance=solution.pose_covariance,

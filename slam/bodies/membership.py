@@ -7,7 +7,6 @@ it is a part of it; a young body that shows more of a thing than the older one t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,9 +14,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.bodies.belief import MAX_REJECTIONS
 from slam.bodies.bodies import Body, continued, in_body_axes, spread_of_place, with_extent
-from slam.bodies.config import ObjectsConfig
+from slam.bodies.config import RUN
 from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
 from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import inverses, squares, weighted_means
@@ -26,10 +24,11 @@ from slam.data import BoolArray
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
+MARGIN = 0.25  # how far from a body's extent its further features may lie, as a share of the extent's diagonal
+_MOST_POINTS = 80  # cost: members of a body
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
-_PART_EXPLAINED = 0.05  # share of χ² that the motion of a body leaves of what was found of it before
 _FREEDOM = 6.0  # fixed: of a body's pose in every frame
 PROBATION = 12  #: frames in which a body must have moved for certain, and is not told from another one
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join, and
@@ -42,12 +41,10 @@ _WORSE = -9.0  # a member for which the still world is better by more leaves
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
 _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
-_APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
-_LEAST_SPREAD = 1e-8  # numerics: variance that is added to that of a known pose [m²]
 _RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
 _LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
-_MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
+_MERGES = 2 * PROBATION  # frames in which a body turns out to be a part of another at once; later after so many
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
 
@@ -127,18 +124,18 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     Inside a body that stereo resolves no proof of motion is needed. Returns by how much χ² each body explains its seen
     members better than the still world (K,).
     """
-    gains, config = {}, frame.setup.config
+    gains: dict[int, Array] = {}
     bodies = {id: body for id, body in every.items() if body.measured}
     for body in bodies.values():
         _improve(body, tracks, frame.slot)
-        gains[body.id] = _expel(body, tracks, config)
+        gains[body.id] = _expel(body, tracks)
     if not bodies:
         return gains
     free = np.flatnonzero((tracks.body < 0) & tracks.found & ~tracks.still)
     free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
     for body in bodies.values():
-        near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
+        near = np.flatnonzero(_distances(body, tracks, free, MARGIN) < _NEAR)
         if not len(near):
             continue
         gain = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
@@ -165,7 +162,7 @@ def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[n
     return np.where(may, v.gain, -np.inf)
 
 
-def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
+def _expel(body: Body, tracks: Tracks) -> Array:
     """Remove members that do not fit the body, in place.
 
     Returns the gains of the seen ones that stay (K,), less what the body's poses, fitted to them, gain by chance.
@@ -175,17 +172,17 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     most_fit = v.fits[seen].sum() > _MOST * seen.sum()
     unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
-    wrong = stays | (tracks.misfit[mine] >= MAX_REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
+    wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((v.gain < _WORSE) | unfit))
     tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
     if wrong.any():
         remove_members(tracks, mine[wrong & ~seen], body)
         tracks.expelled[mine[wrong]] = True
         _release(tracks, mine[wrong & seen])
         mine = mine[~wrong]
-    if len(mine) > config.max_points:
+    if len(mine) > _MOST_POINTS:
         worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
         order = np.lexsort((worth, -tracks.unfound[mine]))
-        remove_members(tracks, mine[order[: len(mine) - config.max_points]], body)
+        remove_members(tracks, mine[order[: len(mine) - _MOST_POINTS]], body)
     stay = seen & ~wrong
     return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
 
@@ -197,9 +194,7 @@ def take_to(tracks: Tracks, rows: NDArray[np.intp], change: Array) -> None:
     tracks.local_information[rows] = R @ tracks.local_information[rows] @ R.T
 
 
-def tracks_on_bodies(
-    bodies: Mapping[int, Body], tracks: Tracks, margin: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of seen tracks on a proven body, members or inside its extent, and of those that may lie on any body."""
     seen, known = tracks.found, tracks.body >= 0
     on = np.zeros(len(tracks), bool)
@@ -210,7 +205,7 @@ def tracks_on_bodies(
     for body in bodies.values():
         if not body.measured:
             continue
-        close = free[_distances(body, tracks, free, margin) < _NEAR]
+        close = free[_distances(body, tracks, free, MARGIN) < _NEAR]
         near[close] = True
         inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
         if len(inside) and body.proven:
@@ -219,44 +214,11 @@ def tracks_on_bodies(
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
 
-def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
+def tracks_on(body: Body, tracks: Tracks) -> NDArray[np.intp]:
     """Rows of the seen tracks that belong to a body, or lie on or near it and belong to none."""
     free = np.flatnonzero(tracks.found & (tracks.body < 0))
-    near = free[_distances(body, tracks, free, margin) < _NEAR]
+    near = free[_distances(body, tracks, free, MARGIN) < _NEAR]
     return np.concatenate([np.flatnonzero(tracks.found & (tracks.body == body.id)), near])
-
-
-def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
-    """The body in or beside which most of these tracks lie and whose motion explains them; None for none.
-
-    In it as far as its pose is known; beside it, as far as `own`, a body of them alone, is long, as one rigid body's.
-    """
-    for body in bodies.values():
-        near = _distances(body, tracks, rows, _MERGED * (1.0 + own.across / body.across)) < _NEAR
-        if not body.measured or 2 * near.sum() <= len(rows) or _explained(body, tracks, rows) >= 2 * EXPLAINED:
-            continue
-        inside = 2 * (_distances(body, tracks, rows, _MERGED) < _NEAR).sum() > len(rows)
-        if body.seen <= PROBATION or (inside and not _moves_otherwise(body, own, tracks, rows)):
-            return body
-        if not inside and distinctness(own, rows, body, _members(tracks, body.id), tracks) < 1.0:
-            return body
-    return None
-
-
-def _moves_otherwise(body: Body, own: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
-    """Whether `own`, a body made of these tracks alone, leaves far less χ² than chance would make of the body's.
-
-    In every frame the tracks share the displacement by the error of the body's pose, of known covariance.
-    """
-    alone = float(squares(*in_body_axes(own, tracks, rows)[:2]).sum())
-    points, A, known = in_body_axes(body, tracks, rows)
-    y = weighted_means(points, A)
-    pull = times_vectors(A, points - y[:, None]).sum(axis=0)
-    pose = np.linalg.inv(spread_of_place(body, y.mean(axis=0)) + _LEAST_SPREAD * np.eye(3))
-    shared = (pull * np.linalg.solve(A.sum(axis=0) + pose, pull[..., None])[..., 0]).sum()
-    certain = float(squares(points, A).sum() - shared)
-    by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
-    return certain - alone > _APART * by_chance and certain > 2 * _APART * alone
 
 
 def _explained(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> float:
@@ -285,11 +247,6 @@ def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body 
         if off < least:
             best, least = body, off
     return best
-
-
-def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
-    """Whether the members `rows` of another body have moved with this one all the time: hardly any χ² is left."""
-    return len(rows) > 0 and _explained(whole, tracks, rows) < _PART_EXPLAINED
 
 
 def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
@@ -337,50 +294,50 @@ def _still(tracks: Tracks, rows: NDArray[np.intp], known: BoolArray) -> Array:
 
 
 def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
-    """Merge bodies that move as an older one does, in place: young ones at once, others only if that lasts.
+    """Make one of two bodies that have moved as one, in place, under the older id.
 
-    The parts of an articulated body move alike now and then.
+    Young bodies are merged at once; old ones, and parts of the other, only if that lasts: the parts of an articulated
+    body move alike now and then. What has clearly moved apart once is never one again.
     """
     for id in sorted(bodies, reverse=True):
-        body = bodies.get(id)  # it may have taken the place of another
-        if body is None or not body.measured:
+        body, mine, whole = bodies[id], _members(tracks, id), None
+        if not body.measured:
             continue
-        mine = _members(tracks, id)
-        whole = bodies.get(-1 if body.apart_from is None else body.apart_from)
-        if (
-            whole is not None and whole.measured and whole.id not in body.distinct
-            and distinctness(body, mine, whole, _members(tracks, whole.id), tracks) > _DISTINCT
-        ):  # fmt: skip
-            body = bodies[id] = replace(body, distinct=body.distinct | {whole.id})
-        older = {id: b for id, b in bodies.items() if id < body.id and id not in body.distinct}
-        whole = body_around(older, tracks, mine, body)
-        alike = body.alike + 1 if whole is not None else 0
-        body = bodies[id] = replace(body, alike=alike) if alike != body.alike else body
-        young = body.seen < _MERGES and (whole is None or whole.id != body.apart_from)
-        if whole is not None and (young or alike > _MERGES):
+        for other in [b for b in bodies.values() if b.id < id and b.measured and b.id not in body.distinct]:
+            apart = _apart(body, mine, other, _members(tracks, other.id), tracks)
+            if apart > _DISTINCT:
+                body = replace(body, distinct=body.distinct | {other.id})
+            elif apart < 1.0 and whole is None:
+                whole = other
+        body = bodies[id] = replace(body, alike=0 if whole is None else body.alike + 1)
+        if whole is None or not (body.alike > _MERGES or (body.seen < _MERGES and whole.id != body.apart_from)):
+            continue
+        theirs = _members(tracks, whole.id)
+        if len(theirs) >= len(mine):
             add_members(whole, tracks, mine, sure=True)
-            del bodies[id]
             tracks.give_up(np.flatnonzero(tracks.body == id))
-        elif whole is None and young:
-            _outgrow(bodies, body, list(older.values()), tracks)
+        else:
+            bodies[whole.id] = _in_place_of(whole, body, theirs, tracks)
+            tracks.body[tracks.body == id] = whole.id
+        del bodies[id]
 
 
-def _outgrow(bodies: dict[int, Body], body: Body, older: list[Body], tracks: Tracks) -> None:
-    """Let a young body replace older ones with the same motion of which fewer members are seen."""
-    for known in older:
-        mine, theirs = _members(tracks, body.id), _members(tracks, known.id)
-        larger = known.measured and known.id != body.apart_from and len(theirs) < len(mine)
-        near = math.dist(body.middle, known.middle) <= body.across + known.across
-        if not (larger and near and moves_with(body, tracks, theirs)):
-            continue
-        apart = distinctness(body, mine, known, theirs, tracks)
-        if apart > _DISTINCT:  # they are never one again
-            body = bodies[body.id] = replace(body, distinct=body.distinct | {known.id})
-        elif apart < 1.0:
-            bodies[known.id] = _in_place_of(known, body, theirs, tracks)
-            tracks.body[tracks.body == body.id] = known.id
-            del bodies[body.id]
-            return
+def _apart(body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks) -> float:
+    """How far a body is from being one with an older one, see `distinctness`: below 1 it is, from 1 on it may not be.
+
+    The one of which more is seen must explain the other, which lies in or beside it. A fresh body is no more than that.
+    """
+    part, larger = other.id == body.apart_from, len(theirs) >= len(mine)
+    whole, few, rows = (other, body, mine) if larger else (body, other, theirs)
+    near = _distances(whole, tracks, rows, _MERGED * (1.0 + few.across / whole.across)) < _NEAR
+    beside = 2 * near.sum() > len(rows)
+    explained = beside and _explained(whole, tracks, rows) < 2 * EXPLAINED
+    if explained and larger and not part and body.seen <= PROBATION:
+        return 0.0
+    if not (explained or part):
+        return 1.0
+    apart = distinctness(body, mine, other, theirs, tracks)
+    return apart if explained else max(apart, 1.0)
 
 
 def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks) -> Body:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slam.bodies.config import MIN_FRAMES, RUN
 from slam.bodies.fits import AGREES, EXPLAINED, MOVES, ConstantVelocity, constant_velocity
 from slam.bodies.frame import Frame
 from slam.data import BoolArray, IndexArray
@@ -57,7 +58,7 @@ class Region:
         is seen shares the error of the camera's pose, so that does not fall with the number of tracks.
         """
         share = self.agreeing > _SHARE * (self.agreeing + self.contradicting)
-        if len(self.rows) < MINIMAL_POINTS or self.frames < frame.setup.config.min_frames or not share:
+        if len(self.rows) < MINIMAL_POINTS or self.frames < MIN_FRAMES or not share:
             return False
         moved = self.state[:3] - self.start
         length = float(np.linalg.norm(moved))
@@ -97,7 +98,7 @@ def _moving_tracks(frame: Frame, tracks: Tracks) -> _Moving:
     """Free tracks whose depth is known better than to within a region."""
     s, c = frame.setup, frame.setup.config
     rows = np.flatnonzero(tracks.found & (tracks.body < 0) & ~tracks.still)
-    rows = rows[tracks.count(rows) >= c.min_frames - 1]
+    rows = rows[tracks.count(rows) >= MIN_FRAMES - 1]
     m = constant_velocity(tracks, rows, frame.times, c.max_speed)
     depth = (m.position - frame.eye) @ frame.T_world_left[:3, 2]
     radius = s.radius(depth)
@@ -121,7 +122,7 @@ def follow_regions(regions: list[Region], frame: Frame, tracks: Tracks) -> tuple
         mine &= t.unexplained(r.state[3:], r.covariance[3:, 3:]) <= AGREES
         free &= ~mine
         r = _supported(r, t, mine)
-        if r.unseen <= frame.setup.config.patience:
+        if r.unseen <= RUN:
             followed.append(r)
     followed += _new_regions(t, np.flatnonzero(free))
     moved = [r.has_moved(frame) for r in followed]

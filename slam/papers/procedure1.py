@@ -28,6 +28,7 @@ from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
 
+_ALIKE = 0.45, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # guard: of its numbers
 _STEP = 1e-5  # numerics: of the finite differences [m]
@@ -152,7 +153,7 @@ def motion_of_triples(current: Array, initial: Array, origin: Array) -> tuple[Ar
 
 def detect(
     features: StereoFeatures, matches: tuple[NDArray[np.intp], NDArray[np.intp]], points: Array,
-    database: ObjectDatabase, least_side: float, least_sine: float,
+    database: ObjectDatabase, least_side: float = 0.08, least_sine: float = 0.3,
 ) -> ObjectMotion:  # fmt: skip
     """The object's motion by Procedure 1, from `matches` of the database's rows and the features' (K,) (step c).
 
@@ -226,19 +227,18 @@ class Procedure1Detector(ObjectDetector):
 
         The object is reported where it was measured in this frame; the back end is not asked.
         """
-        c, d = self.config, self.database
+        d = self.database
         if d.descriptors.shape[1] != features.descriptors.shape[1]:
             raise ConfigurationError(
                 f"objects: the database has descriptors of {d.descriptors.shape[1]} dimensions, the front end's have "
                 f"{features.descriptors.shape[1]}"
             )
         free = np.flatnonzero(features.has_stereo)
-        limits = c.wide_d_match, c.wide_ratio
-        found = match_everywhere(d.descriptors, d.laplacian, features.select(free), *limits)
+        found = match_everywhere(d.descriptors, d.laplacian, features.select(free), *_ALIKE)
         known, rows = found.tracks, free[found.features]
         local = self.rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         points = transform(estimate.T_world_left, local)
-        self.motion = detect(features, (known, rows), points, d, c.least_side, c.least_sine)
+        self.motion = detect(features, (known, rows), points, d)
         self._rows = rows
         if not self.motion.reason:
             at = np.array([np.flatnonzero(rows == row)[0] for row in self.motion.triple])

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 import slam
-from slam.config import SystemConfig
+from slam.bodies import bodies
 from slam.data import StereoFeatures
 
 EVEN, GONE = 50, 100  # frames: the box moves from 60 on, and is covered from 100 on
 
 
 @pytest.fixture
-def moving_box():
+def moving_box(monkeypatch):
+    monkeypatch.setattr(bodies, "UNMEASURED_SHARE", 0.1)
     sequence = slam.open_sequence("synthetic:box?density=300")
-    config = SystemConfig.for_kind(sequence.kind, None).with_settings(["objects.unmeasured_share=0.1"])
-    system = slam.StereoSlam(sequence.rig, None, "ekf", config=config)
+    system = slam.StereoSlam(sequence.rig, None, "ekf", kind=sequence.kind)
 
     def step(k, covered=False):
         seen = sequence.simulate(k)
