@@ -69,10 +69,9 @@ class Way:
         return cls(places, stamps[seen], by_rig, camera)
 
     @property
-    def bar(self) -> float:
-        """−log10 of the chance that is asked for: what goes farther than the camera hardly slides with it."""
-        length = float(np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max())
-        return PROVEN if length > _FARTHER * self.of_camera else _SLIDES
+    def far(self) -> bool:
+        """Whether it is longer than that of the camera by far: what slides does not go so far."""
+        return float(np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max()) > _FARTHER * self.of_camera
 
 
 def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
@@ -81,13 +80,14 @@ def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, fa
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
     For a body that was followed `far`, for farther than it is wide, its way alone counts.
     """
-    says = _by_frames(way)
-    if len(moved.d) >= MIN_POINTS:
-        says = says if far else min(says, _by_members(moved, scene, way.by_rig))
+    says, turns, enough = _by_frames(way), 0.0, len(moved.d) >= MIN_POINTS
+    if enough and not far:
+        by_members, turns = _by_members(moved, scene, way.by_rig)
+        says = min(says, by_members)
+    if enough:
         evidence = max(0.0, evidence + says - _ALLOWANCE)
-    elif not far:
-        says = 0.0
-    return evidence, says >= way.bar
+    bar = PROVEN if way.far else max(PROVEN, _SLIDES - turns)  # what slides with the camera hardly turns
+    return evidence, (enough or far) and says >= bar
 
 
 def _evidence(chance: float) -> float:
@@ -95,8 +95,8 @@ def _evidence(chance: float) -> float:
     return -float(np.log10(max(chance, 10.0**-_MOST)))
 
 
-def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> float:
-    """What the members' common motion says: −log10 of the chance of so large a one if they stand still."""
+def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> tuple[float, float]:
+    """−log10 of the chance of so large a common motion of the members, and of such a turn, if they stand still."""
     J, dof = -moved.lag[:, None, None] * points_by_pose(moved.points), 3 * len(moved.d)
     JW = np.swapaxes(J, 1, 2) @ moved.W
     P = np.linalg.inv((JW @ J).sum(axis=0) + np.diag(PRIOR))
@@ -106,7 +106,9 @@ def _by_members(moved: Displacements, scene: Scene, by_rig: Array) -> float:
     scatter = median(np.einsum("ni,nij,nj->n", rest, moved.W, rest)) / MEDIAN * dof / (dof - 6)
     covariance = max(scatter, 1.0) * P + scene.covariance
     covariance[3:, 3:] += np.outer(by_rig, by_rig)
-    return _evidence(float(chdtrc(6, motion @ np.linalg.solve(covariance, motion))))
+    turn = motion[:3] @ np.linalg.solve(covariance[:3, :3], motion[:3])
+    motion_test = motion @ np.linalg.solve(covariance, motion)
+    return _evidence(float(chdtrc(6, motion_test))), _evidence(float(chdtrc(3, turn)))
 
 
 def _by_frames(way: Way) -> float:

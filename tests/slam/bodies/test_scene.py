@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from slam.bodies.bodies import in_body_axes
-from slam.bodies.finder import _SIZES, Displacements, _full_windows, classify_scene, displacements, tail
+from slam.bodies.finder import Displacements, classify_scene, moved_in, tail
 from slam.geometry.se3 import hat, transform
 from tests.slam.bodies.test_membership import SIGMA, SLOT, TIMES, WINDOW, body_along, path, seen_from, table
 
@@ -104,26 +106,6 @@ def test_three_bodies_with_a_third_of_the_tracks_do_not_hide_each_other():
     assert sorted(int(group.members.min()) // 24 for group in found.groups) == [0, 1, 2]
 
 
-def test_windows_hold_all_tracks_of_their_cells():
-    """Against a dictionary of cells, for every size and offset; tracks ascend, and so do the cells."""
-    rng = np.random.default_rng(5)
-    place, sizes, support = rng.uniform(-0.3, 0.3, (120, 3)), _SIZES, 4
-    starts, tracks, centres, widths = _full_windows(place)
-    expected = []
-    for size in sizes:
-        for offset in np.ndindex(2, 2, 2):
-            cells: dict[tuple, list[int]] = {}
-            for n, cell in enumerate(np.floor(place / size + 0.5 * np.array(offset)).astype(int).tolist()):
-                cells.setdefault(tuple(cell), []).append(n)
-            full = sorted(cell for cell, inside in cells.items() if len(inside) >= support)
-            expected += [(size * (np.array(cell) + 0.5 - 0.5 * np.array(offset)), size, cells[cell]) for cell in full]
-    assert len(expected) == len(centres) > 20
-    for m, (centre, width, inside) in enumerate(expected):
-        assert tracks[starts[m] : starts[m + 1]].tolist() == inside
-        np.testing.assert_allclose(centres[m], centre, atol=1e-12)
-        np.testing.assert_allclose(widths[m], width)
-
-
 @pytest.mark.parametrize(("speed", "count"), [(0.15, 1), (0.0, 0)])
 def test_a_drawer_is_found_only_while_it_is_pulled_out(speed: float, count: int) -> None:
     rng, velocity = np.random.default_rng(3), np.array([0.0, 0.5, 0.0, 0.2, 0.0, 0.0])  # [rad/s], [m/s]
@@ -133,8 +115,9 @@ def test_a_drawer_is_found_only_while_it_is_pulled_out(speed: float, count: int)
     pulled = np.stack([transform(T, drawer - speed * t * np.array([0, 0, 1.0])) for T, t in zip(poses, TIMES)], axis=1)
     pulled += SIGMA * rng.standard_normal(pulled.shape)
     tracks = table(np.concatenate([seen_from(poses, chest, 1), pulled]))
-    inside = in_body_axes(body_along(poses, rows, tracks), tracks, rows)
-    moved = displacements(tracks, rows, (SLOT - np.arange(WINDOW)) % WINDOW, np.zeros((WINDOW, 3)), 0.0, inside)
+    ages, none = (SLOT - np.arange(WINDOW)) % WINDOW, np.tile(np.eye(4), (WINDOW, 1, 1))
+    frame: Any = SimpleNamespace(ages=ages, poses=none, eye=np.zeros(3), setup=SimpleNamespace(slide=0.0))
+    moved = moved_in(body_along(poses, rows, tracks), tracks, rows, frame)
     place = np.column_stack([tracks.position[rows, :2], np.log(tracks.position[rows, 2])])
     groups = classify_scene(moved, place, 20.0).groups
     assert [group.members.tolist() for group in groups] == [list(range(24, 30))][:count]
