@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.bodies.config import MIN_POINTS
 from slam.data import BoolArray, IdArray, RecentPoses
@@ -100,23 +99,6 @@ def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Sha
         gradient = (weight @ (z - predicted)[:, :, None])[:, :, 0] + (shape.mean - h) @ prior
         h = h + (covariance @ gradient[:, :, None])[:, :, 0]
     return h, covariance
-
-
-def points_to_replace(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:
-    """Which points (p,) of a body make room for `wanted` ones, so that it has `most` at most.
-
-    Those `unseen` for more frames than their `sights`. Where hardly any are in view, as when a body has turned round,
-    others leave, too.
-    """
-    age = unseen / sights
-    order = np.argsort(-age, kind="stable")
-    in_view = int((unseen == 0).sum())
-    lacking = min(wanted, most // 2 - in_view) - (most - len(age))
-    surplus = len(age) + wanted - most
-    leaving = order[: max(0, min(surplus, max(int((age > 1).sum()), lacking), len(age) - in_view))]
-    gone = np.zeros(len(age), bool)
-    gone[leaving] = True
-    return gone
 
 
 def when_measured(probability: float, gain: float) -> float:

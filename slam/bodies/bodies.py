@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.bodies.belief import EVEN, BodyBelief, when_measured, when_missed
+from slam.bodies.config import MIN_FRAMES
 from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, so3_exp, transform
@@ -20,7 +21,6 @@ from slam.tracks.table import Tracks
 
 _UNMEASURED = 1.0  # [s] for which a body is still reported after its last measurement
 UNMEASURED_SHARE = 0.05  #: most frames in which it is so, as a share of those in which it was measured
-_YOUNG = 4  # frames in which a body moves as it did when it was found
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
@@ -124,7 +124,7 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
     return body.placed(
         estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
         velocity_covariance=P, belief=belief, moved=body.moved or belief.moved,
-        moving=body.seen <= _YOUNG or (certain and speed > min_speed), **changes,
+        moving=body.seen <= MIN_FRAMES or (certain and speed > min_speed), **changes,
     )  # fmt: skip
 
 

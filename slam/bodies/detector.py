@@ -38,8 +38,6 @@ from slam.tracks.table import Tracks
 
 _NONE: IndexArray = np.zeros(0, np.intp)
 _FORGOTTEN = 8.0  # [s] after which an unseen body is forgotten
-_PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
-_ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
 
 
 class ObjectDetector:
@@ -174,9 +172,7 @@ class MovingObjectDetector(ObjectDetector):
         """Predict all bodies; forget those that were not seen for long."""
         now, dt = frame.features.stamp, frame.dt
         for body in list(self.bodies.values()):
-            fresh = (body.seen + 0.5) * dt < _ESTABLISHED  # to the nearest frame
-            too_long = now - body.seen_at > _FORGOTTEN
-            if too_long or (fresh and body.missed >= _PATIENCE + body.seen):
+            if now - body.seen_at > _FORGOTTEN or body.missed > RUN * body.seen:
                 del self.bodies[body.id]
                 tracks.give_up(np.flatnonzero(tracks.body == body.id))
             else:
@@ -259,7 +255,7 @@ class MovingObjectDetector(ObjectDetector):
             certain = body.certain + counts
             body = replace(body, evidence=evidence, certain=certain, proven=body.proven or certain >= PROOF)
             self.bodies[body.id] = body
-            if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
+            if evidence == 0.0 if body.proven else body.seen >= WINDOW:
                 self._drop(tracks, body)
 
     def _drop(self, tracks: Tracks, body: Body) -> None:

@@ -38,7 +38,7 @@ from slam.bodies.config import MIN_FRAMES, MIN_POINTS, RUN, WINDOW
 from slam.bodies.fits import constant_velocity, fit_velocities, measure, times_vectors
 from slam.bodies.frame import Frame, Setup
 from slam.bodies.regions import Region
-from slam.bodies.track_kernels import displaced, fit_fixed_points, inverses
+from slam.bodies.track_kernels import PART, displaced, fit_fixed_points, inverses
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
@@ -46,7 +46,6 @@ from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
-LAG = 4  #: frames between the older and the recent measurements, about
 _RECENT = 5  # frames that are recent, at most; of short tracks the later half
 FARTHEST = 4.0  #: a track's depth must be so many times its deviation
 _TAIL = 3.0  # tracks; see `limit`
@@ -57,7 +56,6 @@ _CELLS = 2**12  # numerics: more than there are windows along an axis
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 _PRECISE = 0.25  # times the noise of a pixel: what it is from frame to frame at least, without what lasts; at 0.5 a box
 # that starts carries the camera along
-_RIDGE = 1e-6  # numerics: share of the trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +204,7 @@ def find_groups(
     moved, each with the id of the body that it is a part of, or None.
     """
     c = frame.setup.config
-    least = LAG * frame.dt * c.min_speed
+    least = MIN_FRAMES * frame.dt * c.min_speed
     rows, scene = _classified(frame, tracks, np.flatnonzero(tracks.found & (tracks.body < 0)))
     groups = [rows[g.members][~tracks.still[rows[g.members]]] for g in scene.groups]
     moving = [members for g, members in zip(scene.groups, groups) if g.moves(c.moves, least)]
@@ -326,8 +324,8 @@ def parting(
     far = np.linalg.norm(rays, axis=1)
     slide = setup.slide * np.linalg.norm(np.cross(rays, T_world_left[:3, 3] - share @ eyes), axis=1)
     across = np.eye(3) - rays[:, :, None] * rays[:, None] / far[:, None, None] ** 2
-    noise = _PRECISE**2 * (inverses(A[k], _RIDGE, 0.0) + P[at[k]]) + slide[:, None, None] * across
-    moved = Displacements(rays, (points - position[at])[k], inverses(noise, _RIDGE, 0.0), age)
+    noise = _PRECISE**2 * (inverses(A[k], PART, 0.0) + P[at[k]]) + slide[:, None, None] * across
+    moved = Displacements(rays, (points - position[at])[k], inverses(noise, PART, 0.0), age)
     view = places_in_view(local)
     scene = classify_scene(moved, view[k], setup.config.suspect)
     if now < WINDOW:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.bodies.bodies import Body, continued, in_body_axes, spread_of_place, with_extent
-from slam.bodies.config import RUN
+from slam.bodies.config import RUN, WINDOW
 from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import inverses, squares, weighted_means
+from slam.bodies.track_kernels import LEAST, RIDGE, inverses, squares, weighted_means
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
@@ -29,8 +29,6 @@ _MOST_POINTS = 80  # cost: members of a body
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
-_FREEDOM = 6.0  # fixed: of a body's pose in every frame
-PROBATION = 12  #: frames in which a body must have moved for certain, and is not told from another one
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join, and
 _INSIDE = 4.0  # up to which it counts as inside, the extent being widened by
 _EDGE = 0.1  # as a share of its diagonal: the outermost points lie beyond the percentiles
@@ -40,11 +38,7 @@ _BETTER_INSIDE = -4.0  # where it lies inside
 _WORSE = -9.0  # a member for which the still world is better by more leaves
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
-_RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
-_RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
-_LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
-_MERGES = 2 * PROBATION  # frames in which a body turns out to be a part of another at once; later after so many
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
 
@@ -184,14 +178,7 @@ def _expel(body: Body, tracks: Tracks) -> Array:
         order = np.lexsort((worth, -tracks.unfound[mine]))
         remove_members(tracks, mine[order[: len(mine) - _MOST_POINTS]], body)
     stay = seen & ~wrong
-    return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
-
-
-def take_to(tracks: Tracks, rows: NDArray[np.intp], change: Array) -> None:
-    """Take the points of members to another frame of their body, by `change` (4, 4), in place."""
-    R = change[:3, :3]
-    tracks.local[rows] = transform(change, tracks.local[rows])
-    tracks.local_information[rows] = R @ tracks.local_information[rows] @ R.T
+    return v.gain[stay] - 6.0 * float(body.known.sum()) / max(int(stay.sum()), 1)
 
 
 def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -224,7 +211,7 @@ def tracks_on(body: Body, tracks: Tracks) -> NDArray[np.intp]:
 def _explained(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> float:
     """Which share of the χ² of tracks that stand still the motion of a body leaves."""
     points, A, known = in_body_axes(body, tracks, rows)
-    return float(squares(points, A).sum()) / max(float(_still(tracks, rows, known).sum()), _LEAST)
+    return float(squares(points, A).sum()) / max(float(_still(tracks, rows, known).sum()), LEAST)
 
 
 def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body | None:
@@ -232,7 +219,7 @@ def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body 
 
     The middle of what is seen may be off the body's by half its size, and no body is faster than `max_speed` [m/s].
     """
-    best, least = None, _RETURNED
+    best, least = None, chi_square_limit(6, 0.99)  # of place and velocity
     for body in bodies.values():
         if body.measured or not body.proven:
             continue
@@ -273,7 +260,7 @@ def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float
     wider = margin * body.across
     local = transform(inverse(body.T), tracks.position[rows])
     away = (local - np.clip(local, body.lower - wider, body.upper + wider)) @ body.T[:3, :3].T
-    P = inverses(tracks.covariance[rows], _RIDGE, _LEAST)
+    P = inverses(tracks.covariance[rows], RIDGE, LEAST)
     return np.asarray((away * times_vectors(P, away)).sum(axis=1))
 
 
@@ -285,7 +272,7 @@ def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     turned = R.T @ t.A[mine, slot] @ R
     total = t.local_information[mine] + turned
     t.local_information[mine] = total
-    t.local[mine] += times_vectors(inverses(total, _RIDGE, 0.0), times_vectors(turned, gap))
+    t.local[mine] += times_vectors(inverses(total, RIDGE, 0.0), times_vectors(turned, gap))
 
 
 def _still(tracks: Tracks, rows: NDArray[np.intp], known: BoolArray) -> Array:
@@ -310,7 +297,7 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
             elif apart < 1.0 and whole is None:
                 whole = other
         body = bodies[id] = replace(body, alike=0 if whole is None else body.alike + 1)
-        if whole is None or not (body.alike > _MERGES or (body.seen < _MERGES and whole.id != body.apart_from)):
+        if whole is None or not (body.alike > 2 * WINDOW or (body.seen < 2 * WINDOW and whole.id != body.apart_from)):
             continue
         theirs = _members(tracks, whole.id)
         if len(theirs) >= len(mine):
@@ -332,7 +319,7 @@ def _apart(body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.i
     near = _distances(whole, tracks, rows, _MERGED * (1.0 + few.across / whole.across)) < _NEAR
     beside = 2 * near.sum() > len(rows)
     explained = beside and _explained(whole, tracks, rows) < 2 * EXPLAINED
-    if explained and larger and not part and body.seen <= PROBATION:
+    if explained and larger and not part and body.seen <= WINDOW:
         return 0.0
     if not (explained or part):
         return 1.0
@@ -344,8 +331,10 @@ def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks
     """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
     tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.found))
     grown = continued(body, known)
-    own = np.flatnonzero(tracks.body == body.id)
-    take_to(tracks, own, inverse(grown.T) @ body.T)
+    own, change = tracks.body == body.id, inverse(grown.T) @ body.T
+    R = change[:3, :3]
+    tracks.local[own] = transform(change, tracks.local[own])
+    tracks.local_information[own] = R @ tracks.local_information[own] @ R.T
     add_members(grown, tracks, mine, sure=True)
     return grown
 

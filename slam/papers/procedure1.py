@@ -9,6 +9,7 @@ says "the image correspondence A′, B′, C′", meant are their 3D positions, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -165,16 +166,14 @@ def detect(
         return ObjectMotion.refused(f"{len(rows)} features of the object recognised, 3 are needed")
     order = np.argsort(-features.response[rows], kind="stable")[:_CANDIDATES]
     reason = ""
-    for k in range(2, len(order)):  # triples in the order of their weakest feature
-        for j in range(1, k):
-            for i in range(j):
-                three = order[[i, j, k]]
-                why = why_degenerate(points[three], least_side, least_sine)
-                why = why or why_degenerate(database.points[known[three]], least_side, least_sine)
-                if not why:
-                    R, AA = motion_of_triples(points[three], database.points[known[three]], database.origin)
-                    return ObjectMotion("", R, angles(R), AA, rows[three], known[three])
-                reason = reason or why
+    for triple in sorted(combinations(range(len(order)), 3), key=lambda three: three[::-1]):  # by their weakest feature
+        three = order[list(triple)]
+        current, initial = points[three], database.points[known[three]]
+        why = why_degenerate(current, least_side, least_sine) or why_degenerate(initial, least_side, least_sine)
+        if not why:
+            R, AA = motion_of_triples(current, initial, database.origin)
+            return ObjectMotion("", R, angles(R), AA, rows[three], known[three])
+        reason = reason or why
     return ObjectMotion.refused(reason)
 
 
