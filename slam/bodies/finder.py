@@ -266,7 +266,7 @@ def moving_group(frame: Frame, tracks: Tracks, members: IndexArray) -> MovingGro
         group = _with_common_twist(frame, tracks, members)
         if not frame.resolves(group.centre):
             return None
-        moves: BoolArray = membership.membership_test(group.body(0, frame, tracks), tracks, members).gain > 0
+        moves: BoolArray = membership.membership_test(group.body(0, frame, tracks), tracks, members)[0] > 0
         if moves.all():
             break
         members = members[moves]  # what lies among them and rather stands still slows them down

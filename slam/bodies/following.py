@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from slam.bodies.belief import BodyBelief
@@ -127,7 +126,7 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     mine = members[tracks.found[members]]
     rows = tracks.row[mine]
 
-    def estimated(mine: NDArray[np.intp], rows: NDArray[np.intp], T: Array | None = None) -> BodyBelief | None:
+    def estimated(mine: IndexArray, rows: IndexArray, T: Array | None = None) -> BodyBelief | None:
         return estimator.updated(body.belief, body.id, observed(body, tracks, mine, rows, features, T), frame.cameras)
 
     def agreeing(belief: BodyBelief | None) -> int:
@@ -165,7 +164,7 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
 
 
 def observed(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], features: StereoFeatures,
+    body: Body, tracks: Tracks, mine: IndexArray, rows: IndexArray, features: StereoFeatures,
     T: Array | None = None,
 ) -> ObjectObservations:  # fmt: skip
     """A body's tracks (K,) as the features of these rows, with a guess of its pose (4, 4) where there is one."""
@@ -192,7 +191,7 @@ def _is_expected(body: Body) -> bool:
 
 
 def _fit(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], frame: Frame
+    body: Body, tracks: Tracks, mine: IndexArray, rows: IndexArray, frame: Frame
 ) -> tuple[Array, BoolArray] | None:
     """Pose T_body_left, and which tracks agree with it as the features of these rows."""
     if len(mine) < MIN_POINTS:
@@ -205,9 +204,7 @@ def _fit(
     return None if stereo.sum() < MIN_POINTS else (fit.T_world_left, fit.inliers)
 
 
-def _by_descriptors(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], frame: Frame
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _by_descriptors(body: Body, tracks: Tracks, mine: IndexArray, frame: Frame) -> tuple[IndexArray, IndexArray]:
     """Members matched by descriptor, and the features' rows, no farther off than the body can have gone.
 
     Features of free tracks may be matched, too: such tracks may have started on the body's points.

@@ -8,11 +8,10 @@ it is a part of it; a young body that shows more of a thing than the older one t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.bodies.bodies import Body, continued, in_body_axes, spread_of_place, with_extent
 from slam.bodies.config import RUN, WINDOW
@@ -20,7 +19,7 @@ from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
 from slam.bodies.frame import Frame
 from slam.bodies.track_kernels import LEAST, RIDGE, inverses, squares, weighted_means
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
-from slam.data import BoolArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
@@ -42,23 +41,17 @@ _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
 
-@dataclass(frozen=True, eq=False)
-class MembershipTest:
-    """How well tracks fit a body, a row each."""
+def membership_test(body: Body, tracks: Tracks, rows: IndexArray) -> tuple[Array, BoolArray, IndexArray]:
+    """Compare the fit of tracks (N,) to a body with that to the still world, over the window.
 
-    gain: Array  # by how much χ² the body explains them better than the still world (N,)
-    fits: BoolArray  # whether the body explains them (N,)
-    count: NDArray[np.int64]  # number of frames that say so (N,)
-
-
-def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> MembershipTest:
-    """Compare the fit of tracks to a body with that to the still world, over the window."""
+    By how much χ² the body explains them better, whether it explains them at all, and the frames that say so (N,) each.
+    """
     points, A, known = in_body_axes(body, tracks, rows)
     dof = np.where(known, tracks.dof[rows], 0)
     fixed, still, count = squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
     limit = _limits(3 * dof.shape[1])[np.maximum(dof.sum(axis=1) - 3, 1)]
     fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
-    return MembershipTest(still - fixed, fits, count)
+    return still - fixed, fits, count
 
 
 @cache
@@ -67,14 +60,14 @@ def _limits(most: int) -> Array:
     return chi_square_limits(np.arange(most + 1), 0.99)
 
 
-def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Body:
+def fitted(body: Body, tracks: Tracks, rows: IndexArray, slot: int) -> Body:
     """A new body with its poses over the window, which were those of a constant velocity, fitted to tracks."""
     body = _with_poses_fitted(replace(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
     points, A, _ = in_body_axes(body, tracks, rows)
     return with_extent(replace(body, T=body.history[slot]), weighted_means(points, A))
 
 
-def _with_poses_fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
+def _with_poses_fitted(body: Body, tracks: Tracks, rows: IndexArray) -> Body:
     """A body with its poses over the window fitted to what tracks measured."""
     for _ in range(_ROUNDS):
         points, A, _ = in_body_axes(body, tracks, rows)
@@ -87,7 +80,7 @@ def _with_poses_fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Bo
     return body
 
 
-def add_members(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False) -> None:
+def add_members(body: Body, tracks: Tracks, rows: IndexArray, sure: bool = False) -> None:
     """Make tracks members of a body, in place; their points in it are what they measured over the window."""
     if not len(rows):
         return
@@ -97,7 +90,7 @@ def add_members(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool =
     tracks.sure[rows] = sure
 
 
-def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
+def remove_members(tracks: Tracks, rows: IndexArray, body: Body) -> None:
     """Make members free tracks without measurements, in place."""
     if not len(rows):
         return
@@ -106,7 +99,7 @@ def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
     tracks.unfound[rows] = 1
 
 
-def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
+def _release(tracks: Tracks, rows: IndexArray) -> None:
     """Make seen members free tracks that keep their measurements, in place."""
     tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
     fit_positions(tracks, rows)
@@ -143,17 +136,13 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     return gains
 
 
-def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[np.intp]) -> Array:
+def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: IndexArray) -> Array:
     """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it."""
     inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
     proof = tracks.expelled[rows] | (not resolved)
-    v = membership_test(body, tracks, rows)
-    may = (
-        v.fits
-        & (v.count >= np.where(proof, _ENOUGH, 2))
-        & (v.gain > np.where(inside & ~proof, _BETTER_INSIDE, _BETTER))
-    )
-    return np.where(may, v.gain, -np.inf)
+    gain, fits, count = membership_test(body, tracks, rows)
+    better = gain > np.where(inside & ~proof, _BETTER_INSIDE, _BETTER)
+    return np.where(better & fits & (count >= np.where(proof, _ENOUGH, 2)), gain, -np.inf)
 
 
 def _expel(body: Body, tracks: Tracks) -> Array:
@@ -162,12 +151,12 @@ def _expel(body: Body, tracks: Tracks) -> Array:
     Returns the gains of the seen ones that stay (K,), less what the body's poses, fitted to them, gain by chance.
     """
     mine = np.flatnonzero(tracks.body == body.id)
-    v, seen = membership_test(body, tracks, mine), tracks.found[mine]
-    most_fit = v.fits[seen].sum() > _MOST * seen.sum()
-    unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
+    (gain, fits, count), seen = membership_test(body, tracks, mine), tracks.found[mine]
+    most_fit = fits[seen].sum() > _MOST * seen.sum()
+    unfit = ~fits & (count >= _ENOUGH) & most_fit
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
-    wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((v.gain < _WORSE) | unfit))
-    tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
+    wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((gain < _WORSE) | unfit))
+    tracks.sure[mine] |= fits & (gain > _BETTER)
     if wrong.any():
         remove_members(tracks, mine[wrong & ~seen], body)
         tracks.expelled[mine[wrong]] = True
@@ -178,10 +167,10 @@ def _expel(body: Body, tracks: Tracks) -> Array:
         order = np.lexsort((worth, -tracks.unfound[mine]))
         remove_members(tracks, mine[order[: len(mine) - _MOST_POINTS]], body)
     stay = seen & ~wrong
-    return v.gain[stay] - 6.0 * float(body.known.sum()) / max(int(stay.sum()), 1)
+    return gain[stay] - 6.0 * float(body.known.sum()) / max(int(stay.sum()), 1)
 
 
-def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[IndexArray, IndexArray]:
     """Rows of seen tracks on a proven body, members or inside its extent, and of those that may lie on any body."""
     seen, known = tracks.found, tracks.body >= 0
     on = np.zeros(len(tracks), bool)
@@ -197,18 +186,18 @@ def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[NDArra
         inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
         if len(inside) and body.proven:
             asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
-            on[inside[membership_test(body, tracks, inside).gain > asked]] = True
+            on[inside[membership_test(body, tracks, inside)[0] > asked]] = True
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
 
-def tracks_on(body: Body, tracks: Tracks) -> NDArray[np.intp]:
+def tracks_on(body: Body, tracks: Tracks) -> IndexArray:
     """Rows of the seen tracks that belong to a body, or lie on or near it and belong to none."""
     free = np.flatnonzero(tracks.found & (tracks.body < 0))
     near = free[_distances(body, tracks, free, MARGIN) < _NEAR]
     return np.concatenate([np.flatnonzero(tracks.found & (tracks.body == body.id)), near])
 
 
-def _explained(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> float:
+def _explained(body: Body, tracks: Tracks, rows: IndexArray) -> float:
     """Which share of the χ² of tracks that stand still the motion of a body leaves."""
     points, A, known = in_body_axes(body, tracks, rows)
     return float(squares(points, A).sum()) / max(float(_still(tracks, rows, known).sum()), LEAST)
@@ -236,7 +225,7 @@ def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body 
     return best
 
 
-def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
+def distinctness(one: Body, ones: IndexArray, other: Body, others: IndexArray, tracks: Tracks) -> float:
     """How far tracks of two bodies are from having moved like one rigid body; from 1 on they have not.
 
     The increase of χ² if all share the poses of one, relative to the larger of its 99 % limit and that of motions that
@@ -245,7 +234,7 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     both = one.known & other.known
     one, other = replace(one, known=both), replace(other, known=both)
 
-    def left(body: Body, rows: NDArray[np.intp]) -> float:
+    def left(body: Body, rows: IndexArray) -> float:
         return float(squares(*in_body_axes(_with_poses_fitted(body, tracks, rows), tracks, rows)[:2]).sum())
 
     every = np.concatenate([ones, others])
@@ -255,7 +244,7 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
 
 
-def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float) -> Array:
+def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> Array:
     """Squared distances (N,) of tracks from a body's extent, widened by a share `margin`, in their own noise."""
     wider = margin * body.across
     local = transform(inverse(body.T), tracks.position[rows])
@@ -275,7 +264,7 @@ def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     t.local[mine] += times_vectors(inverses(total, RIDGE, 0.0), times_vectors(turned, gap))
 
 
-def _still(tracks: Tracks, rows: NDArray[np.intp], known: BoolArray) -> Array:
+def _still(tracks: Tracks, rows: IndexArray, known: BoolArray) -> Array:
     """χ² (N,) of "one fixed point in the world" in the slots of tracks that are `known` (N, W)."""
     return squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))
 
@@ -309,7 +298,7 @@ def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
         del bodies[id]
 
 
-def _apart(body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.intp], tracks: Tracks) -> float:
+def _apart(body: Body, mine: IndexArray, other: Body, theirs: IndexArray, tracks: Tracks) -> float:
     """How far a body is from being one with an older one, see `distinctness`: below 1 it is, from 1 on it may not be.
 
     The one of which more is seen must explain the other, which lies in or beside it. A fresh body is no more than that.
@@ -327,7 +316,7 @@ def _apart(body: Body, mine: NDArray[np.intp], other: Body, theirs: NDArray[np.i
     return apart if explained else max(apart, 1.0)
 
 
-def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks) -> Body:
+def _in_place_of(known: Body, body: Body, mine: IndexArray, tracks: Tracks) -> Body:
     """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
     tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.found))
     grown = continued(body, known)
@@ -339,6 +328,6 @@ def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks
     return grown
 
 
-def _members(tracks: Tracks, id: int) -> NDArray[np.intp]:
+def _members(tracks: Tracks, id: int) -> IndexArray:
     """Rows of a body's seen members."""
     return np.flatnonzero((tracks.body == id) & tracks.found)
