@@ -206,21 +206,23 @@ def _explained(body: Body, tracks: Tracks, rows: IndexArray) -> float:
 def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body | None:
     """The body out of view that a new one is, by position and velocity, perhaps seen from another side; else None.
 
-    The middle of what is seen may be off the body's by half its size, and no body is faster than `max_speed` [m/s].
+    The middle of what is seen may be off the body's by half its size, and no body is faster than `max_speed` [m/s]. A
+    body of its own may be anywhere within that, with any velocity: the known one must explain the new one better.
     """
-    best, least = None, chi_square_limit(6, 0.99)  # of place and velocity
+    best, least = None, chi_square_limit(6, 0.99)
     for body in bodies.values():
         if body.measured or not body.proven:
             continue
-        gap, size = new.middle - body.middle, 0.5 * (body.across + new.across)
-        if np.linalg.norm(gap) > size + max_speed * (new.seen_at - body.seen_at):
-            continue
+        gap = new.middle - body.middle
+        reach = 0.5 * (body.across + new.across) + max_speed * (new.seen_at - body.seen_at)
         R, spread = body.T[:3, :3], spread_of_place(body, 0.5 * (body.lower + body.upper))
         place = R @ spread @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
         change = new.velocity[3:] - body.velocity[3:]
         velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
         off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))
-        if off < least:
+        anywhere = 2.0 * np.log((4.0 / 3.0 * np.pi) ** 2 * (reach * max_speed) ** 3)  # as −2 log of its density
+        known = off + float(np.linalg.slogdet(2 * np.pi * place)[1] + np.linalg.slogdet(2 * np.pi * velocity)[1])
+        if np.linalg.norm(gap) <= reach and off < least and known < anywhere:
             best, least = body, off
     return best
 
