@@ -11,7 +11,7 @@ frames agree, less that of the rest of the scene, is known to within
 Members also share errors of which nothing is known: that of a junction of two edges at different depths, for instance,
 which slides along both as the camera moves, with all features around it. Therefore the body's places in the frames of
 the window, or those of its ends, must lie along a way better than they scatter about it (an F test): such a junction
-jumps, and a body goes on.
+jumps, and a body goes on. Nor does it turn: how surely the members turn, as a whole, counts as much as the way does.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, fa
         says = min(says, by_members)
     if enough:
         evidence = max(0.0, evidence + says - _ALLOWANCE)
-    bar = PROVEN if way.far else max(PROVEN, _SLIDES - turns)  # what slides with the camera hardly turns
-    return evidence, (enough or far) and says >= bar
+    bar = PROVEN if way.far else _SLIDES
+    return evidence, (enough or far) and says >= max(0.5 * PROVEN, bar - turns)
 
 
 def _evidence(chance: float) -> float:
