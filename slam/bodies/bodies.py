@@ -141,7 +141,8 @@ def continued(body: Body, known: Body) -> Body:
     return replace(
         body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
-        proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
+        proven=known.proven, moved=known.moved, existence=known.existence, evidence=known.evidence, age=known.age,
+        seen=body.seen + known.seen,
         measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
     )  # fmt: skip
 
