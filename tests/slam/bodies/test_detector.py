@@ -39,7 +39,7 @@ def test_the_box_is_found_once_and_followed(box_run):
     # It starts to move at frame 60, and is a pixel away at 66.
     assert body["delay [frames]"] <= 15
     longest = max(score.lives.values(), key=lambda life: len(life.frames))
-    # In single frames too few of its features are found, and in some of the last five, as it comes to rest.
+    # In single frames too few of its features are found, here in some of the last five.
     assert longest.truth == 1 and longest.frames[-1] >= 108
 
 
