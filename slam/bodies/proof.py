@@ -31,7 +31,7 @@ from slam.geometry.se3 import Array, inverse, points_by_pose
 
 PROVEN = 12.0  #: −log10 of the chance from which a body has moved for certain if it went farther than the camera; at 8
 #: the same bodies are found in `boxes` and on drives, and twice as many pieces of a walker
-PROOF = 2  #: frames that are certain by both tests, from which on a body is
+PROOF = 4  #: by frames that are certain by both tests, each of which counts twice, or by way and turn together
 _SLIDES = 20.0  # the same elsewhere: what slides with the camera was seen to agree by up to some 1e-19
 _FARTHER = 2.0  # times the camera's way; from 2 to 4 nothing changes, at 1 what slides in EuRoC MH_01 is a body
 _ALLOWANCE = 3.0  # −log10 of the chance below which a frame says that a body moves
@@ -74,8 +74,8 @@ class Way:
         return float(np.linalg.norm(np.ptp(self.places, axis=0), axis=1).max()) > _FARTHER * self.of_camera
 
 
-def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, bool]:
-    """The evidence that a body moves still, after one more frame, and whether this frame is certain that it moves.
+def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, far: bool) -> tuple[float, int]:
+    """The evidence that a body moves still, after one more frame, and what this frame counts for its `PROOF`.
 
     The evidence is a cumulative sum of −log10 of the chance that the weaker test gives; it fades while a body rests.
     For a body that was followed `far`, for farther than it is wide, its way alone counts.
@@ -87,7 +87,9 @@ def with_frame(evidence: float, moved: Displacements, scene: Scene, way: Way, fa
     if enough:
         evidence = max(0.0, evidence + says - _ALLOWANCE)
     bar = PROVEN if way.far else _SLIDES
-    return evidence, (enough or far) and says >= max(0.5 * PROVEN, bar - turns)
+    if not (enough or far) or says < max(0.5 * PROVEN, bar - turns):
+        return evidence, 0
+    return evidence, 2 if says >= PROVEN else 1
 
 
 def _evidence(chance: float) -> float:
