@@ -32,7 +32,7 @@ ASSOCIATIONS = {
 #: Moving objects by kind of motion: traffic is faster than what a hand or a robot moves.
 OBJECTS = {
     "handheld": ObjectsConfig(),
-    "driving": ObjectsConfig(max_speed=25.0, min_speed=1.0, suspect=40.0, group_test=70.0, size=2.0),
+    "driving": ObjectsConfig(max_speed=25.0, min_speed=1.0, suspect=40.0, size=2.0),
 }
 
 #: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does; nothing comes

@@ -13,10 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam.bodies.config import MIN_POINTS
 from slam.data import BoolArray, IdArray, RecentPoses
-from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, transform
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
@@ -32,8 +31,6 @@ _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again
 
 
 _FAR = 3.0  # so many times the median distance from the median point is no part of the body
-MIN_POINTS = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
-MAX_REJECTIONS = 3  #: so many running, and a point restarts
 _STEPS = 3  # numerics: of Gauss-Newton; the prior is weak where depth is known well
 
 
@@ -102,23 +99,6 @@ def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Sha
         gradient = (weight @ (z - predicted)[:, :, None])[:, :, 0] + (shape.mean - h) @ prior
         h = h + (covariance @ gradient[:, :, None])[:, :, 0]
     return h, covariance
-
-
-def points_to_replace(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:
-    """Which points (p,) of a body make room for `wanted` ones, so that it has `most` at most.
-
-    Those `unseen` for more frames than their `sights`. Where hardly any are in view, as when a body has turned round,
-    others leave, too.
-    """
-    age = unseen / sights
-    order = np.argsort(-age, kind="stable")
-    in_view = int((unseen == 0).sum())
-    lacking = min(wanted, most // 2 - in_view) - (most - len(age))
-    surplus = len(age) + wanted - most
-    leaving = order[: max(0, min(surplus, max(int((age > 1).sum()), lacking), len(age) - in_view))]
-    gone = np.zeros(len(age), bool)
-    gone[leaving] = True
-    return gone
 
 
 def when_measured(probability: float, gain: float) -> float:

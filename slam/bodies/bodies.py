@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.bodies.belief import EVEN, BodyBelief, when_measured, when_missed
-from slam.bodies.config import ObjectsConfig
+from slam.bodies.config import MIN_FRAMES
 from slam.bodies.track_kernels import windows_in_body
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, so3_exp, transform
 from slam.models import ObjectModels
-from slam.object_data import MovingObject, ObjectEstimate
+from slam.object_data import MovingObject
 from slam.tracks.table import Tracks
 
-_YOUNG = 4  # frames in which a body moves as it did when it was found
+_UNMEASURED = 1.0  # [s] for which a body is still reported after its last measurement
+UNMEASURED_SHARE = 0.05  #: most frames in which it is so, as a share of those in which it was measured
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
@@ -53,8 +54,6 @@ class Body:
     age: int = 0  # number of frames since it was found
     existence: float = EVEN  # probability that it exists, see `slam.bodies.belief`
     measured_at: float = float("nan")  # when the estimate last used them [s]
-    reported: int = 0  # number of frames in which it was reported as measured
-    reported_unmeasured: int = 0  # number of frames in which it was reported though it was not measured
     apart_from: int | None = None  # id of the body of which it is a part with a motion of its own; None for none
     distinct: frozenset[int] = frozenset()  # ids of bodies that it is known not to be a part of
     belief: BodyBelief | None = field(default=None, repr=False)  # its estimate; None where there is none yet
@@ -125,7 +124,7 @@ def with_belief(body: Body, belief: BodyBelief, slot: int, stamp: float, min_spe
     return body.placed(
         estimate.T_world_object, slot, estimate.measured, covariance=estimate.covariance, velocity=v,
         velocity_covariance=P, belief=belief, moved=body.moved or belief.moved,
-        moving=body.seen <= _YOUNG or (certain and speed > min_speed), **changes,
+        moving=body.seen <= MIN_FRAMES or (certain and speed > min_speed), **changes,
     )  # fmt: skip
 
 
@@ -142,8 +141,8 @@ def continued(body: Body, known: Body) -> Body:
     return replace(
         body, id=known.id, T=frame, T_before=body.T_before @ change, history=body.history @ change,
         covariance=turn @ body.covariance @ turn.T, lower=corners.min(axis=0), upper=corners.max(axis=0),
-        proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
-        reported=known.reported, reported_unmeasured=known.reported_unmeasured,
+        proven=known.proven, moved=known.moved, existence=known.existence, evidence=known.evidence, age=known.age,
+        seen=body.seen + known.seen,
         measured_at=known.measured_at, distinct=body.distinct | known.distinct, belief=None,
     )  # fmt: skip
 
@@ -192,24 +191,17 @@ def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Ar
     return points, A, known
 
 
-def reported(bodies: dict[int, Body], tracks: Tracks, config: ObjectsConfig) -> tuple[MovingObject, ...]:
-    """The bodies that are worth reporting, by ascending id; that they are is counted in place."""
+def reported(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[MovingObject, ...]:
+    """The bodies that are worth reporting, by ascending id: if not measured, for a short while if they likely exist."""
     out = []
-    for id, body in sorted(bodies.items()):
+    for _, body in sorted(bodies.items()):
         if body.belief is None or not (body.proven and body.moved):
             continue
-        if _worth_reporting(body, body.belief.estimate, config):
-            count = "reported" if body.belief.estimate.measured else "reported_unmeasured"
-            bodies[id] = replace(body, **{count: getattr(body, count) + 1})
+        e = body.belief.estimate
+        short = e.stamp - body.measured_at <= _UNMEASURED and body.missed <= UNMEASURED_SHARE * body.seen
+        if e.measured or (short and body.existence > EVEN):
             out.append(_report(body, body.belief, tracks))
     return tuple(out)
-
-
-def _worth_reporting(body: Body, estimate: ObjectEstimate, config: ObjectsConfig) -> bool:
-    """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
-    short = estimate.stamp - body.measured_at <= config.report_unmeasured
-    seldom = body.reported_unmeasured + 1 <= config.unmeasured_share * body.reported
-    return estimate.measured or (short and seldom and body.existence > EVEN)
 
 
 def _enclosing(points: Array) -> Array:

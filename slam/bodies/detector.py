@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,14 +18,14 @@ from slam.bodies.bodies import (
     with_evidence,
     with_extent,
 )
-from slam.bodies.config import ObjectsConfig
+from slam.bodies.config import MIN_FRAMES, RUN, WINDOW, ObjectsConfig
 from slam.bodies.estimator import FRAMES, BodyEstimator
-from slam.bodies.finder import Scene, displacements, parting
+from slam.bodies.finder import Scene, parting
 from slam.bodies.fits import fit_positions, fit_velocities, make_room, record, revise_tracks
 from slam.bodies.following import follow, located, observed
 from slam.bodies.frame import NO_IDS, Frame, Setup, recent_poses, with_estimate
 from slam.bodies.membership import merge
-from slam.bodies.proof import PROOF, Way, by_left_image, with_frame
+from slam.bodies.proof import PROOF, Way, with_frame
 from slam.bodies.regions import Region, follow_regions
 from slam.data import BoolArray, Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import among, median
@@ -37,8 +37,7 @@ from slam.object_data import MotionLabels, MovingObject
 from slam.tracks.table import Tracks
 
 _NONE: IndexArray = np.zeros(0, np.intp)
-_PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
-_ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
+_FORGOTTEN = 8.0  # [s] after which an unseen body is forgotten
 
 
 class ObjectDetector:
@@ -85,7 +84,7 @@ class MovingObjectDetector(ObjectDetector):
 
     def __init__(self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> None:
         self.setup = Setup(rig, config, models)
-        self.window = config.window
+        self.window = WINDOW
         self._estimator = BodyEstimator(rig, models)
         self._next_track = 0
         self._next_body = 1
@@ -116,10 +115,9 @@ class MovingObjectDetector(ObjectDetector):
         at, rows, now = at[followed], rows[followed], self._number + 1
         if not now:
             return NO_IDS
-        parts, moved = parting(self.setup, tracks, now, features, at, rows, T_world_left)
-        tracks.parted[at[parts]] = 1 + self.setup.config.confirm
-        doubted = tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)]
-        return np.union1d(doubted, tracks.ids[at[moved]])
+        parts = parting(self.setup, tracks, now, self._poses[:, :3, 3], features, at, rows, T_world_left)
+        tracks.parted[parts] = 1 + RUN if now >= WINDOW else 1
+        return np.sort(tracks.ids[(tracks.ids >= 0) & (tracks.parted > 0)])
 
     def step(
         self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate,
@@ -134,7 +132,7 @@ class MovingObjectDetector(ObjectDetector):
         tracks.still[:] = tracks.found & among(max(len(frame.local), 1), still)[tracks.row]
         self._fit(tracks, frame)
         self._change_members(tracks, frame)
-        scene, suspects, groups = finder.find_groups(frame, tracks, self.bodies)
+        scenes, suspects, groups = finder.find_groups(frame, tracks, self.bodies)
         for group in groups:
             moving = finder.lasting(group, tracks, frame)
             new = finder.moving_group(frame, tracks, moving) if len(moving) else None
@@ -144,16 +142,16 @@ class MovingObjectDetector(ObjectDetector):
             self._regions, moved = follow_regions(self._regions, frame, tracks)
             for region in moved:
                 self._found(finder.region_group(frame, tracks, region), tracks, frame, far=True)
-        self._prove(tracks, frame, scene)
+        self._prove(tracks, frame, scenes)
         unproven = (tracks.body >= 0) & ~self._of_proven(tracks)
-        c, expelled = self.setup.config, np.flatnonzero(tracks.expelled & tracks.found)
+        expelled = np.flatnonzero(tracks.expelled & tracks.found)
         # of a body that was dropped: nothing is known of these until a group could be found
-        unproven[expelled[tracks.count(expelled) < c.min_frames + c.confirm]] = True
+        unproven[expelled[tracks.count(expelled) < MIN_FRAMES + RUN]] = True
         suspected = np.concatenate([tracks.ids[suspects], tracks.ids[unproven]])
         self.suspects = np.unique(suspected[suspected >= 0])
         self._begin_estimates(tracks, frame)
         self._begin_tracks(tracks, frame)
-        return self._motion_labels(tracks, frame), reported(self.bodies, tracks, self.setup.config)
+        return self._motion_labels(tracks, frame), reported(self.bodies, tracks)
 
     def _begin(self, backend: Backend, tracks: Tracks, features: StereoFeatures, estimate: Estimate) -> Frame:
         """Move on by a frame; nothing is followed into the first one."""
@@ -161,7 +159,7 @@ class MovingObjectDetector(ObjectDetector):
         self._number += 1
         if self._number == 0:
             tracks.number[:], tracks.body[:], tracks.dof[:] = -1, -1, 0
-        slot = self._number % s.config.window
+        slot = self._number % WINDOW
         self._stamps[slot], self._poses[slot] = features.stamp, estimate.T_world_left
         local = s.rig.triangulate(features.uv_left, features.uv_right)
         measured = among(len(local), tracks.row[tracks.row >= 0])
@@ -174,9 +172,7 @@ class MovingObjectDetector(ObjectDetector):
         """Predict all bodies; forget those that were not seen for long."""
         now, dt = frame.features.stamp, frame.dt
         for body in list(self.bodies.values()):
-            fresh = (body.seen + 0.5) * dt < _ESTABLISHED  # to the nearest frame
-            too_long = now - body.seen_at > self.setup.config.forget_after
-            if too_long or (fresh and body.missed >= _PATIENCE + body.seen):
+            if now - body.seen_at > _FORGOTTEN or body.missed > RUN * body.seen:
                 del self.bodies[body.id]
                 tracks.give_up(np.flatnonzero(tracks.body == body.id))
             else:
@@ -209,7 +205,7 @@ class MovingObjectDetector(ObjectDetector):
         c = self.setup.config
         free = np.flatnonzero((tracks.body < 0) & tracks.found)
         count = tracks.count(free)
-        unsure = (count < c.min_frames) | tracks.doubtful[free] | tracks.velocity[free].any(axis=1)
+        unsure = (count < MIN_FRAMES) | tracks.doubtful[free] | tracks.velocity[free].any(axis=1)
         fit_positions(tracks, free)
         fit_velocities(tracks, free[unsure & (count > 1)], frame.times, c.max_speed)
 
@@ -245,22 +241,21 @@ class MovingObjectDetector(ObjectDetector):
         membership.add_members(body, tracks, members, sure=True)
         self.bodies[body.id] = with_extent(replace(body, apart_from=whole), tracks.local[members])
 
-    def _prove(self, tracks: Tracks, frame: Frame, scene: Scene) -> None:
+    def _prove(self, tracks: Tracks, frame: Frame, scenes: Mapping[int | None, Scene]) -> None:
         """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
-        s = self.setup
         for body in list(self.bodies.values()):
-            if not body.measured:
+            whole = self.bodies.get(-1 if body.apart_from is None else body.apart_from)
+            if not body.measured or (whole is not None and whole.id not in scenes):
                 continue
             members = np.flatnonzero((tracks.body == body.id) & tracks.found)
-            members = members[tracks.count(members) >= s.config.min_frames - 1]
-            moved = displacements(tracks, members, frame.ages, frame.poses[:, :3, 3], s.slide)
-            way = Way.of(body, frame)
-            left = 0.0 if body.proven else by_left_image(tracks, members, frame, scene)
-            evidence, counts = with_frame(body.evidence, moved, scene, way, left, body.far)
+            members = members[tracks.count(members) >= MIN_FRAMES - 1]
+            scene = scenes[None if whole is None else whole.id]
+            moved, way = finder.moved_in(whole, tracks, members, frame), Way.of(body, frame, whole)
+            evidence, counts = with_frame(body.evidence, moved, scene, way, body.far)
             certain = body.certain + counts
             body = replace(body, evidence=evidence, certain=certain, proven=body.proven or certain >= PROOF)
             self.bodies[body.id] = body
-            if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
+            if evidence == 0.0 if body.proven else body.seen >= WINDOW:
                 self._drop(tracks, body)
 
     def _drop(self, tracks: Tracks, body: Body) -> None:
@@ -282,7 +277,7 @@ class MovingObjectDetector(ObjectDetector):
     def _begin_tracks(self, tracks: Tracks, frame: Frame) -> None:
         """Follow landmarks and stereo features that are not followed yet; give up what was not found for long."""
         f, deep = frame.features, np.isfinite(frame.local[:, 0])
-        lost = (tracks.number >= 0) & (tracks.body < 0) & (tracks.unfound > self.setup.config.patience)
+        lost = (tracks.number >= 0) & (tracks.body < 0) & (tracks.unfound > RUN)
         tracks.give_up(np.flatnonzero(lost))
         found = np.flatnonzero(tracks.row >= 0)
         anew = found[(tracks.number[found] < 0) & deep[tracks.row[found]]]
@@ -302,7 +297,7 @@ class MovingObjectDetector(ObjectDetector):
 
     def _motion_labels(self, tracks: Tracks, frame: Frame) -> MotionLabels:
         n = len(frame.local)
-        on, near = membership.tracks_on_bodies(self.bodies, tracks, self.setup.config.margin)
+        on, near = membership.tracks_on_bodies(self.bodies, tracks)
         moving = among(n, tracks.row[on])
         undecided = among(n, np.append(tracks.row[near], tracks.row[tracks.found & tracks.doubtful]))
         landmarks = np.sort(tracks.ids[self._of_proven(tracks) & (tracks.ids >= 0)])

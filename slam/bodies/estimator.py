@@ -15,20 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.bodies.belief import (
-    MAX_REJECTIONS,
-    MIN_POINTS,
     BodyBelief,
     Points,
     Shape,
     begun,
     carried,
     first_frame,
-    points_to_replace,
     shape_of,
     slid,
     window,
     with_shape,
 )
+from slam.bodies.config import MIN_POINTS, RUN
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, Observations, RecentPoses
 from slam.geometry.arrays import isin
@@ -240,7 +238,7 @@ class BodyEstimator:
         failures, unseen, sights, ids = p.failures.copy(), p.unseen.copy(), p.sights.copy(), p.ids.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
         unseen[rows], sights[rows] = 0, sights[rows] + used
-        ids[failures >= MAX_REJECTIONS] = -1
+        ids[failures >= RUN] = -1
         w = solution.window
         return replace(
             b, poses=w.poses, covariance=solution.pose_covariance,
@@ -250,13 +248,15 @@ class BodyEstimator:
     def _joined(self, b: BodyBelief, seen: _Seen, new: BoolArray) -> tuple[BodyBelief, IndexArray]:
         """With those of the new observations that have a depth, as far as there is room; and which they are."""
         which = np.flatnonzero(new & seen.deep)
-        alive = np.flatnonzero(b.alive)
-        gone = points_to_replace(b.points.unseen[alive], b.points.sights[alive], len(which), self.models.points)
-        which = which[: self.models.points - len(alive) + int(gone.sum())]
+        alive, unseen = np.flatnonzero(b.alive), b.points.unseen
+        hidden = alive[unseen[alive] > 0]
+        surplus = len(alive) + len(which) - self.models.points
+        gone = hidden[np.argsort(-unseen[hidden], kind="stable")][: max(surplus, 0)]  # the longest unseen make room
+        which = which[: self.models.points - len(alive) + len(gone)]
         if not len(which):
             return b, which
         ids = b.points.ids.copy()
-        ids[alive[gone]] = -1
+        ids[gone] = -1
         Y = b.poses[-1]
         shape = self._shape(b, seen.local[which]).seen_from(inverse(Y))
         h, own = with_shape(self.stereo.project, seen.z[which], seen.local[which], self.sigma, shape)

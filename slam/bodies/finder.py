@@ -25,7 +25,7 @@ of its pose grows by what the withheld measurements would have told.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -34,10 +34,11 @@ from slam.bodies import membership
 from slam.bodies import scene_kernels as kernels
 from slam.bodies.belief import compact
 from slam.bodies.bodies import Body, in_body_axes, new_body
+from slam.bodies.config import MIN_FRAMES, MIN_POINTS, RUN, WINDOW
 from slam.bodies.fits import constant_velocity, fit_velocities, measure, times_vectors
 from slam.bodies.frame import Frame, Setup
 from slam.bodies.regions import Region
-from slam.bodies.track_kernels import displaced, fit_fixed_points, inverses
+from slam.bodies.track_kernels import PART, displaced, fit_fixed_points, inverses
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray, IndexArray, StereoFeatures
 from slam.geometry.arrays import among
@@ -45,7 +46,6 @@ from slam.geometry.rig import measurement_rows
 from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
-LAG = 4  #: frames between the older and the recent measurements, about
 _RECENT = 5  # frames that are recent, at most; of short tracks the later half
 FARTHEST = 4.0  #: a track's depth must be so many times its deviation
 _TAIL = 3.0  # tracks; see `limit`
@@ -54,9 +54,8 @@ _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of win
 _HALVES = 0.5 * np.array(list(product((0, 1), repeat=3)))  # of a width, by which windows of a size are apart
 _CELLS = 2**12  # numerics: more than there are windows along an axis
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
-_AROUND = 0.5  # of a group's extent in view, how far beyond it landmarks of unknown motion are taken for a part of it
-_LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
-_RIDGE = 1e-6  # numerics: share of the trace
+_PRECISE = 0.25  # times the noise of a pixel: what it is from frame to frame at least, without what lasts; at 0.5 a box
+# that starts carries the camera along
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,31 +99,23 @@ class Scene:
         return rest
 
 
-def displacements(
-    tracks: Tracks, rows: IndexArray, ages: IndexArray, centres: Array, slide: float,
-    body: tuple[Array, Array, BoolArray] | None = None,
-) -> Displacements:  # fmt: skip
-    """How far tracks (N,) went in the world, or in the axes of a body, given what they measured in these.
-
-    The window's slots have `ages` (W,) in frames, and the camera was at `centres` (W, 3); `slide` is the variance of a
-    feature's direction with the angle from which it is seen [rad].
-    """
-    t = tracks
-    rays = t.position[rows] - centres[int(np.argmin(ages))]
+def moved_in(body: Body | None, tracks: Tracks, rows: IndexArray, frame: Frame) -> Displacements:
+    """How far tracks (N,) went in the world, or in the axes of a body, about whose origin their points are then."""
+    t, ages, eyes, slide = tracks, frame.ages, frame.poses[:, :3, 3], frame.setup.slide
+    rays = t.position[rows] - frame.eye
     if body is None:
         older = t.older_A, t.older_b, t.older_age
-        return Displacements(rays, *displaced(t.A, t.p, t.dof, *older, rows, ages, _RECENT, rays, centres, slide))
-    points, A, known = body
-    n = len(rows)
+        return Displacements(rays, *displaced(t.A, t.p, t.dof, *older, rows, ages, _RECENT, rays, eyes, slide))
+    (points, A, known), n = in_body_axes(body, tracks, rows), len(rows)
     none = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
-    dof = np.where(known, t.dof[rows], 0).astype(np.int8)
-    points = np.where(known[..., None], points, 0.0)
-    return Displacements(rays, *displaced(A, points, dof, *none, np.arange(n), ages, _RECENT, rays, centres, 0.0))
+    dof, points = np.where(known, t.dof[rows], 0).astype(np.int8), np.where(known[..., None], points, 0.0)
+    inside = (t.position[rows] - body.T[:3, 3]) @ body.T[:3, :3]
+    return Displacements(inside, *displaced(A, points, dof, *none, np.arange(n), ages, _RECENT, rays, eyes, 0.0))
 
 
-def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array, min_frames: int) -> tuple[IndexArray, Array]:
+def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array) -> tuple[IndexArray, Array]:
     """Those of the tracks (K,) seen in enough frames whose depth is known, and where: x/z, y/z, log z (K, 3)."""
-    rows = rows[tracks.count(rows) >= min_frames]
+    rows = rows[tracks.count(rows) >= MIN_FRAMES]
     local = (tracks.position[rows] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
     variance = np.einsum("nii->n", tracks.covariance[rows])
     known = local[:, 2] > FARTHEST * np.sqrt(np.where(variance < 0, np.inf, variance))  # below 0 by rounding alone
@@ -133,7 +124,8 @@ def known_well(tracks: Tracks, rows: IndexArray, T_world_left: Array, min_frames
 
 def places_in_view(local: Array) -> Array:
     """Where points (N, 3) in camera coordinates are seen: x/z, y/z, log z (N, 3)."""
-    return np.column_stack([local[:, :2] / local[:, 2:], np.log(local[:, 2])])
+    depth = np.maximum(local[:, 2:], 1e-9)
+    return np.column_stack([local[:, :2] / depth, np.log(depth)])
 
 
 def limit(test: float, size: IndexArray | int) -> Array:
@@ -141,19 +133,19 @@ def limit(test: float, size: IndexArray | int) -> Array:
     return test * (1.0 + _TAIL / np.maximum(size, 1.0))
 
 
-def classify_scene(moved: Displacements, place: Array, test: float, support: int, least_scale: float = 1.0) -> Scene:
-    """Groups of `support` tracks at least that moved on their own, and every track's displacement against the rest.
+def classify_scene(moved: Displacements, place: Array, test: float) -> Scene:
+    """Groups of tracks that moved on their own, and every track's displacement against the rest.
 
     Tracks are seen at `place` (N, 3): x/z, y/z, log z; `test` is the χ²(6) from which a large group moved. Every χ² is
-    divided by the ratio of the rest's median to what it should be, and by `least_scale` at least.
+    divided by the ratio of the rest's median to what it should be, if that is more than 1.
     """
     n = len(moved.d)
-    if n < 3 * support:
+    if n < 3 * MIN_POINTS:
         return Scene([], np.zeros(n), np.zeros(6), np.diag(1.0 / kernels.PRIOR))
     L, eta, dWd = kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag)
     asked = limit(test, np.arange(n + 1, dtype=np.intp))
     group, values, alone, common, scale = kernels.groups_apart(
-        L, eta, dWd, place, *_full_windows(place, support), asked, support, least_scale
+        L, eta, dWd, place, *_full_windows(place), asked, MIN_POINTS
     )  # fmt: skip
     rest = group < 0
     heavier = tail(alone[rest])  # of what is in no group: before, other groups would be part of it
@@ -169,7 +161,7 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
     return Scene(groups, alone, common, scale * heavier * np.linalg.inv(information))
 
 
-def _full_windows(place: Array, support: int) -> tuple[IndexArray, IndexArray, Array, Array]:
+def _full_windows(place: Array) -> tuple[IndexArray, IndexArray, Array, Array]:
     """Windows with enough tracks, of every size, each half a width from the next along every axis.
 
     As starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
@@ -183,7 +175,7 @@ def _full_windows(place: Array, support: int) -> tuple[IndexArray, IndexArray, A
     code, tracks = ordered >> bits, ordered & ((1 << bits) - 1)
     first = np.flatnonzero(np.append(True, code[1:] != code[:-1]))
     count = np.diff(np.append(first, len(code)))
-    full = count >= support
+    full = count >= MIN_POINTS
     code = code[first[full], None]
     kind = code[:, 0] // _CELLS**3
     size, half = _SIZES[kind // len(_HALVES)], _HALVES[kind % len(_HALVES)]
@@ -205,56 +197,48 @@ def tail(alone: Array) -> float:
 
 def find_groups(
     frame: Frame, tracks: Tracks, bodies: Mapping[int, Body]
-) -> tuple[Scene, IndexArray, list[tuple[int | None, IndexArray]]]:
+) -> tuple[dict[int | None, Scene], IndexArray, list[tuple[int | None, IndexArray]]]:
     """Test the free tracks against the world, and the tracks on bodies against these; notes in place what is in doubt.
 
-    Returns the still world, as it appears to move; rows of tracks in groups that may move; and those groups that moved,
-    each with the id of the body that it is a part of, or None.
+    Returns what world (None) and bodies say, by id; rows of tracks in groups that may move; and those groups that
+    moved, each with the id of the body that it is a part of, or None.
     """
     c = frame.setup.config
-    least = LAG * frame.dt * c.min_speed
+    least = MIN_FRAMES * frame.dt * c.min_speed
     rows, scene = _classified(frame, tracks, np.flatnonzero(tracks.found & (tracks.body < 0)))
     groups = [rows[g.members][~tracks.still[rows[g.members]]] for g in scene.groups]
-    moving = [members for g, members in zip(scene.groups, groups) if g.moves(c.group_test, least)]
-    parts = [
-        (body.id, on[g.members])
-        for body in bodies.values()
-        if body.measured and body.proven
-        for on, test in [_classified(frame, tracks, membership.tracks_on(body, tracks, c.margin), body)]
-        for g in test.groups
-        if g.moves(c.group_test, least)
-    ]
+    moving = [members for g, members in zip(scene.groups, groups) if g.moves(c.moves, least)]
+    scenes: dict[int | None, Scene] = {None: scene}
+    parts = []
+    for body in bodies.values():
+        if body.measured and body.proven:
+            on, scenes[body.id] = _classified(frame, tracks, membership.tracks_on(body, tracks), body)
+            parts += [(body.id, on[g.members]) for g in scenes[body.id].groups if g.moves(c.moves, least)]
     suspects = np.concatenate([np.zeros(0, np.intp), *groups])
     tracks.doubtful[:] = False
-    tracks.doubtful[rows] = (scene.alone > c.doubtful) & ~tracks.still[rows]
+    tracks.doubtful[rows] = (scene.alone > kernels.FITS) & ~tracks.still[rows]
     tracks.doubtful[suspects] = True
     fit_velocities(tracks, np.flatnonzero(tracks.doubtful), frame.times, c.max_speed)
     of_parts = among(len(tracks), np.concatenate([np.zeros(0, np.intp), *(members for _, members in parts)]))
     alike = of_parts | among(len(of_parts), np.concatenate([np.zeros(0, np.intp), *moving]))
     tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
     alone = [(None, members) for members in groups if 2 * of_parts[members].sum() <= len(members)]
-    return scene, suspects, [*parts, *alone]
+    return scenes, suspects, [*parts, *alone]
 
 
 def lasting(group: tuple[int | None, IndexArray], tracks: Tracks, frame: Frame) -> IndexArray:
     """Those of a group's tracks that have moved alike for some frames; none where they are too few."""
     whole, members = group
-    c = frame.setup.config
     members = members[(tracks.body[members] == -1) | (tracks.body[members] == (-1 if whole is None else whole))]
-    if (tracks.streak[members] >= c.confirm).sum() < c.min_support - 1:
+    if (tracks.streak[members] >= RUN).sum() < MIN_POINTS - 1:
         return members[:0]
     return np.asarray(members[tracks.streak[members] > 0])
 
 
 def _classified(frame: Frame, tracks: Tracks, rows: IndexArray, body: Body | None = None) -> tuple[IndexArray, Scene]:
     """Those of the tracks that are known well, tested in the world or in a body's axes."""
-    c = frame.setup.config
-    rows, place = known_well(tracks, rows, frame.T_world_left, c.min_frames)
-    inside = None if body is None else in_body_axes(body, tracks, rows)
-    moved = displacements(tracks, rows, frame.ages, frame.poses[:, :3, 3], frame.setup.slide, inside)
-    if body is not None:
-        moved = replace(moved, points=(tracks.position[rows] - body.T[:3, 3]) @ body.T[:3, :3])
-    return rows, classify_scene(moved, place, c.suspect, c.min_support)
+    rows, place = known_well(tracks, rows, frame.T_world_left)
+    return rows, classify_scene(moved_in(body, tracks, rows, frame), place, frame.setup.config.suspect)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,12 +261,12 @@ def moving_group(frame: Frame, tracks: Tracks, members: IndexArray) -> MovingGro
     """Those of the tracks `members` (K,) that lie together and move alike; None if they are too few or too far."""
     members = members[compact(tracks.position[members])]
     for _ in range(_ROUNDS + 1):
-        if len(members) < frame.setup.config.min_support:
+        if len(members) < MIN_POINTS:
             return None
         group = _with_common_twist(frame, tracks, members)
         if not frame.resolves(group.centre):
             return None
-        moves: BoolArray = membership.membership_test(group.body(0, frame, tracks), tracks, members).gain > 0
+        moves: BoolArray = membership.membership_test(group.body(0, frame, tracks), tracks, members)[0] > 0
         if moves.all():
             break
         members = members[moves]  # what lies among them and rather stands still slows them down
@@ -316,54 +300,41 @@ def region_group(frame: Frame, tracks: Tracks, region: Region) -> MovingGroup:
 
 
 def parting(
-    setup: Setup, tracks: Tracks, now: int, features: StereoFeatures, at: IndexArray, rows: IndexArray,
+    setup: Setup, tracks: Tracks, now: int, eyes: Array, features: StereoFeatures, at: IndexArray, rows: IndexArray,
     T_world_left: Array,
-) -> tuple[BoolArray, BoolArray]:  # fmt: skip
-    """Which landmarks `at` (K,), seen as features `rows`, part from the rest, or are too young and lie among those.
+) -> IndexArray:  # fmt: skip
+    """Those of the landmarks `at` (K,), seen as features `rows`, that part from the rest of them.
 
-    And which moved since they were first seen, in a run's first frames, in which means of tracks are no better: what
-    moves from the beginning on would else pull the camera along, and the world's axes with it.
+    The camera was at `eyes` (W, 3) in the window's frames. In a run's first frames single ones part, too, and however
+    many: what moves from the beginning on would else pull the camera along, and the world's axes with it.
     """
-    c, t = setup.config, tracks
-    parts, moved = np.zeros((2, len(at)), bool)
+    t, free = tracks, tracks.body[at] < 0
+    at, rows = at[free], rows[free]
+    position, P = np.empty_like(t.position), np.empty_like(t.covariance)
+    fit_fixed_points(t.A, t.p, t.anchor, at, position, P)
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-    mine = np.flatnonzero((t.body[at] < 0) & (t.count(at) >= c.min_frames))
-    position, covariance = np.empty_like(t.position), np.empty_like(t.covariance)
-    fit_fixed_points(t.A, t.p, t.anchor, at[mine], position, covariance)
-    ages, seen = 1 + (now - 1 - np.arange(c.window)) % c.window, t.dof[at[mine]] > 0
-    age = (seen @ ages) / np.maximum(seen.sum(axis=1), 1)
-    mean = position[at[mine]], covariance[at[mine]]
-    known, view, scene = _compared(setup, T_world_left, *mean, age, z[mine], FARTHEST)
-    young = np.setdiff1d(np.arange(len(at)), mine[known])
-    local = transform(inverse(T_world_left), t.position[at[young]])
-    young, place = young[local[:, 2] > 0], places_in_view(local[local[:, 2] > 0])
-    few = (~scene.rest).sum() <= kernels.LARGEST * len(known)  # else it is rather the poses before that were wrong
-    for group in scene.groups if few else ():
-        parts[mine[known[group.members]]] = True
-        low, high = view[group.members].min(axis=0), view[group.members].max(axis=0)
-        beyond = _AROUND * (high - low)
-        parts[young] |= ((place > low - beyond) & (place < high + beyond)).all(axis=1)
-    if now < c.window:  # slots are frames
-        first = (t.dof[at] > 0).argmax(axis=1)
-        was = inverses(t.A[at, first], _RIDGE, 0.0)
-        known, _, scene = _compared(setup, T_world_left, t.anchor[at], was, now - first.astype(float), z, 0.0)
-        moved[known] = ~scene.rest | (scene.alone > c.doubtful * tail(scene.alone[scene.rest]))
-    return parts, moved
-
-
-def _compared(
-    setup: Setup, T_world_left: Array, before: Array, P: Array, age: Array, z: Array, far: float
-) -> tuple[IndexArray, Array, Scene]:
-    """How points `before` (N, 3), of covariances P (N, 3, 3), have moved in `age` (N,) frames to pixels z (N, 3).
-
-    Those whose depth is more than `far` deviations (K,), where the camera saw them (K, 3), and the groups among them,
-    in the noise of the rest.
-    """
-    c = setup.config
-    points, A, dof = measure(setup.rig, T_world_left, before, z, setup.sigma)
-    local = transform(inverse(T_world_left), before)
-    known = np.flatnonzero((dof > 0) & (local[:, 2] > far * np.sqrt(np.trace(P, axis1=1, axis2=2))))
-    W = inverses(inverses(A[known], _RIDGE, 0.0) + P[known], _RIDGE, 0.0)
-    moved = Displacements(before[known] - T_world_left[:3, 3], (points - before)[known], W, age[known])
-    view = places_in_view(local[known])
-    return known, view, classify_scene(moved, view, c.suspect, c.min_support, (_LEAST_NOISE / setup.sigma) ** 2)
+    points, A, dof = measure(setup.rig, T_world_left, position[at], z, setup.sigma)
+    local = transform(inverse(T_world_left), position[at])
+    well = (
+        (dof > 0) & (t.count(at) >= MIN_FRAMES) & (local[:, 2] > FARTHEST * np.sqrt(np.trace(P[at], axis1=1, axis2=2)))
+    )
+    k = np.flatnonzero(well if now >= WINDOW else dof > 0)
+    share = (t.dof[at[k]] > 0) / np.maximum(t.count(at[k]), 1)[:, None]
+    age, rays = share @ (1 + (now - 1 - np.arange(WINDOW)) % WINDOW), position[at[k]] - T_world_left[:3, 3]
+    far = np.linalg.norm(rays, axis=1)
+    slide = setup.slide * np.linalg.norm(np.cross(rays, T_world_left[:3, 3] - share @ eyes), axis=1)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None] / far[:, None, None] ** 2
+    noise = _PRECISE**2 * (inverses(A[k], PART, 0.0) + P[at[k]]) + slide[:, None, None] * across
+    moved = Displacements(rays, (points - position[at])[k], inverses(noise, PART, 0.0), age)
+    view = places_in_view(local)
+    scene = classify_scene(moved, view[k], setup.config.suspect)
+    if now < WINDOW:
+        return at[k[~scene.rest | (scene.alone > kernels.FITS * tail(scene.alone[scene.rest]))]]
+    if (~scene.rest).sum() > kernels.LARGEST * len(k):  # it is rather the poses before that were wrong
+        return at[:0]
+    parts = among(len(at), k[~scene.rest])
+    for group in scene.groups:  # what is not known well and lies among them moves as they do
+        low, high = view[k[group.members]].min(axis=0), view[k[group.members]].max(axis=0)
+        beyond = 0.5 * (high - low)
+        parts |= ~well & (local[:, 2] > 0) & ((view > low - beyond) & (view < high + beyond)).all(axis=1)
+    return at[parts]

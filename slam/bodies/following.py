@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from slam.bodies.belief import MIN_POINTS, BodyBelief
+from slam.bodies.belief import BodyBelief
 from slam.bodies.bodies import Body
+from slam.bodies.config import MIN_FRAMES, MIN_POINTS
 from slam.bodies.estimator import BodyEstimator
 from slam.bodies.fits import AGREES
 from slam.bodies.frame import Frame
@@ -25,6 +25,8 @@ from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
 from slam.window.consensus import find_consensus
 
+_SEARCH = 4.0, 25.0  # least and largest half size of the search windows of tracks [px]
+_ALIKE = 0.5, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _UNKNOWN = 1e-6  # numerics: on a member's point that has no information yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
@@ -80,14 +82,14 @@ def _look(tracks: Tracks, frame: Frame, rows: IndexArray, taken: BoolArray) -> N
     z, J = s.rig.project_stereo(transform(inverse(T), places))
     G = J @ T[:3, :3].T
     S = G @ tracks.covariance[rows] @ np.swapaxes(G, 1, 2) + s.sigma**2 * np.eye(3)
-    least = np.where(tracks.doubtful[rows], 0.5 * c.search_limit, c.search_radius)
-    windows = features_of_tracks.Windows((SIGMAS,), (c.d_match,), c.ratio, c.search_limit, least)
+    least = np.where(tracks.doubtful[rows], 0.5 * _SEARCH[1], _SEARCH[0])
+    windows = features_of_tracks.Windows((SIGMAS,), (_ALIKE[0],), _ALIKE[1], _SEARCH[1], least)
     looks = tracks.look[rows], tracks.laplacian[rows]
     found = features_of_tracks.follow(z[:, :2], S[:, :2, :2], *looks, f, windows, taken)
     m, row = found.tracks, found.features
     # A right pixel off by more says that this is another point, or a false stereo match.
     depth = np.maximum((places[m] - T[:3, 3]) @ T[:3, 2], 1e-3)
-    uneven = np.where(tracks.count(rows[m]) < c.min_frames, 1.0, _UNEVEN)
+    uneven = np.where(tracks.count(rows[m]) < MIN_FRAMES, 1.0, _UNEVEN)
     deviation = np.sqrt(np.maximum(S[m, 2, 2], s.sigma**2))  # rounding may leave a covariance that is not definite
     allowance = _RIGHT_SIGMAS * deviation + uneven * c.max_speed * frame.dt * s.rig.left.fu / depth
     good = ~(np.abs(f.uv_right[row, 0] - z[m, 2]) > allowance)  # NaN compares false
@@ -99,7 +101,7 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     """Look for tracks without a velocity yet as far off as `max_speed` allows, in features not `taken` (N,)."""
     s, c = frame.setup, frame.setup.config
     left = np.flatnonzero((tracks.number >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.unfound == 0))
-    left = left[tracks.count(left) <= c.min_frames]
+    left = left[tracks.count(left) <= MIN_FRAMES]
     free = np.flatnonzero(~taken & np.isfinite(frame.local[:, 0]))
     if not len(left) or not len(free):
         return
@@ -109,7 +111,7 @@ def _far(tracks: Tracks, frame: Frame, taken: BoolArray) -> None:
     away = cdist(tracks.position[left], transform(frame.T_world_left, local))
     allowed = away < c.max_speed * frame.dt + unknown
     looks, features = (tracks.look[left], tracks.laplacian[left]), frame.features.select(free)
-    found = features_of_tracks.match_everywhere(*looks, features, c.wide_d_match, c.wide_ratio, allowed)
+    found = features_of_tracks.match_everywhere(*looks, features, *_ALIKE, allowed)
     tracks.set_features(left[found.tracks], free[found.features])
 
 
@@ -124,7 +126,7 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
     mine = members[tracks.found[members]]
     rows = tracks.row[mine]
 
-    def estimated(mine: NDArray[np.intp], rows: NDArray[np.intp], T: Array | None = None) -> BodyBelief | None:
+    def estimated(mine: IndexArray, rows: IndexArray, T: Array | None = None) -> BodyBelief | None:
         return estimator.updated(body.belief, body.id, observed(body, tracks, mine, rows, features, T), frame.cameras)
 
     def agreeing(belief: BodyBelief | None) -> int:
@@ -162,7 +164,7 @@ def located(body: Body, tracks: Tracks, frame: Frame, estimator: BodyEstimator) 
 
 
 def observed(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], features: StereoFeatures,
+    body: Body, tracks: Tracks, mine: IndexArray, rows: IndexArray, features: StereoFeatures,
     T: Array | None = None,
 ) -> ObjectObservations:  # fmt: skip
     """A body's tracks (K,) as the features of these rows, with a guess of its pose (4, 4) where there is one."""
@@ -189,7 +191,7 @@ def _is_expected(body: Body) -> bool:
 
 
 def _fit(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], frame: Frame
+    body: Body, tracks: Tracks, mine: IndexArray, rows: IndexArray, frame: Frame
 ) -> tuple[Array, BoolArray] | None:
     """Pose T_body_left, and which tracks agree with it as the features of these rows."""
     if len(mine) < MIN_POINTS:
@@ -202,13 +204,10 @@ def _fit(
     return None if stereo.sum() < MIN_POINTS else (fit.T_world_left, fit.inliers)
 
 
-def _by_descriptors(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], frame: Frame
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _by_descriptors(body: Body, tracks: Tracks, mine: IndexArray, frame: Frame) -> tuple[IndexArray, IndexArray]:
     """Members matched by descriptor, and the features' rows, no farther off than the body can have gone.
 
-    Where its position is unknown weaker matches are accepted, and the fit decides. Features of free tracks may be
-    matched, too: such tracks may have started on the body's points.
+    Features of free tracks may be matched, too: such tracks may have started on the body's points.
     """
     features, c = frame.features, frame.setup.config
     taken = among(len(features), tracks.row[tracks.found & (tracks.body >= 0) & (tracks.body != body.id)])
@@ -219,7 +218,5 @@ def _by_descriptors(
     away = np.linalg.norm(transform(frame.T_world_left, local) - body.T[:3, 3], axis=1)
     reach = c.max_speed * max(features.stamp - body.seen_at, 0.1) + float(np.linalg.norm(body.upper - body.lower))
     allowed = np.broadcast_to(away < reach + _DEPTHS * np.abs(local[:, 2]), (len(mine), len(free)))
-    lost = body.apart_from is None and not _is_expected(body)
-    limits = (c.d_match, c.ratio) if lost else (c.wide_d_match, c.wide_ratio)
-    found = match_everywhere(tracks.look[mine], tracks.laplacian[mine], features.select(free), *limits, allowed)
+    found = match_everywhere(tracks.look[mine], tracks.laplacian[mine], features.select(free), *_ALIKE, allowed)
     return mine[found.tracks], free[found.features]

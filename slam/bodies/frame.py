@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from slam.bodies.config import ObjectsConfig
 from slam.data import Estimate, IdArray, IndexArray, RecentPoses, StereoFeatures
@@ -105,27 +106,19 @@ NO_IDS: IdArray = np.zeros(0, np.int64)  #: none
 
 
 def with_estimate(
-    path: RecentPoses | None, estimate: Estimate, rig: StereoRig, sigma: float, landmarks: Array, most: int
+    path: RecentPoses | None, estimate: Estimate, rig: StereoRig, sigma: float, landmarks: Array, n: int
 ) -> RecentPoses:
-    """The online poses of the last frames, `most` at most, with the (6, 6) blocks of each frame's own noise.
+    """The online poses of the last n frames, with the (6, 6) blocks of each frame's own noise.
 
     That is what its `landmarks`, (M, 3) in camera coordinates, would leave uncertain if they were known.
     """
-    information = np.linalg.inv(estimate.covariance + 1e-12 * np.eye(6))
-    if len(landmarks):
-        J = (rig.project_stereo(landmarks)[1] @ points_by_pose(landmarks)).reshape(-1, 6)
-        information = information + J.T @ J / sigma**2
-    own = np.linalg.inv(information)
-    n = 0 if path is None else min(len(path), most - 1)
-    blocks = np.zeros((6 * n + 6, 6 * n + 6))
-    blocks[-6:, -6:] = own
-    if path is None or n == 0:
-        return RecentPoses(np.array([estimate.stamp]), estimate.T_world_left[None], blocks)
-    blocks[:-6, :-6] = path.covariance[-6 * n :, -6 * n :]
-    return RecentPoses(
-        np.append(path.stamps[-n:], estimate.stamp), np.concatenate([path.poses[-n:], estimate.T_world_left[None]]),
-        blocks,
-    )  # fmt: skip
+    J = (rig.project_stereo(landmarks)[1] @ points_by_pose(landmarks)).reshape(-1, 6)
+    own = np.linalg.inv(np.linalg.inv(estimate.covariance + 1e-12 * np.eye(6)) + J.T @ J / sigma**2)
+    stamps, poses, blocks = np.array([estimate.stamp]), estimate.T_world_left[None], own
+    if path is not None:
+        stamps, poses = np.append(path.stamps, stamps)[-n:], np.concatenate([path.poses, poses])[-n:]
+        blocks = block_diag(path.covariance, own)[-6 * n :, -6 * n :]
+    return RecentPoses(stamps, poses, blocks)
 
 
 def recent_poses(backend: Backend, n: int, path: RecentPoses, covariance: Array) -> RecentPoses:

@@ -7,31 +7,27 @@ it is a part of it; a young body that shows more of a thing than the older one t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam.bodies.belief import MAX_REJECTIONS
 from slam.bodies.bodies import Body, continued, in_body_axes, spread_of_place, with_extent
-from slam.bodies.config import ObjectsConfig
+from slam.bodies.config import RUN, WINDOW
 from slam.bodies.fits import EXPLAINED, fit_positions, times_vectors
 from slam.bodies.frame import Frame
-from slam.bodies.track_kernels import inverses, squares, weighted_means
+from slam.bodies.track_kernels import LEAST, RIDGE, inverses, squares, weighted_means
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
-from slam.data import BoolArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.tracks.table import Tracks
 
+MARGIN = 0.25  # how far from a body's extent its further features may lie, as a share of the extent's diagonal
+_MOST_POINTS = 80  # cost: members of a body
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of both diagonals
-_PART_EXPLAINED = 0.05  # share of χ² that the motion of a body leaves of what was found of it before
-_FREEDOM = 6.0  # fixed: of a body's pose in every frame
-PROBATION = 12  #: frames in which a body must have moved for certain, and is not told from another one
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join, and
 _INSIDE = 4.0  # up to which it counts as inside, the extent being widened by
 _EDGE = 0.1  # as a share of its diagonal: the outermost points lie beyond the percentiles
@@ -41,33 +37,21 @@ _BETTER_INSIDE = -4.0  # where it lies inside
 _WORSE = -9.0  # a member for which the still world is better by more leaves
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
-_RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
-_APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
-_LEAST_SPREAD = 1e-8  # numerics: variance that is added to that of a known pose [m²]
-_RIDGE = 1e-9  # numerics: share of the trace that keeps 3x3 matrices invertible
-_LEAST = 1e-12  # numerics: variance that is added to that of points known exactly [m²]
 _UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
-_MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 
 
-@dataclass(frozen=True, eq=False)
-class MembershipTest:
-    """How well tracks fit a body, a row each."""
+def membership_test(body: Body, tracks: Tracks, rows: IndexArray) -> tuple[Array, BoolArray, IndexArray]:
+    """Compare the fit of tracks (N,) to a body with that to the still world, over the window.
 
-    gain: Array  # by how much χ² the body explains them better than the still world (N,)
-    fits: BoolArray  # whether the body explains them (N,)
-    count: NDArray[np.int64]  # number of frames that say so (N,)
-
-
-def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> MembershipTest:
-    """Compare the fit of tracks to a body with that to the still world, over the window."""
+    By how much χ² the body explains them better, whether it explains them at all, and the frames that say so (N,) each.
+    """
     points, A, known = in_body_axes(body, tracks, rows)
     dof = np.where(known, tracks.dof[rows], 0)
     fixed, still, count = squares(points, A), _still(tracks, rows, known), known.sum(axis=1)
     limit = _limits(3 * dof.shape[1])[np.maximum(dof.sum(axis=1) - 3, 1)]
     fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
-    return MembershipTest(still - fixed, fits, count)
+    return still - fixed, fits, count
 
 
 @cache
@@ -76,14 +60,14 @@ def _limits(most: int) -> Array:
     return chi_square_limits(np.arange(most + 1), 0.99)
 
 
-def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Body:
+def fitted(body: Body, tracks: Tracks, rows: IndexArray, slot: int) -> Body:
     """A new body with its poses over the window, which were those of a constant velocity, fitted to tracks."""
     body = _with_poses_fitted(replace(body, known=np.asarray(tracks.dof[rows].any(axis=0))), tracks, rows)
     points, A, _ = in_body_axes(body, tracks, rows)
     return with_extent(replace(body, T=body.history[slot]), weighted_means(points, A))
 
 
-def _with_poses_fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
+def _with_poses_fitted(body: Body, tracks: Tracks, rows: IndexArray) -> Body:
     """A body with its poses over the window fitted to what tracks measured."""
     for _ in range(_ROUNDS):
         points, A, _ = in_body_axes(body, tracks, rows)
@@ -96,7 +80,7 @@ def _with_poses_fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Bo
     return body
 
 
-def add_members(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False) -> None:
+def add_members(body: Body, tracks: Tracks, rows: IndexArray, sure: bool = False) -> None:
     """Make tracks members of a body, in place; their points in it are what they measured over the window."""
     if not len(rows):
         return
@@ -106,7 +90,7 @@ def add_members(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool =
     tracks.sure[rows] = sure
 
 
-def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
+def remove_members(tracks: Tracks, rows: IndexArray, body: Body) -> None:
     """Make members free tracks without measurements, in place."""
     if not len(rows):
         return
@@ -115,7 +99,7 @@ def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
     tracks.unfound[rows] = 1
 
 
-def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
+def _release(tracks: Tracks, rows: IndexArray) -> None:
     """Make seen members free tracks that keep their measurements, in place."""
     tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
     fit_positions(tracks, rows)
@@ -127,18 +111,18 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     Inside a body that stereo resolves no proof of motion is needed. Returns by how much χ² each body explains its seen
     members better than the still world (K,).
     """
-    gains, config = {}, frame.setup.config
+    gains: dict[int, Array] = {}
     bodies = {id: body for id, body in every.items() if body.measured}
     for body in bodies.values():
         _improve(body, tracks, frame.slot)
-        gains[body.id] = _expel(body, tracks, config)
+        gains[body.id] = _expel(body, tracks)
     if not bodies:
         return gains
     free = np.flatnonzero((tracks.body < 0) & tracks.found & ~tracks.still)
     free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
     for body in bodies.values():
-        near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
+        near = np.flatnonzero(_distances(body, tracks, free, MARGIN) < _NEAR)
         if not len(near):
             continue
         gain = _gain_of_joining(body, frame.resolves(body.T[:3, 3]), tracks, free[near])
@@ -152,54 +136,41 @@ def update_members(every: Mapping[int, Body], frame: Frame, tracks: Tracks) -> d
     return gains
 
 
-def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[np.intp]) -> Array:
+def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: IndexArray) -> Array:
     """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it."""
     inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
     proof = tracks.expelled[rows] | (not resolved)
-    v = membership_test(body, tracks, rows)
-    may = (
-        v.fits
-        & (v.count >= np.where(proof, _ENOUGH, 2))
-        & (v.gain > np.where(inside & ~proof, _BETTER_INSIDE, _BETTER))
-    )
-    return np.where(may, v.gain, -np.inf)
+    gain, fits, count = membership_test(body, tracks, rows)
+    better = gain > np.where(inside & ~proof, _BETTER_INSIDE, _BETTER)
+    return np.where(better & fits & (count >= np.where(proof, _ENOUGH, 2)), gain, -np.inf)
 
 
-def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
+def _expel(body: Body, tracks: Tracks) -> Array:
     """Remove members that do not fit the body, in place.
 
     Returns the gains of the seen ones that stay (K,), less what the body's poses, fitted to them, gain by chance.
     """
     mine = np.flatnonzero(tracks.body == body.id)
-    v, seen = membership_test(body, tracks, mine), tracks.found[mine]
-    most_fit = v.fits[seen].sum() > _MOST * seen.sum()
-    unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
+    (gain, fits, count), seen = membership_test(body, tracks, mine), tracks.found[mine]
+    most_fit = fits[seen].sum() > _MOST * seen.sum()
+    unfit = ~fits & (count >= _ENOUGH) & most_fit
     stays = tracks.still[mine] & (body.moving | ~tracks.sure[mine])
-    wrong = stays | (tracks.misfit[mine] >= MAX_REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
-    tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
+    wrong = stays | (tracks.misfit[mine] >= RUN) | (seen & ((gain < _WORSE) | unfit))
+    tracks.sure[mine] |= fits & (gain > _BETTER)
     if wrong.any():
         remove_members(tracks, mine[wrong & ~seen], body)
         tracks.expelled[mine[wrong]] = True
         _release(tracks, mine[wrong & seen])
         mine = mine[~wrong]
-    if len(mine) > config.max_points:
+    if len(mine) > _MOST_POINTS:
         worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
         order = np.lexsort((worth, -tracks.unfound[mine]))
-        remove_members(tracks, mine[order[: len(mine) - config.max_points]], body)
+        remove_members(tracks, mine[order[: len(mine) - _MOST_POINTS]], body)
     stay = seen & ~wrong
-    return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
+    return gain[stay] - 6.0 * float(body.known.sum()) / max(int(stay.sum()), 1)
 
 
-def take_to(tracks: Tracks, rows: NDArray[np.intp], change: Array) -> None:
-    """Take the points of members to another frame of their body, by `change` (4, 4), in place."""
-    R = change[:3, :3]
-    tracks.local[rows] = transform(change, tracks.local[rows])
-    tracks.local_information[rows] = R @ tracks.local_information[rows] @ R.T
-
-
-def tracks_on_bodies(
-    bodies: Mapping[int, Body], tracks: Tracks, margin: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def tracks_on_bodies(bodies: Mapping[int, Body], tracks: Tracks) -> tuple[IndexArray, IndexArray]:
     """Rows of seen tracks on a proven body, members or inside its extent, and of those that may lie on any body."""
     seen, known = tracks.found, tracks.body >= 0
     on = np.zeros(len(tracks), bool)
@@ -210,89 +181,53 @@ def tracks_on_bodies(
     for body in bodies.values():
         if not body.measured:
             continue
-        close = free[_distances(body, tracks, free, margin) < _NEAR]
+        close = free[_distances(body, tracks, free, MARGIN) < _NEAR]
         near[close] = True
         inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
         if len(inside) and body.proven:
             asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
-            on[inside[membership_test(body, tracks, inside).gain > asked]] = True
+            on[inside[membership_test(body, tracks, inside)[0] > asked]] = True
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
 
-def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
+def tracks_on(body: Body, tracks: Tracks) -> IndexArray:
     """Rows of the seen tracks that belong to a body, or lie on or near it and belong to none."""
     free = np.flatnonzero(tracks.found & (tracks.body < 0))
-    near = free[_distances(body, tracks, free, margin) < _NEAR]
+    near = free[_distances(body, tracks, free, MARGIN) < _NEAR]
     return np.concatenate([np.flatnonzero(tracks.found & (tracks.body == body.id)), near])
 
 
-def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
-    """The body in or beside which most of these tracks lie and whose motion explains them; None for none.
-
-    In it as far as its pose is known; beside it, as far as `own`, a body of them alone, is long, as one rigid body's.
-    """
-    for body in bodies.values():
-        near = _distances(body, tracks, rows, _MERGED * (1.0 + own.across / body.across)) < _NEAR
-        if not body.measured or 2 * near.sum() <= len(rows) or _explained(body, tracks, rows) >= 2 * EXPLAINED:
-            continue
-        inside = 2 * (_distances(body, tracks, rows, _MERGED) < _NEAR).sum() > len(rows)
-        if body.seen <= PROBATION or (inside and not _moves_otherwise(body, own, tracks, rows)):
-            return body
-        if not inside and distinctness(own, rows, body, _members(tracks, body.id), tracks) < 1.0:
-            return body
-    return None
-
-
-def _moves_otherwise(body: Body, own: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
-    """Whether `own`, a body made of these tracks alone, leaves far less χ² than chance would make of the body's.
-
-    In every frame the tracks share the displacement by the error of the body's pose, of known covariance.
-    """
-    alone = float(squares(*in_body_axes(own, tracks, rows)[:2]).sum())
-    points, A, known = in_body_axes(body, tracks, rows)
-    y = weighted_means(points, A)
-    pull = times_vectors(A, points - y[:, None]).sum(axis=0)
-    pose = np.linalg.inv(spread_of_place(body, y.mean(axis=0)) + _LEAST_SPREAD * np.eye(3))
-    shared = (pull * np.linalg.solve(A.sum(axis=0) + pose, pull[..., None])[..., 0]).sum()
-    certain = float(squares(points, A).sum() - shared)
-    by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
-    return certain - alone > _APART * by_chance and certain > 2 * _APART * alone
-
-
-def _explained(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> float:
+def _explained(body: Body, tracks: Tracks, rows: IndexArray) -> float:
     """Which share of the χ² of tracks that stand still the motion of a body leaves."""
     points, A, known = in_body_axes(body, tracks, rows)
-    return float(squares(points, A).sum()) / max(float(_still(tracks, rows, known).sum()), _LEAST)
+    return float(squares(points, A).sum()) / max(float(_still(tracks, rows, known).sum()), LEAST)
 
 
 def reappeared(bodies: Mapping[int, Body], new: Body, max_speed: float) -> Body | None:
     """The body out of view that a new one is, by position and velocity, perhaps seen from another side; else None.
 
-    The middle of what is seen may be off the body's by half its size, and no body is faster than `max_speed` [m/s].
+    The middle of what is seen may be off the body's by half its size, and no body is faster than `max_speed` [m/s]. A
+    body of its own may be anywhere within that, with any velocity: the known one must explain the new one better.
     """
-    best, least = None, _RETURNED
+    best, least = None, chi_square_limit(6, 0.99)
     for body in bodies.values():
         if body.measured or not body.proven:
             continue
-        gap, size = new.middle - body.middle, 0.5 * (body.across + new.across)
-        if np.linalg.norm(gap) > size + max_speed * (new.seen_at - body.seen_at):
-            continue
+        gap = new.middle - body.middle
+        reach = 0.5 * (body.across + new.across) + max_speed * (new.seen_at - body.seen_at)
         R, spread = body.T[:3, :3], spread_of_place(body, 0.5 * (body.lower + body.upper))
         place = R @ spread @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
         change = new.velocity[3:] - body.velocity[3:]
         velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
         off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))
-        if off < least:
+        anywhere = 2.0 * np.log((4.0 / 3.0 * np.pi) ** 2 * (reach * max_speed) ** 3)  # as −2 log of its density
+        known = off + float(np.linalg.slogdet(2 * np.pi * place)[1] + np.linalg.slogdet(2 * np.pi * velocity)[1])
+        if np.linalg.norm(gap) <= reach and off < least and known < anywhere:
             best, least = body, off
     return best
 
 
-def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
-    """Whether the members `rows` of another body have moved with this one all the time: hardly any χ² is left."""
-    return len(rows) > 0 and _explained(whole, tracks, rows) < _PART_EXPLAINED
-
-
-def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
+def distinctness(one: Body, ones: IndexArray, other: Body, others: IndexArray, tracks: Tracks) -> float:
     """How far tracks of two bodies are from having moved like one rigid body; from 1 on they have not.
 
     The increase of χ² if all share the poses of one, relative to the larger of its 99 % limit and that of motions that
@@ -301,7 +236,7 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     both = one.known & other.known
     one, other = replace(one, known=both), replace(other, known=both)
 
-    def left(body: Body, rows: NDArray[np.intp]) -> float:
+    def left(body: Body, rows: IndexArray) -> float:
         return float(squares(*in_body_axes(_with_poses_fitted(body, tracks, rows), tracks, rows)[:2]).sum())
 
     every = np.concatenate([ones, others])
@@ -311,12 +246,12 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
 
 
-def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float) -> Array:
+def _distances(body: Body, tracks: Tracks, rows: IndexArray, margin: float) -> Array:
     """Squared distances (N,) of tracks from a body's extent, widened by a share `margin`, in their own noise."""
     wider = margin * body.across
     local = transform(inverse(body.T), tracks.position[rows])
     away = (local - np.clip(local, body.lower - wider, body.upper + wider)) @ body.T[:3, :3].T
-    P = inverses(tracks.covariance[rows], _RIDGE, _LEAST)
+    P = inverses(tracks.covariance[rows], RIDGE, LEAST)
     return np.asarray((away * times_vectors(P, away)).sum(axis=1))
 
 
@@ -328,71 +263,73 @@ def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     turned = R.T @ t.A[mine, slot] @ R
     total = t.local_information[mine] + turned
     t.local_information[mine] = total
-    t.local[mine] += times_vectors(inverses(total, _RIDGE, 0.0), times_vectors(turned, gap))
+    t.local[mine] += times_vectors(inverses(total, RIDGE, 0.0), times_vectors(turned, gap))
 
 
-def _still(tracks: Tracks, rows: NDArray[np.intp], known: BoolArray) -> Array:
+def _still(tracks: Tracks, rows: IndexArray, known: BoolArray) -> Array:
     """χ² (N,) of "one fixed point in the world" in the slots of tracks that are `known` (N, W)."""
     return squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))
 
 
 def merge(bodies: dict[int, Body], tracks: Tracks) -> None:
-    """Merge bodies that move as an older one does, in place: young ones at once, others only if that lasts.
+    """Make one of two bodies that have moved as one, in place, under the older id.
 
-    The parts of an articulated body move alike now and then.
+    Young bodies are merged at once; old ones, and parts of the other, only if that lasts: the parts of an articulated
+    body move alike now and then. What has clearly moved apart once is never one again.
     """
     for id in sorted(bodies, reverse=True):
-        body = bodies.get(id)  # it may have taken the place of another
-        if body is None or not body.measured:
+        body, mine, whole = bodies[id], _members(tracks, id), None
+        if not body.measured:
             continue
-        mine = _members(tracks, id)
-        whole = bodies.get(-1 if body.apart_from is None else body.apart_from)
-        if (
-            whole is not None and whole.measured and whole.id not in body.distinct
-            and distinctness(body, mine, whole, _members(tracks, whole.id), tracks) > _DISTINCT
-        ):  # fmt: skip
-            body = bodies[id] = replace(body, distinct=body.distinct | {whole.id})
-        older = {id: b for id, b in bodies.items() if id < body.id and id not in body.distinct}
-        whole = body_around(older, tracks, mine, body)
-        alike = body.alike + 1 if whole is not None else 0
-        body = bodies[id] = replace(body, alike=alike) if alike != body.alike else body
-        young = body.seen < _MERGES and (whole is None or whole.id != body.apart_from)
-        if whole is not None and (young or alike > _MERGES):
+        for other in [b for b in bodies.values() if b.id < id and b.measured and b.id not in body.distinct]:
+            apart = _apart(body, mine, other, _members(tracks, other.id), tracks)
+            if apart > _DISTINCT:
+                body = replace(body, distinct=body.distinct | {other.id})
+            elif apart < 1.0 and whole is None:
+                whole = other
+        body = bodies[id] = replace(body, alike=0 if whole is None else body.alike + 1)
+        if whole is None or not (body.alike > 2 * WINDOW or (body.seen < 2 * WINDOW and whole.id != body.apart_from)):
+            continue
+        theirs = _members(tracks, whole.id)
+        if len(theirs) >= len(mine):
             add_members(whole, tracks, mine, sure=True)
-            del bodies[id]
             tracks.give_up(np.flatnonzero(tracks.body == id))
-        elif whole is None and young:
-            _outgrow(bodies, body, list(older.values()), tracks)
+        else:
+            bodies[whole.id] = _in_place_of(whole, body, theirs, tracks)
+            tracks.body[tracks.body == id] = whole.id
+        del bodies[id]
 
 
-def _outgrow(bodies: dict[int, Body], body: Body, older: list[Body], tracks: Tracks) -> None:
-    """Let a young body replace older ones with the same motion of which fewer members are seen."""
-    for known in older:
-        mine, theirs = _members(tracks, body.id), _members(tracks, known.id)
-        larger = known.measured and known.id != body.apart_from and len(theirs) < len(mine)
-        near = math.dist(body.middle, known.middle) <= body.across + known.across
-        if not (larger and near and moves_with(body, tracks, theirs)):
-            continue
-        apart = distinctness(body, mine, known, theirs, tracks)
-        if apart > _DISTINCT:  # they are never one again
-            body = bodies[body.id] = replace(body, distinct=body.distinct | {known.id})
-        elif apart < 1.0:
-            bodies[known.id] = _in_place_of(known, body, theirs, tracks)
-            tracks.body[tracks.body == body.id] = known.id
-            del bodies[body.id]
-            return
+def _apart(body: Body, mine: IndexArray, other: Body, theirs: IndexArray, tracks: Tracks) -> float:
+    """How far a body is from being one with an older one, see `distinctness`: below 1 it is, from 1 on it may not be.
+
+    The one of which more is seen must explain the other, which lies in or beside it. A fresh body is no more than that.
+    """
+    part, larger = other.id == body.apart_from, len(theirs) >= len(mine)
+    whole, few, rows = (other, body, mine) if larger else (body, other, theirs)
+    near = _distances(whole, tracks, rows, _MERGED * (1.0 + few.across / whole.across)) < _NEAR
+    beside = 2 * near.sum() > len(rows)
+    explained = beside and _explained(whole, tracks, rows) < 2 * EXPLAINED
+    if explained and larger and not part and body.seen <= WINDOW:
+        return 0.0
+    if not (explained or part):
+        return 1.0
+    apart = distinctness(body, mine, other, theirs, tracks)
+    return apart if explained else max(apart, 1.0)
 
 
-def _in_place_of(known: Body, body: Body, mine: NDArray[np.intp], tracks: Tracks) -> Body:
+def _in_place_of(known: Body, body: Body, mine: IndexArray, tracks: Tracks) -> Body:
     """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
     tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.found))
     grown = continued(body, known)
-    own = np.flatnonzero(tracks.body == body.id)
-    take_to(tracks, own, inverse(grown.T) @ body.T)
+    own, change = tracks.body == body.id, inverse(grown.T) @ body.T
+    R = change[:3, :3]
+    tracks.local[own] = transform(change, tracks.local[own])
+    tracks.local_information[own] = R @ tracks.local_information[own] @ R.T
     add_members(grown, tracks, mine, sure=True)
     return grown
 
 
-def _members(tracks: Tracks, id: int) -> NDArray[np.intp]:
+def _members(tracks: Tracks, id: int) -> IndexArray:
     """Rows of a body's seen members."""
     return np.flatnonzero((tracks.body == id) & tracks.found)

@@ -17,13 +17,13 @@ PRIOR = np.array([1e-4] * 3 + [1e-6] * 3)  #: keeps Λ of nearly collinear track
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
 _SOFT, _SHARP = 3, 2  # numerics: rounds of reweighting: Huber's first, which has one minimum, then a sharper one
 LARGEST = 0.4  #: share of all tracks that a body may have: the still world has most
-_FITS = 14.2  # derived: χ²(3) at 99.7 % of a member and its group's motion
+FITS = 14.2  #: derived: χ²(3) at 99.7 %, of a track and a common motion
 _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
 _BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
 _BETTER_AROUND = 6.0  # where it lies outside the window
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
 _MOST = 20  # cost: windows looked into for the next group
-_MEDIAN = chi_square_limit(3, 0.5)  # of χ²(3)
+MEDIAN = chi_square_limit(3, 0.5)  #: of χ²(3)
 
 # ---------------------------------------------------------------------------------------------- a common motion
 
@@ -198,13 +198,13 @@ def _window_tests(starts, tracks, L, eta, alone, scale, rest, asked, support, la
 
 
 @kernel
-def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, support, least_scale):
+def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, support):
     """Groups of tracks that moved alike, and otherwise than the rest: the clearest first, until there is none.
 
     Tracks have sums as of `normal_equations` and are seen at `place` (N, 3). Windows of `centres` and `widths` (M, 3)
     have `starts` (M + 1,) in the list of their `tracks`; `asked` (N + 1,) is the χ²(6) from which one with so many
     moved. Returns the group of each track (N,), −1 for the rest; χ²(6) of each group (G,); χ²(3) of every track against
-    the rest (N,); the rest's common motion (6,); and the ratio by which χ² was divided, `least_scale` at least.
+    the rest (N,); the rest's common motion (6,); and the ratio by which χ² was divided, 1 at least.
     """
     n = len(dWd)
     work = np.empty(n), np.empty(21), np.empty(6), np.empty(21), np.empty((6, 6))
@@ -216,7 +216,7 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
     while True:
         _common_motion(L, eta, dWd, rest, work, common)
         _squares_against(L, eta, dWd, common, 1.0, work[3], alone)
-        scale = max(least_scale, np.median(alone[rest]) / _MEDIAN)
+        scale = max(1.0, np.median(alone[rest]) / MEDIAN)
         for m in range(n):
             alone[m] /= scale
             doubted[m] = not rest[m]
@@ -249,7 +249,7 @@ def groups_apart(L, eta, dWd, place, starts, tracks, centres, widths, asked, sup
                 _squares_against(L, eta, dWd, motion, scale, work[3], fits)
                 found = 0
                 for m in range(n):
-                    rows[m] = rest[m] and fits[m] < max(_FITS, _EXPLAINED * apart[m])
+                    rows[m] = rest[m] and fits[m] < max(FITS, _EXPLAINED * apart[m])
                     rows[m] = rows[m] and apart[m] - fits[m] > (_BETTER if seeds[m] else _BETTER_AROUND)
                     for axis in range(3):
                         off = abs(place[m, axis] - centres[window, axis])

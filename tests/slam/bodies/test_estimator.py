@@ -16,7 +16,6 @@ from slam.data import Observations, RecentPoses
 from slam.errors import ConfigurationError
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry import se3
-from slam.interfaces import RecentBackend
 from slam.models import ObjectModels
 from slam.object_data import ObjectEstimate
 from slam.window.stereo import RectifiedStereo
@@ -236,33 +235,7 @@ def test_too_few_points_begin_no_body():
         assert BodyEstimator(scene.rig, scene.models).updated(None, 1, wrong, camera) is None
 
 
-def test_the_same_input_gives_the_same_bytes_and_changes_nothing_else():
-    scene = box_scene(seed=15, frames=8)
-    runs = [list(follow("ekf", scene)) for _ in range(2)]
-    for (_, a, X), (_, b, Y) in zip(*runs):
-        for name in ("T_world_object", "covariance", "velocity", "velocity_covariance"):
-            np.testing.assert_array_equal(getattr(a.estimate, name), getattr(b.estimate, name))
-        np.testing.assert_array_equal(X, Y)
-
-
 # --- the camera's last poses ---
-
-
-class _Knows:
-    """A back end that knows its last poses."""
-
-    def __init__(self, poses):
-        self.poses = poses
-
-    def recent(self, n):
-        return RecentPoses(self.poses.stamps[-n:], self.poses.poses[-n:], self.poses.covariance[-6 * n :, -6 * n :])
-
-
-def test_recent_poses_are_the_back_ends_own_if_it_has_them():
-    path = RecentPoses(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)), np.eye(18))
-    backend = _Knows(path)
-    assert isinstance(backend, RecentBackend)
-    assert len(recent_poses(backend, 2, path, np.eye(6))) == 2
 
 
 def test_derived_recent_poses():

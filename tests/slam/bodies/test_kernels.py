@@ -16,17 +16,6 @@ def windows():
     return A, 0.1 * RNG.standard_normal((TRACKS, SLOTS, 3)), np.where(A[..., 0, 0] > 0, 3, 0).astype(np.int8)
 
 
-def test_fixed_points_solve_the_normal_equations():
-    A, p, _ = windows()
-    anchor, position, covariance = RNG.standard_normal((TRACKS, 3)), np.zeros((TRACKS, 3)), np.zeros((TRACKS, 3, 3))
-    track_kernels.fit_fixed_points(A, p, anchor, np.array([0, 3]), position, covariance)
-    for n in (0, 3):
-        P = np.linalg.inv(A[n].sum(axis=0))
-        np.testing.assert_allclose(covariance[n], P, rtol=1e-6)  # 1e-9 of the trace on the diagonal, condition < 1e3
-        np.testing.assert_allclose(position[n] - anchor[n], P @ np.einsum("wij,wj->i", A[n], p[n]), atol=1e-7)
-    assert not position[1].any()
-
-
 def test_constant_velocities_are_least_squares_in_point_and_velocity():
     A, p, _ = windows()
     times = np.linspace(-0.5, 0.0, SLOTS)

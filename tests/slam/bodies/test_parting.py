@@ -7,7 +7,7 @@ import pytest
 
 import slam
 from frontends import create
-from slam.bodies.config import ObjectsConfig
+from slam.bodies.config import WINDOW, ObjectsConfig
 from slam.bodies.detector import MovingObjectDetector
 from slam.bodies.fits import fit_positions, make_room, record
 from slam.config import SystemConfig
@@ -18,7 +18,7 @@ from slam.tracks.table import Tracks
 from tests.slam.scene import RIG
 
 SIGMA = 0.3  # pixel noise [px]; the detector is told one pixel
-FRAMES = ObjectsConfig().window
+FRAMES = WINDOW
 IDENTITY = np.eye(4)
 
 
@@ -53,7 +53,7 @@ class Room:
         self.points[:near] = np.column_stack([rng.uniform(-0.07, 0.07, (near, 2)), rng.uniform(0.95, 1.05, near)])
         self.near, self.ids = near, np.arange(count)
         self.detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
-        self.tracks = tracks = Tracks.empty(16, ObjectsConfig().window, count)
+        self.tracks = tracks = Tracks.empty(16, WINDOW, count)
         tracks.ids[:] = tracks.row[:] = self.ids
         tracks.begin(self.ids, self.ids, features_at(np.zeros((count, 3))), self.points)
         for frame in range(frames):

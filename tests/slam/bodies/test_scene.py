@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from slam.bodies.bodies import in_body_axes
-from slam.bodies.finder import _SIZES, Displacements, _full_windows, classify_scene, displacements, tail
+from slam.bodies.finder import Displacements, classify_scene, moved_in, tail
 from slam.geometry.se3 import hat, transform
 from tests.slam.bodies.test_membership import SIGMA, SLOT, TIMES, WINDOW, body_along, path, seen_from, table
 
@@ -28,14 +30,14 @@ def scene(count=80, near=12, shift=(0.0, 0.0, 0.0), pose_error=(0.0,) * 6, noise
 def test_a_wrong_pose_moves_nothing():
     """A rotation of 20 mrad and a shift of 2 cm displace every point by more than ten deviations."""
     moved, view = scene(pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
-    found = classify_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0)
     assert not found.groups
     assert found.alone.max() < 30  # χ²(3) of 80 points: 99.9999 %
 
 
 def test_the_near_group_is_found_though_the_pose_is_wrong():
     moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
-    found = classify_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0)
     assert len(found.groups) == 1
     assert set(found.groups[0].members) <= set(range(12)) and len(found.groups[0].members) >= 10
     assert abs(found.groups[0].away - 0.006) < 0.002
@@ -44,13 +46,13 @@ def test_the_near_group_is_found_though_the_pose_is_wrong():
 def test_where_the_near_group_rules_the_pose_it_is_still_the_one_that_moves():
     """The pose follows the box, so that its own points stand still and the wall is displaced."""
     moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.0, 0.0, -0.006, 0.0, 0.0]))
-    found = classify_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0)
     assert len(found.groups) == 1 and set(found.groups[0].members) <= set(range(12))
 
 
 def test_too_few_tracks_say_nothing():
     moved, view = scene(count=8, near=4, shift=(0.1, 0, 0))
-    assert not classify_scene(moved, view, 30.0, 4).groups
+    assert not classify_scene(moved, view, 30.0).groups
 
 
 def test_single_false_tracks_find_no_company():
@@ -58,7 +60,7 @@ def test_single_false_tracks_find_no_company():
     moved, view = scene()
     for row, jump in zip((20, 40, 60), np.eye(3)):
         moved.d[row] += 0.5 * jump
-    found = classify_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0)
     assert not found.groups
     assert set(np.flatnonzero(found.alone > 100)) == {20, 40, 60}
 
@@ -71,7 +73,7 @@ def test_two_groups_that_move_differently_are_two():
         [moved.points[second, :2] / moved.points[second, 2:], np.log(moved.points[second, 2])]
     )
     moved.d[second] += (0.0, -0.008, 0.0)
-    found = classify_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0)
     assert len(found.groups) == 2
     assert {frozenset(g.members <= 11) for g in found.groups} == {frozenset({True}), frozenset({False})}
 
@@ -84,7 +86,7 @@ def test_where_errors_have_heavy_tails_a_small_group_that_agrees_by_chance_does_
         if spoilt:
             third = RNG.permutation(np.arange(12, 80))[:27]
             moved.d[third] += 4e-3 * RNG.standard_normal((27, 3))
-        found[spoilt] = classify_scene(moved, view, 20.0, 4)
+        found[spoilt] = classify_scene(moved, view, 20.0)
     assert len(found[False].groups) == 1
     assert not found[True].groups
     assert tail(found[True].alone) > 1.5 > tail(found[False].alone)
@@ -100,28 +102,8 @@ def test_three_bodies_with_a_third_of_the_tracks_do_not_hide_each_other():
         )
         view[rows] = np.column_stack([moved.points[rows, :2] / moved.points[rows, 2:], np.log(moved.points[rows, 2])])
         moved.d[rows] += shift
-    found = classify_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0)
     assert sorted(int(group.members.min()) // 24 for group in found.groups) == [0, 1, 2]
-
-
-def test_windows_hold_all_tracks_of_their_cells():
-    """Against a dictionary of cells, for every size and offset; tracks ascend, and so do the cells."""
-    rng = np.random.default_rng(5)
-    place, sizes, support = rng.uniform(-0.3, 0.3, (120, 3)), _SIZES, 4
-    starts, tracks, centres, widths = _full_windows(place, support)
-    expected = []
-    for size in sizes:
-        for offset in np.ndindex(2, 2, 2):
-            cells: dict[tuple, list[int]] = {}
-            for n, cell in enumerate(np.floor(place / size + 0.5 * np.array(offset)).astype(int).tolist()):
-                cells.setdefault(tuple(cell), []).append(n)
-            full = sorted(cell for cell, inside in cells.items() if len(inside) >= support)
-            expected += [(size * (np.array(cell) + 0.5 - 0.5 * np.array(offset)), size, cells[cell]) for cell in full]
-    assert len(expected) == len(centres) > 20
-    for m, (centre, width, inside) in enumerate(expected):
-        assert tracks[starts[m] : starts[m + 1]].tolist() == inside
-        np.testing.assert_allclose(centres[m], centre, atol=1e-12)
-        np.testing.assert_allclose(widths[m], width)
 
 
 @pytest.mark.parametrize(("speed", "count"), [(0.15, 1), (0.0, 0)])
@@ -133,8 +115,9 @@ def test_a_drawer_is_found_only_while_it_is_pulled_out(speed: float, count: int)
     pulled = np.stack([transform(T, drawer - speed * t * np.array([0, 0, 1.0])) for T, t in zip(poses, TIMES)], axis=1)
     pulled += SIGMA * rng.standard_normal(pulled.shape)
     tracks = table(np.concatenate([seen_from(poses, chest, 1), pulled]))
-    inside = in_body_axes(body_along(poses, rows, tracks), tracks, rows)
-    moved = displacements(tracks, rows, (SLOT - np.arange(WINDOW)) % WINDOW, np.zeros((WINDOW, 3)), 0.0, inside)
+    ages, none = (SLOT - np.arange(WINDOW)) % WINDOW, np.tile(np.eye(4), (WINDOW, 1, 1))
+    frame: Any = SimpleNamespace(ages=ages, poses=none, eye=np.zeros(3), setup=SimpleNamespace(slide=0.0))
+    moved = moved_in(body_along(poses, rows, tracks), tracks, rows, frame)
     place = np.column_stack([tracks.position[rows, :2], np.log(tracks.position[rows, 2])])
-    groups = classify_scene(moved, place, 20.0, 4).groups
+    groups = classify_scene(moved, place, 20.0).groups
     assert [group.members.tolist() for group in groups] == [list(range(24, 30))][:count]
