@@ -169,25 +169,27 @@ def _against(d: Difference) -> dict[str, str]:
 
 
 def sentences(group: Group) -> list[str]:
-    """Which back end is better than the first in what, a sentence for each other one.
-
-    Said is what can be told apart, of the main figures. Then come the runs that failed, if any.
-    """
-    reference, *others = group.runs
-    sure, found = (Verdict.CERTAIN, Verdict.LIKELY), []
-    for other in others:
-        every = [group.compared[metric.key][other] for metric in group.metrics if metric.main]
-        told = [d for d in every if d.verdict in sure and not _is_trifle(d)]
-        parts = []
-        for better, first, second in ((True, other, reference), (False, reference, other)):
-            names = [f"{d.metric.label.partition(' (')[0]} ({d.verdict.value})" for d in told if d.better is better]
-            if names:
-                parts.append(f"{first} is better than {second} in {', '.join(names)}")
-        found.append(f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}.")
+    """`in_short` of each back end but the first, and the runs that failed, if any."""
+    first, *others = group.runs
+    found = [
+        in_short([group.compared[metric.key][other] for metric in group.metrics], first, other) for other in others
+    ]
     if counts := [f"{n} of {group.trials} of {backend}" for backend in group.runs if (n := group.failures(backend))]:
         failed = "a trial in which either failed is no pair, and is in no other figure."
         found.append(f"Runs failed, {', '.join(counts)}: {failed}")
     return found
+
+
+def in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
+    """Which of two back ends is better in what, in one sentence: in the main figures that can be told apart."""
+    sure = (Verdict.CERTAIN, Verdict.LIKELY)
+    told = [d for d in differences if d.metric.main and d.verdict in sure and not _is_trifle(d)]
+    parts = []
+    for better, first, second in ((True, other, reference), (False, reference, other)):
+        names = [f"{d.metric.label.partition(' (')[0]} ({d.verdict.value})" for d in told if d.better is better]
+        if names:
+            parts.append(f"{first} is better than {second} in {', '.join(names)}")
+    return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
 
 
 def honesty(group: Group) -> list[str]:
