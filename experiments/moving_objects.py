@@ -14,6 +14,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, rotation_angle, so3_exp, so3_log
 from slam.object_data import MovingObject
-from slam.papers.procedure1 import ObjectDatabase, Procedure1Detector
+from slam.papers.procedure1 import ObjectDatabase
 
 BACKENDS = ("ekf", "smoother", "window")
 PARTS = ("table1", "moving", "boxes", "occlusion", "still", "people", "kitti", "cyclists")
@@ -82,29 +83,32 @@ def table1(quick: bool, out: Path) -> list[dict[str, Any]]:
     frames = 40 if quick else len(sequence)
     true = np.array([sequence.objects(k)[0] for k in range(frames)])
     rows = []
-    for backend in BACKENDS:
-        for mode in ("detect", "procedure1"):
-            system = system_for(sequence, backend, [])
-            if mode == "procedure1":
-                system.objects = known_box(sequence, system, *seen_in(name, frames)[0])
-            poses: dict[int, dict[int, np.ndarray]] = {}
-            world = None
-            for k, result, _ in steps(name, system, frames):
-                if world is None:
-                    world = inverse(result.estimate.T_world_left @ inverse(sequence.ground_truth.poses[0]))
-                for thing in result.objects:
-                    poses.setdefault(thing.id, {})[k] = world @ thing.estimate.T_world_object
-            longest = max(poses.values(), key=len, default={})
-            rows += place_rows(sequence, true, longest, backend, mode)
+    with TemporaryDirectory() as folder:
+        database = Path(folder) / "box.npz"
+        known_box(sequence, *seen_in(name, frames)[0]).save(database)
+        known = [f"objects.database={database}", "objects.mode=procedure1"]
+        systems = [
+            (backend, mode, system_for(sequence, backend, settings))
+            for backend in BACKENDS
+            for mode, settings in (("detect", []), ("procedure1", known))
+        ]
+    for backend, mode, system in systems:
+        poses: dict[int, dict[int, np.ndarray]] = {}
+        world = None
+        for k, result, _ in steps(name, system, frames):
+            if world is None:
+                world = inverse(result.estimate.T_world_left @ inverse(sequence.ground_truth.poses[0]))
+            for thing in result.objects:
+                poses.setdefault(thing.id, {})[k] = world @ thing.estimate.T_world_object
+        longest = max(poses.values(), key=len, default={})
+        rows += place_rows(sequence, true, longest, backend, mode)
     return rows
 
 
-def known_box(sequence: Any, system: slam.StereoSlam, features: StereoFeatures, labels: Any) -> Procedure1Detector:
-    """The papers' detector with the box's features of the first frame."""
-    start = np.eye(4) if system.config.models.T_world_left is None else system.config.models.initial_pose
+def known_box(sequence: Any, features: StereoFeatures, labels: Any) -> ObjectDatabase:
+    """What the papers' detector knows: the box's features in the first frame, in which the camera is the world."""
     corner = inverse(sequence.ground_truth.poses[0]) @ sequence.objects(0)[0]
-    database = ObjectDatabase.of(features, labels == 1, sequence.rig, start, (start @ corner)[:3, 3])
-    return Procedure1Detector(sequence.rig, system.config.objects, system.config.models, database)
+    return ObjectDatabase.of(features, labels == 1, sequence.rig, np.eye(4), corner[:3, 3])
 
 
 def place_rows(sequence: Any, true: Any, poses: dict[int, Any], backend: str, mode: str) -> list[dict[str, Any]]:

@@ -48,11 +48,15 @@ def _set(library: LibController, threads: int) -> None:
 class _Call:
     """A call that is under way."""
 
+    def __init__(self) -> None:
+        self.before: list[tuple[LibController, int]] = []  # numbers of this thread, which other threads cannot set back
+
 
 class _Limit:
     """The number of BLAS threads is 1 as long as any thread is inside; the last one out sets back what was changed.
 
-    Calls that an interrupt ended on their way in or out leave no more than a token, which goes with them.
+    Calls that an interrupt ended on their way in or out leave a token, which goes with them, and numbers that the next
+    call sets back.
     """
 
     def __init__(self) -> None:
@@ -61,16 +65,19 @@ class _Limit:
 
     def enter(self, call: _Call) -> None:
         for library in _blas(len(sys.modules)):
-            threads = library.get_num_threads()  # of the process; with OpenMP, of this thread
+            threads = library.get_num_threads()
             if threads != 1:
-                self._before.append((library, threads))
+                of_thread = getattr(library, "threading_layer", "") == "openmp"
+                (call.before if of_thread else self._before).append((library, threads))
                 _set(library, 1)
         self._inside.add(call)
 
     def leave(self, call: _Call) -> None:
         self._inside.discard(call)
-        while self._before and not self._inside:
-            _set(*self._before.pop())
+        for before in (call.before, [] if self._inside else self._before):
+            while before:
+                _set(*before[-1])
+                before.pop()
 
 
 _limit, _lock = _Limit(), RLock()
