@@ -3,7 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slam.config import SystemConfig
 from slam.data import StereoFeatures
+from slam.system import StereoSlam
 from slam.tracks.config import MapConfig
 from slam.tracks.mapper import (
     MapView,
@@ -24,7 +26,7 @@ CONFIG = MapConfig(target_in_view=20, separation=5.0)
 def features_at(uv, depth=3.0, response=None):
     uv = np.asarray(uv, float)
     n = len(uv)
-    right = uv - [RIG.left.fu * RIG.baseline / depth, 0]
+    right = uv - np.outer(RIG.left.fu * RIG.baseline / depth * np.ones(n), [1, 0])
     d = np.eye(16, dtype=np.float32)[np.arange(n) % 16]
     response = np.ones(n) if response is None else np.asarray(response, float)
     return StereoFeatures(0.0, uv, right, np.ones(n), np.zeros(n), response, np.ones(n, np.int8), d)
@@ -34,6 +36,14 @@ def chosen(features, occupied=(), config=CONFIG, free=None):
     free = np.ones(len(features), bool) if free is None else free
     deep = depth_is_known(RIG, features, np.arange(len(features)), 1.0, config.max_depth_error)
     return new_landmarks(features, free & deep, np.asarray(occupied, float).reshape(-1, 2), RIG, config)
+
+
+def test_features_of_uncertain_depth_do_not_become_landmarks():
+    uv = np.stack(np.meshgrid(np.arange(60, 300, 40), np.arange(40, 200, 40)), axis=-1).reshape(-1, 2)
+    far = np.arange(len(uv)) % 2 == 1
+    system = StereoSlam(RIG, None, "ekf", config=SystemConfig(map=MapConfig(target_in_view=40)))
+    system.process_features(features_at(uv, np.where(far, 60.0, 3.0)))
+    assert (system.estimate().positions[:, 2] < 4.0).all() and len(system.landmarks) == (~far).sum()
 
 
 def rows_with(**columns):
