@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from slam.runtime import compilation
 from slam.runtime.compilation import compile_clock, working_time
 
 
@@ -50,3 +51,14 @@ def test_after_warming_up_nothing_is_left_to_compile_or_to_load_and_each_kernel_
     done = subprocess.run([sys.executable, "-c", WARM_UP], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not done.stdout.split(), "never called, or compiled for several types or layouts of arrays"
+
+
+def test_a_stage_that_is_entered_again_adds_its_time(monkeypatch):
+    """A step whose past is revised predicts twice, and one that begins anew does all stages twice."""
+    clock = iter([0.0, 0.05, 1.0, 1.02])
+    monkeypatch.setattr(compilation, "working_time", lambda: next(clock))
+    stages = compilation.Stages()
+    for _ in range(2):
+        with stages.stage("predict"):
+            pass
+    assert stages.milliseconds["predict"] == pytest.approx(70.0)
