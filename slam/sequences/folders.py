@@ -92,7 +92,7 @@ def _found(path: Path) -> Side:
     if "*" in path.name:
         names = [name for name in image_names(path.parent) if Path(name).match(path.name)]
         if not names:
-            raise SequenceError(f"{path}: no image has such a name")
+            raise SequenceError(f"{path}: no images have such a name")
         return path.parent, names
     if not path.exists():
         raise SequenceError(f"{path}: there is no such folder or video")
