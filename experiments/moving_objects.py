@@ -86,7 +86,7 @@ def table1(quick: bool, out: Path) -> list[dict[str, Any]]:
         for mode in ("detect", "procedure1"):
             system = system_for(sequence, backend, [])
             if mode == "procedure1":
-                system.objects = known_box(sequence, system, *seen_in(name, frames)[0])
+                system._tracker.objects = known_box(sequence, system, *seen_in(name, frames)[0])
             poses: dict[int, dict[int, np.ndarray]] = {}
             world = None
             for k, result, _ in steps(name, system, frames):
