@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from slam.atlas.config import AtlasConfig
 from slam.bodies.config import ObjectsConfig
+from slam.bounds import MOST
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
 from slam.models import EstimatorModels, models_for, require_not_negative
@@ -128,16 +129,27 @@ _GIVEN = ("self", "rig", "models")
 def _built(kind: Any, tree: Mapping[str, Any], where: str = "") -> Any:
     """A dataclass of settings, and those in it, from a tree of plain types; `where` is its place in the whole."""
     if not isinstance(tree, Mapping):
-        raise ConfigurationError(f"settings must be an object, got {tree!r:.80}")
+        what = f"setting {where[:-1]}" if where else "settings"
+        raise ConfigurationError(f"{what} must be an object, got {tree!r:.80}")
     hints, names, values = get_type_hints(kind), {f.name for f in fields(kind)}, {}
     for key, value in tree.items():
         if key not in names:
             raise ConfigurationError(f"setting {where}{key}: there is no such setting in this version")
         if is_dataclass(hints[key]):
             value = _built(hints[key], value, f"{where}{key}.")
-        values[key] = tuple(value) if isinstance(value, list) else value
+        values[key] = _as_hinted(value, hints[key])
     try:
         return kind(**values)
     except ConfigurationError as error:
         said = str(error).removeprefix(f"{where[:-1].rpartition('.')[2]}: ")  # the section names itself
         raise ConfigurationError(f"setting {where}{said}") from None
+
+
+def _as_hinted(value: Any, hint: Any) -> Any:
+    """A value of a text as the field has it: ``3`` is 3.0 where numbers need not be whole, a list is a tuple."""
+    if isinstance(value, list):
+        inner = next(iter(get_args(hint)), None)
+        return tuple(_as_hinted(one, inner) for one in value)
+    if hint is float and type(value) is int and abs(value) <= MOST:
+        return float(value)
+    return value

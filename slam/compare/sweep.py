@@ -221,8 +221,10 @@ def read_run(trial: Trial, out: Path) -> Run:
 
 
 def is_done(trial: Trial, out: Path) -> bool:
-    """Whether the trial has ended before."""
+    """Whether the trial has ended before, with these settings and frames, which its folder's name does not tell."""
     try:
-        return bool(read_run(trial, out))
+        read_run(trial, out)
+        before = read_object(out / RUNS / trial.folder / RESULT).get("trial")
     except SlamError:
         return False
+    return bool(before == json.loads(json.dumps(asdict(trial))))

@@ -59,10 +59,11 @@ def keep_result(
     metrics: Mapping[str, float] | None = None,
     milliseconds: Mapping[str, float] | None = None,
 ) -> None:
-    """Write how a trial ended, also where an exception ended it, and its figures."""
+    """Write how a trial ended, also where an exception ended it, and its figures; one that is no number is none."""
     if isinstance(outcome, BaseException):
         outcome = f"failed: {type(outcome).__name__}: {' '.join(text_of(outcome).split())}"
-    found = {"completed": float(outcome == COMPLETED), **(metrics or {})}
+    known = {key: value for key, value in (metrics or {}).items() if np.isfinite(value)}
+    found = {"completed": float(outcome == COMPLETED), **known}
     with naming_folder(folder):
         folder.mkdir(parents=True, exist_ok=True)
     result = {"trial": asdict(trial), "outcome": outcome, "metrics": found, "milliseconds": milliseconds or {}}

@@ -180,7 +180,10 @@ def _read(path: Path, images: Size | None, cameras: tuple[str, str]) -> tuple[Ma
     text = _text(path).strip()
     if kitti := re.search(r"^(P|P_rect_0)\d[: ]+[^!\[\s]", text, re.MULTILINE):
         rows = read_kitti(path)
-        P = {f"P{side}": rows.get(f"{kitti[1]}{camera}") for side, camera in enumerate(cameras)}
+        names = [f"{kitti[1]}{camera}" for camera in cameras]
+        if missing := [name for name in names if name not in rows]:
+            raise CalibrationError(f"{path}: {' and '.join(missing)} missing, or no row of numbers")
+        P = {f"P{side}": rows[name] for side, name in enumerate(names)}
         return P | {"size": rows.get(f"S_rect_0{cameras[0]}")}, "KITTI's"
     with naming(path):
         if text.startswith("<"):

@@ -90,7 +90,10 @@ def _sides(folder: Path, options: Options) -> list[Side]:
 def _found(path: Path) -> Side:
     """What a path stands for: a folder, a video, or a pattern with ``*``."""
     if "*" in path.name:
-        return path.parent, [name for name in image_names(path.parent) if Path(name).match(path.name)]
+        names = [name for name in image_names(path.parent) if Path(name).match(path.name)]
+        if not names:
+            raise SequenceError(f"{path}: no images have such a name")
+        return path.parent, names
     if not path.exists():
         raise SequenceError(f"{path}: there is no such folder or video")
     return path, None if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES else image_names(path)

@@ -88,7 +88,8 @@ def read_rig(
     paths: Sequence[Path], size: Size | None, options: Mapping[str, Any], cameras: tuple[str, str] = ("0", "1")
 ) -> StereoRig:
     """The rig of one or two files, see `load_rig` and `rig_of`; `cameras` are the numbers of two in KITTI's files."""
-    return rig_of(read_entries(paths, size, cameras), paths[0], size, options)
+    source = Path(" and ".join(map(str, paths)))  # which of two is at fault, the message says
+    return rig_of(read_entries(paths, size, cameras), source, size, options)
 
 
 def rig_of(entries: Entries, source: Path, size: Size | None, options: Mapping[str, Any]) -> StereoRig:

@@ -91,6 +91,26 @@ def test_unknown_kind_and_unknown_key_in_a_file():
         SystemConfig.from_json(tree)
 
 
+@pytest.mark.parametrize(
+    ("section", "value"), [("models", []), ("models.motion", None), ("map", "x"), ("objects", 3), ("atlas", True)]
+)
+def test_a_section_that_is_none_is_named(section, value):
+    tree = SystemConfig().to_json()
+    *path, name = section.split(".")
+    (tree[path[0]] if path else tree)[name] = value
+    with pytest.raises(ConfigurationError, match=rf"setting {re.escape(section)} must be an object"):
+        SystemConfig.from_json(tree)
+
+
+def test_a_whole_number_in_place_of_a_fraction_is_the_same_setting():
+    whole, fraction = (
+        SystemConfig().with_settings([f"map.separation={two}", f"association.window_sigmas=[{two}, 4.0]"])
+        for two in ("2", "2.0")
+    )
+    assert json.dumps(whole.to_json()) == json.dumps(fraction.to_json())
+    assert SystemConfig().with_settings(["map.spacing=2000000"]).map.spacing == 2e6  # a length is no count
+
+
 CLASSES = (
     SurfConfig, EkfConfig, SmootherConfig, MapConfig, AssociationConfig, SelfCalibrationConfig, ObjectsConfig,
     EstimatorModels, MotionModel, ObjectModels, SystemConfig,

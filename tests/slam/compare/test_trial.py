@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from slam.compare import trial
-from slam.compare.plan import Trial, Variant
+from slam.compare.plan import CLOSED_LOOP, Trial, Variant, parse_variant
+from slam.compare.sweep import RUNS, is_done, read_run
+from slam.compare.trial import COMPLETED, keep_result
 from slam.data import Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.errors import SlamError
 from slam.evaluation.summary import consistency, evaluate
@@ -87,3 +90,19 @@ def test_nothing_tracked_gives_no_accuracy_and_is_no_fault():
     found = measured({k: FrameStatus.FAILED for k in range(N)})
     assert found["tracked"] == 0
     assert not {"ate_online_m", "nees_per_dof", "rpe_1s_m"} & set(found)
+
+
+def test_what_was_run_with_other_settings_or_frames_is_not_done(tmp_path):
+    """It lies there where a comparison that replaces another one was interrupted."""
+    trial = Trial("synthetic:desk?frames=5", parse_variant("small:surf:frontend.features=100"), "ekf", 0, CLOSED_LOOP)
+    keep_result(trial, tmp_path / RUNS / trial.folder, COMPLETED, {"ate_online_m": 0.1})
+    assert is_done(trial, tmp_path)
+    other = replace(trial, variant=parse_variant("small:surf:frontend.features=900"))
+    assert not is_done(other, tmp_path) and not is_done(replace(trial, stop=3), tmp_path)
+
+
+def test_a_figure_that_is_no_number_is_none_of_the_run(tmp_path):
+    """A camera that stands has no drift by distance."""
+    trial = Trial("synthetic:desk?frames=5", parse_variant("small:surf"), "ekf", 0, CLOSED_LOOP)
+    keep_result(trial, tmp_path / RUNS / trial.folder, COMPLETED, {"segment_percent": np.nan, "ate_online_m": 0.1})
+    assert read_run(trial, tmp_path).metrics == {"completed": 1.0, "ate_online_m": 0.1}

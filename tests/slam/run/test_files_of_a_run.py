@@ -131,3 +131,12 @@ def test_too_little_address_space_is_one_line():
     command = 'ulimit -v 800000; exec "$0" -m slam list'
     done = subprocess.run(["bash", "-c", command, sys.executable], capture_output=True, text=True, timeout=300)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "at least 2 GB" in done.stderr
+
+
+def test_an_estimator_that_fails_in_the_end_loses_no_summary(tmp_path, monkeypatch):
+    monkeypatch.setattr("slam.system.StereoSlam.estimate", lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run(tmp_path)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["frames"] == 5 and "division by zero" in summary["failures"][0]
+    assert (tmp_path / "out" / "trajectory_final.txt").read_text().count("\n") == 5

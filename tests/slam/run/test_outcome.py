@@ -128,3 +128,11 @@ def test_a_vehicle_that_goes_sideways_is_doubted():
     for step in ((0.05, 0, 1.0), (0.01, 0, 0.0)):
         assert motion_doubt(along(step), MotionModel(), driving=True) == ""
     assert motion_doubt(along((0.3, 0, 0.05)), MotionModel()) == ""
+
+
+def test_a_baseline_that_no_hand_carries_is_the_cause_unless_it_is_a_vehicle_s():
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 7.5, 320, 240)
+    run = replace(record(0), depths=[110.0] * 11)
+    words = "likely cause: by the calibration the cameras are 7.5 m apart and what they see is 110 m away"
+    assert words in outcome(run, rig)
+    assert "no hand" not in outcome(run, rig, driving=True)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,11 +16,11 @@ import pytest
 from slam.atlas.config import AtlasConfig
 from slam.atlas.map_io import load_map
 from slam.config import SystemConfig
-from slam.errors import SequenceError, SlamError
+from slam.errors import MeasurementError, SequenceError, SlamError
 from slam.geometry.trajectory import Trajectory
 from slam.run.options import RunOptions
 from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
-from slam.run.recording import load_recording
+from slam.run.recording import RecordedFrame, load_recording
 from slam.run.run_data import RunData
 from slam.run.runner import run
 from slam.sequences import open_sequence
@@ -148,3 +149,18 @@ def test_a_stopped_run_keeps_its_frames(tmp_path, kill, ignored):
         assert f"stopped by {kill.name}" in errors
         assert json.loads((out / "summary.json").read_text())["ended"] == f"stopped: {kill.name}"
         assert (out / "landmarks.csv").exists()
+
+
+def test_a_frame_that_cannot_be_recorded_ends_the_run_with_all_its_files(tmp_path, monkeypatch):
+    def of(result, number):
+        if number == 4:
+            raise MeasurementError("frame 4 is not finite")
+        return RecordedFrame.of(result, number)
+
+    monkeypatch.setattr("slam.run.runner.RecordedFrame", SimpleNamespace(of=of))
+    monkeypatch.setattr("slam.run.runner.save_map", lambda *_: 1 / 0)
+    with pytest.raises(MeasurementError, match="frame 4"):
+        run(open_sequence(WORLD), options(tmp_path, record=tmp_path / "tape.npz", save_map=tmp_path / "map"))
+    assert {p.name for p in tmp_path.iterdir()} == WITH_TRUTH | {"tape.npz"}
+    assert len(load_recording(tmp_path / "tape.npz")) == 4
+    assert "frame 4" in json.loads((tmp_path / "summary.json").read_text())["ended"]

@@ -190,6 +190,15 @@ def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
         )
 
 
+def test_the_file_or_pattern_at_fault_is_named(euroc, kitti, two_folders):
+    sensor = euroc / "mav0" / "cam1" / "sensor.yaml"
+    sensor.write_text(sensor.read_text().replace("radial-tangential", "foo"))
+    refused(euroc, CalibrationError, r"cam1/sensor\.yaml: distortion model 'foo'")
+    (kitti / "calib.txt").write_text("P0: 50 0 31.5 0 0 50 23.5 0 0 0 1 0\nP2: 1\n")
+    refused(kitti, CalibrationError, r"calib\.txt: P1 missing")
+    refused(f"{two_folders}?left=left/*.tif&right=right/*.png", SequenceError, r"left/\*\.tif: no image")
+
+
 def test_lists_that_are_none_are_named_with_the_row(euroc, kitti, raw, two_folders):
     table, times = euroc / "mav0/cam0/data.csv", raw / "image_00/timestamps.txt"
     lines = table.read_text().splitlines()
