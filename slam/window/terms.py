@@ -276,9 +276,9 @@ def _in_camera_axes(T, r, J):
             else:
                 J[3 + i, j] = w[i]
     for i in range(3):
-        k, l = (i + 1) % 3, (i + 2) % 3
-        J[3 + i, 6 + k] -= r[3 + l]
-        J[3 + i, 6 + l] += r[3 + k]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        J[3 + i, 6 + j] -= r[3 + k]
+        J[3 + i, 6 + k] += r[3 + j]
 
 
 @helper
