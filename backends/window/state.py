@@ -85,6 +85,8 @@ class WindowState:
     by_rig: Array  # derivatives of the poses by errors of the rig (6 K, m); of the first one, before it is there
     solved: int = 0  # place in the window of the newest pose that was solved for
     begun: int = 0  # number of the frame in which the present problem begins: the first, or that of a restart
+    # covariance of the attitude of the pose with which the problem begins (3, 3) [rad²], about the world's axes
+    turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
     rows: Rows = field(default_factory=Rows.none)
     places: Places = field(default_factory=Places.none)
     motion: Motion = field(default_factory=Motion.none)

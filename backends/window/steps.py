@@ -162,8 +162,9 @@ class Steps(RectifiedMeasurement):
         limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
         s = replace(s, poses=poses, rows=before.joined(self._rows(s, points[used], z[used])))
         w = replace(problem(s, self.stereo), asked=among(len(s.landmarks), points[used]))
+        fresh = unknown_turn(s.covariance[-6:, -6:])
         for again in range(_SOLVED_AGAIN + 1):
-            solution = solve(replace(w, rows=s.rows))
+            solution = solve(replace(w, rows=s.rows), fresh=fresh)
             covariances = solution.point_covariances(len(poses) - 1)
             its = covariances[0][points[used]]
             distances = solution.left_out_distances(-1, points[used], z[used], its, self.models.pixel_sigma, _TESTED)
@@ -181,10 +182,10 @@ class Steps(RectifiedMeasurement):
 
 
 def _lost(s: WindowState) -> bool:
-    """Whether the orientation in the world of the newest pose that measured landmarks is unknown."""
-    i = 6 * s.solved
+    """Whether the newest pose that measured landmarks may have turned anyhow since the problem began."""
+    i, R = 6 * s.solved, s.poses[s.solved][:3, :3]
     enough = np.count_nonzero(s.rows.pose == s.solved) >= MIN_CONSENSUS
-    return bool(enough and unknown_turn(s.covariance[i : i + 6, i : i + 6]))
+    return bool(enough and unknown_turn(R @ s.covariance[i : i + 3, i : i + 3] @ R.T - s.turned))
 
 
 def _seen_from_newest(s: WindowState, rows: IndexArray, by_motion: Array = _STILL) -> tuple[Array, Array]:
@@ -230,6 +231,7 @@ def _begun_anew(s: WindowState, T: Array, P: Array) -> WindowState:
     turn, by_rig = T[:3, :3].T @ s.poses[s.solved][:3, :3], s.by_rig[-6:]
     return WindowState(
         s.frames[-1:], s.stamps[-1:], T[None], P, by_rig, begun=int(s.frames[-1]),
+        turned=T[:3, :3] @ P[:3, :3] @ T[:3, :3].T,
         prior=RelativePrior.of_pose(T, P, by_rig), serials=s.serials, measured=s.measured, contradicted=s.contradicted,
         landmarks=replace(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
     )  # fmt: skip

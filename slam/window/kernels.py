@@ -157,13 +157,14 @@ def _eliminate(layout, cross, information, gradient, whole, H, b):
 
 
 @kernel
-def gauss_newton(camera, poses, points, layout, knowledge, centre, n, huber, close, steps):
+def gauss_newton(camera, poses, points, layout, knowledge, centre, n, huber, close, steps, fresh):
     """Gauss-Newton with halved steps on a window's normal equations ``H x = b`` (n,), its points eliminated.
 
     `camera` (7,) is as in `slam.kernels.stereo`; `layout` ends with `order`. Inverse distances of points that are
     eliminated count from the pose `centre`. A whitened residual beyond `huber` pulls no more than one there. A step
-    that lessens the cost by less than `close` is the last; it is taken with the factor of the step before. `steps` are
-    most with a factor of their own; without any, there is no factor at all.
+    that lessens the cost by less than `close` is the last; it is taken with the factor of the step before, unless
+    each shall have one of its own (`fresh`). `steps` are most with a factor of their own; without any, there is no
+    factor at all.
 
     Returns poses, points, and the cost there, NaN where H is not positive definite or a step not finite; whether it is
     a minimum; the factor L (n, n); H; and of both, where they were linearised: poses, points, E, the inverse
@@ -177,7 +178,7 @@ def gauss_newton(camera, poses, points, layout, knowledge, centre, n, huber, clo
         b, cost, A, E, inverse, gradient, cross = _equations(
             camera, poses, points, layout, knowledge, centre, huber, whole, H
         )
-        if whole or cost <= best + 1e-9 * abs(best) + 1e-12:
+        if best == np.inf or cost <= best + 1e-9 * abs(best) + 1e-12:
             start = poses, points, E, inverse, gradient, cross
             if whole:
                 linearised, best = (*start, b, cost, A), cost
@@ -205,7 +206,7 @@ def gauss_newton(camera, poses, points, layout, knowledge, centre, n, huber, clo
         if minimum:
             cost -= rest
             break
-        whole = False
+        whole = fresh
     return poses, points, cost, minimum, L, H, linearised
 
 

@@ -52,7 +52,7 @@ class NormalEquations:
 
 def linearised(w: Window, centre: int = 0) -> NormalEquations:
     """The normal equations of a window at its present values; points outside the prior are in charts about `centre`."""
-    *_, H, at = _gauss_newton(w, centre, np.inf, 0.0, 0)
+    *_, H, at = _gauss_newton(w, centre, np.inf, 0.0, 0, False)
     return NormalEquations(w, H, *at[2:])
 
 
@@ -130,7 +130,9 @@ class Solution:
         return np.where(alone, 0.0, distances)
 
 
-def solve(window: Window, close: float = CLOSE, huber: float = np.inf, steps: int = STEPS) -> Solution:
+def solve(
+    window: Window, close: float = CLOSE, huber: float = np.inf, steps: int = STEPS, fresh: bool = False
+) -> Solution:
     """The most probable poses and points, by Gauss-Newton with halved steps.
 
     Args:
@@ -138,20 +140,23 @@ def solve(window: Window, close: float = CLOSE, huber: float = np.inf, steps: in
         close: see `CLOSE`.
         huber: whitened residual from which on a row's pull no longer grows.
         steps: at most.
+        fresh: whether each step has a factor of its own. Where next to nothing is known of the place in the world, a
+            step with an earlier factor moves all together by any amount: what is left of the gradient pulls along
+            directions that were those of such a motion before.
 
     Raises:
         numpy.linalg.LinAlgError: something is not determined, or a value is not finite.
     """
-    poses, points, cost, minimum, L, H, at = _gauss_newton(window, 0, huber, close, steps)
+    poses, points, cost, minimum, L, H, at = _gauss_newton(window, 0, huber, close, steps, fresh)
     if np.isnan(cost):
         raise np.linalg.LinAlgError("a window does not determine its unknowns, or holds a value that is not finite")
     return Solution(window.at(poses, points), NormalEquations(window.at(*at[:2]), H, *at[2:]), L, cost, minimum)
 
 
-def _gauss_newton(w: Window, centre: int, huber: float, close: float, steps: int) -> tuple[Any, ...]:
+def _gauss_newton(w: Window, centre: int, huber: float, close: float, steps: int, fresh: bool) -> tuple[Any, ...]:
     found: tuple[Any, ...] = kernels.gauss_newton(
         w.stereo.intrinsics, w.poses, w.points, w.layout[:7], w.knowledge, centre, w.layout.unknowns, huber, close,
-        steps,
+        steps, fresh,
     )  # fmt: skip
     return found
 

@@ -240,6 +240,8 @@ def add_motion(poses, column, motion, H, b):
             r[i] -= mean[m, i]
             for j in range(18):
                 J[i, j] = by_frame[i, j]
+        if not carried:
+            _in_camera_axes(poses[i1], r, J)
         for p in range(3 if carried else 0):  # a perturbation ξ of Y is −Ad_Y ξ of B, one χ of X is Ad_Y χ
             k = max(triple[m, p], 0)
             for i in range(6):
@@ -253,6 +255,30 @@ def add_motion(poses, column, motion, H, b):
             cost += r[i] * r[i]
         add_velocity_rows(J, r, triple[m], column, H, b)
     return cost
+
+
+@helper
+def _in_camera_axes(T, r, J):
+    """Turn the last three of r (6,) and J (6, 18) from the world's axes to those of the middle pose T, in place.
+
+    Their noise is the same along all axes. In the world's, a turn of all poses together would change the residuals to
+    first order: the normal equations would tell of it, where nothing is known of it.
+    """
+    v, w = np.empty(3), np.empty(3)
+    for j in range(19):
+        for i in range(3):
+            v[i] = r[3 + i] if j == 18 else J[3 + i, j]
+        for i in range(3):
+            w[i] = T[0, i] * v[0] + T[1, i] * v[1] + T[2, i] * v[2]
+        for i in range(3):
+            if j == 18:
+                r[3 + i] = w[i]
+            else:
+                J[3 + i, j] = w[i]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        J[3 + i, 6 + j] -= r[3 + k]
+        J[3 + i, 6 + k] += r[3 + j]
 
 
 @helper

@@ -12,7 +12,7 @@ from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
-from slam.models import MotionModel
+from slam.models import EstimatorModels, MotionModel
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=320.0, v0=240.0, baseline=0.3, width=641, height=481)
 
@@ -78,6 +78,33 @@ def scene(
     world = cloud(poses, points, rng)
     observations = tuple(observe(T, world, sigma, rng, limit) for T in poses)
     return Scene(RIG, dt * np.arange(len(poses)), poses, world, observations)
+
+
+def begun_in_the_dark(seed: int) -> tuple[EstimatorModels, Array, list[Observations]]:
+    """A map that begins where nobody knows how the camera is turned: two points, six seconds in the dark, then many.
+
+    Returns the models, poses (160, 4, 4) .1 s apart, and what is seen from them.
+    """
+    rng, dt = np.random.default_rng(seed), 0.1
+    turns = 0.3 * np.cumsum(rng.standard_normal((160, 3)), axis=0) * np.sqrt(dt)
+    steps = dt * np.concatenate([0.5 * np.sin(turns), 0.3 * np.cos(turns)], axis=1)
+    poses = [np.eye(4)]
+    for one in steps[1:]:
+        poses.append(poses[-1] @ se3.exp(one))
+    path = np.array(poses)
+    points = np.concatenate([cloud(path[:1], 2, rng), cloud(path[80:], 60, rng, 2.0, 6.0)])
+    sights = []
+    for k, T in enumerate(path):
+        seen = observe(T, points, 4.0, rng, 12)
+        sights.append(seen.select((seen.ids < 2) & (k < 10) if k < 70 else seen.ids >= 0))
+    return EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=4.0), path, sights
+
+
+def steps_off(found: list[Array], poses: Array) -> float:
+    """By how much [m] motions over ten frames are off, from frame 90 on, root mean square."""
+    moved = se3.inverse(np.array(found[90:-10])) @ np.array(found[100:])
+    truth = se3.inverse(poses[90:-10]) @ poses[100:]
+    return float(np.sqrt(((moved - truth)[:, :3, 3] ** 2).sum(axis=1).mean()))
 
 
 def step(backend: Backend, stamp: float, seen: Observations, known: set[int]) -> UpdateReport:

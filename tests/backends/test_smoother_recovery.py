@@ -15,7 +15,7 @@ from slam.models import EstimatorModels, MotionModel
 from slam.window import recovery
 from slam.window.pose_only import PoseProblem
 from slam.window.stereo import RectifiedStereo
-from tests.backends.scenes import RIG, cloud, observe, path, run, scene, step
+from tests.backends.scenes import RIG, begun_in_the_dark, cloud, observe, path, run, scene, step, steps_off
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
@@ -144,26 +144,14 @@ def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(lag, seed
     The problem begins anew once. How the camera is turned in the world stays unknown, and with every frame it began
     anew: nothing was smoothed any more.
     """
-    rng = np.random.default_rng(seed)
-    models = EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=4.0)
-    turns = 0.3 * np.cumsum(rng.standard_normal((160, 3)), axis=0) * np.sqrt(DT)
-    poses = [np.eye(4)]
-    for k in range(1, 160):
-        poses.append(poses[-1] @ se3.exp(DT * np.concatenate([0.5 * np.sin(turns[k]), 0.3 * np.cos(turns[k])])))
-    poses = np.array(poses)
-    points = np.concatenate([cloud(poses[:1], 2, rng), cloud(poses[80:], 60, rng, 2.0, 6.0)])
+    models, poses, sights = begun_in_the_dark(seed)
     backend = SmootherBackend(RIG, models, lag=lag)
     known, found, begun, rejected = set(), [], set(), 0
-    for k, T in enumerate(poses):
-        seen = observe(T, points, 4.0, rng, 12)
-        seen = seen.select((seen.ids < 2) & (k < 10) if k < 70 else seen.ids >= 0)
+    for k, seen in enumerate(sights):
         rejected += len(step(backend, k * DT, seen, known).rejected)
         found.append(backend.estimate(landmarks=False).T_world_left)
         begun.add(backend.state.begun)
-    moved = se3.inverse(np.array(found[90:-10])) @ np.array(found[100:])
-    truth = se3.inverse(poses[90:-10]) @ poses[100:]
-    off = np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=1)
-    assert np.sqrt((off**2).mean()) < 0.1 and rejected < 60 and len(begun) <= 2, begun
+    assert steps_off(found, poses) < 0.1 and rejected < 60 and len(begun) <= 2, begun
 
 
 def test_a_few_wrong_matches_that_agree_by_chance_move_nothing():

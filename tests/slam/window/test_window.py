@@ -194,6 +194,19 @@ def with_everything():
     )  # fmt: skip
 
 
+def test_motion_tells_nothing_of_how_all_poses_are_turned_in_the_world():
+    """Its rows in the world's axes did, to first order: the normal equations knew of it what nothing had measured."""
+    w = with_everything()
+    path = np.array([w.poses[0]] * POSES)
+    for k in range(1, POSES):
+        path[k] = path[k - 1] @ se3.exp(VELOCITY + 0.05 * np.sin(np.arange(6) + k))
+    one = Motion(*(column[1:] for column in w.motion.arrays[:4]))
+    e = linearised(Window(STEREO, path, np.zeros((0, 3)), Rows.none(), motion=one))
+    H = np.tril(e.H) + np.tril(e.H, -1).T
+    together = np.concatenate([se3.adjoint(se3.inverse(T)) for T in path])
+    np.testing.assert_allclose(H @ together, 0.0, atol=1e-9 * np.abs(H).max())
+
+
 def test_gradient_is_the_costs_derivative():
     """Of a window with each kind of knowledge, whose points are at their best for its poses."""
     w = with_everything()
