@@ -29,13 +29,14 @@ _ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
     "align": (tuple, {}),
 }
 _IDS, _FINITE = ("ids", "used", "rejected"), ("T_world_left", "covariance", "positions", "covariances", "real")
+_COVARIANCES = ("covariance", "covariances", "innovation")
 
 
 def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     """What a method of a back end or front end answered, checked; a step does that with every answer, so it is cheap.
 
     `sizes` of the arrays, by the letters of `_ANSWERS`, are those that are known. Raises SlamError where it is of
-    another type than documented, an array of another shape, or a pose or position not finite.
+    another type than documented, an array of another shape, a pose or position not finite, or a variance negative.
     """
     what, (kind, attributes) = f"{type(owner).__name__}.{method}", _ANSWERS[method]
     if not isinstance(answer, kind):
@@ -56,6 +57,8 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
                 raise SlamError(f"{where} must be an array of ids, got {value.dtype}")
             if name in _FINITE and not np.isfinite(value).all():
                 raise SlamError(f"{where} is not finite")
+            if name in _COVARIANCES and (value.diagonal(0, -2, -1) < -1e-9).any():  # 1e-9: rounding
+                raise SlamError(f"{where} has a negative variance")
         elif not isinstance(value, wanted):
             raise SlamError(f"{where} must be of type {wanted.__name__}, got {type(value).__name__}")
         elif name == "stamp" and not abs(value) <= LATEST_STAMP:

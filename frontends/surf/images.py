@@ -55,6 +55,10 @@ def grey(image: NDArray, what: str = "image") -> NDArray:
     Raises SequenceError, a line that begins with `what`, where it is no array (H, W), (H, W, 3|4) of uint8 or uint16.
     """
     image = np.asarray(image)
+    if image.dtype == object and image.ndim == 0:
+        raise SequenceError(
+            f"{what}: is {image[()]!r:.40} and no array; of a file it cannot read, cv2.imread gives None"
+        )
     if image.dtype.newbyteorder("=") not in _FULL_SCALE:
         raise SequenceError(f"{what}: pixels must be uint8 or uint16, not {image.dtype}")
     channels = image.shape[2] if image.ndim == 3 else 1

@@ -244,7 +244,8 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", row {mark.line + 1}" if mark else ""
-        raise CalibrationError(f"{path}{where}: no valid YAML") from error
+        kind = "JSON" if path.suffix.lower() == ".json" else "YAML"
+        raise CalibrationError(f"{path}{where}: no valid {kind}") from error
     if not isinstance(root, Mapping):
         raise CalibrationError(f"{path}: no calibration in this file")
     return root

@@ -287,7 +287,8 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
         names = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS
         D = np.array([entries.number(name, side, 0.0) for name in names])
     if 0 < len(D) < 4:
-        raise CalibrationError(f"distortion model takes 4 coefficients or more, got {len(D)}")
+        name = (entries.find("D", side) or ("distortion", ""))[0]
+        raise CalibrationError(f"{name}: a distortion takes 4 coefficients or more, got {len(D)}")
     D = D[:4] if fisheye else D
     return PinholeCamera.from_matrix(K, D if D.any() or fisheye else None, size, fisheye)
 

@@ -121,6 +121,7 @@ def test_threshold_keeps_the_number_of_features():
     ("left", "right", "says"),
     [
         (LEFT, RIGHT[:, :100], "frame 7, right image: 100x240 pixels"),
+        (None, RIGHT, "frame 7, left image: is None and no array"),
         (LEFT.astype(float), RIGHT, "frame 7, left image: pixels must be uint8 or uint16, not float64"),
     ],
 )

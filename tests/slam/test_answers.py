@@ -43,6 +43,7 @@ ANSWERS = [
     ("estimate", lambda e: replace(e, stamp=np.nan), "estimate: stamp must be within"),
     ("estimate", lambda e: replace(e, positions=None), "estimate: positions must be an array"),
     ("estimate", lambda e: replace(e, covariance=np.full((6, 6), np.inf)), "estimate: covariance is not finite"),
+    ("estimate", lambda e: replace(e, covariance=-np.eye(6)), "estimate: covariance has a negative variance"),
     ("positions", lambda x: x[:-1] if len(x) else None, "positions:? must be (of type|an) (ndarray|array)"),
     ("positions", lambda x: x * np.nan, "positions is not finite"),
 ]
