@@ -54,8 +54,8 @@ _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of win
 _HALVES = 0.5 * np.array(list(product((0, 1), repeat=3)))  # of a width, by which windows of a size are apart
 _CELLS = 2**12  # numerics: more than there are windows along an axis
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting again
-_PRECISE = 0.25  # times the noise of a pixel: what it is from frame to frame at least, without what lasts; at 0.5 a box
-# that starts carries the camera along
+# 0.1: from 0.25 on a box that starts carries the camera along
+_PRECISE = 0.1  # times the noise of a pixel: what it is from frame to frame at least, without what lasts
 
 
 @dataclass(frozen=True, eq=False)
