@@ -15,8 +15,8 @@ import slam
 from slam.config import SystemConfig
 from slam.system import StereoSlam
 
-WORLD = "synthetic:box?density=300&frames=90"
-FIRST = 58  # the box moves, and is found some twenty-five frames later
+WORLD = "synthetic:box?density=300&frames=100"
+FIRST = 58  # the box moves, and is found some thirty frames later
 BACKENDS = ("ekf", "smoother")
 
 
@@ -54,7 +54,7 @@ def main() -> None:
 
     def work() -> None:
         for backend in BACKENDS:
-            found[backend] = run(backend, 32, 4, threads)
+            found[backend] = run(backend, 40, 4, threads)
 
     if elsewhere:
         thread = threading.Thread(target=work)
