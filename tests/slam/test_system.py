@@ -53,7 +53,8 @@ def test_frames_with_nothing_to_see_are_predicted(backend):
     statuses = [r.status for r, _ in results]
     assert [k for k, s in enumerate(statuses) if s is FrameStatus.PREDICTED] == [15, 16, 17]
     assert all(r.reason for r, _ in results[15:18])
-    assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.01
+    # the limit of the run without dark frames; the claimed sigma is 9 to 11 mm
+    assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.012
     grown = [np.trace(r.estimate.covariance) for r, _ in results[14:18]]
     assert grown == sorted(grown)
 

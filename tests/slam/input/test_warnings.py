@@ -221,7 +221,7 @@ def test_a_frame_that_is_extracted_again_has_the_same_features():
 @pytest.mark.parametrize("late", [1, -1, 2, -2])
 def test_right_images_of_another_moment_are_named(late):
     """Numbers off by one: as far as it goes, the run would be tracked, with another scale."""
-    frames = list(slam.open_sequence("synthetic:desk?frames=48"))[::4]
+    frames = list(slam.open_sequence("synthetic:aisle?frames=48"))[::4]
     moments = zip(frames, frames[abs(late) :])
     pairs = [replace(b, right=a.right) if late > 0 else replace(a, right=b.right) for a, b in moments]
     (line,) = lines(pairs)
