@@ -8,10 +8,10 @@ from typing import Any, get_args, get_type_hints
 
 from slam.atlas.config import AtlasConfig
 from slam.bodies.config import ObjectsConfig
-from slam.bounds import MOST
+from slam.bounds import MOST, require_not_negative
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
-from slam.models import EstimatorModels, models_for, require_not_negative
+from slam.models import EstimatorModels, models_for
 from slam.settings import apply_settings
 from slam.tracks.config import AssociationConfig, MapConfig
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam.bounds import require_not_negative as require_not_negative
-from slam.bounds import require_positive
+from slam.bounds import require_not_negative, require_positive
 from slam.checks import is_rigid
 from slam.chi_square import SIGMAS
 from slam.errors import ConfigurationError

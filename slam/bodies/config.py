@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from slam.bounds import require_not_negative
 from slam.errors import ConfigurationError
 from slam.geometry.rig import MINIMAL_POINTS
-from slam.models import require_not_negative
 
 MODES = ("detect", "procedure1", "off")
 WINDOW = 12  #: cost: frames over which a feature is classified: every track keeps so many measurements

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from slam.models import require_positive
+from slam.bounds import require_positive
 
 
 @dataclass(frozen=True)
