@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import Evidence
@@ -75,20 +76,20 @@ def pair_of(
     of the random choice in the geometric check.
     """
     seen = first.points[matched.tracks], second.points[matched.features]
-    one, two = (points + model.shift(points, parameters) for points in seen)
-    T: Array = inverse(second.T_world_left) @ first.T_world_left
-    near = (one[:, 2] > 1.0) & (two[:, 2] > 1.0)  # 1.0: least disparity of a point that helps to find the motion [px]
+    one, two = (points + model.shift(points, parameters)[:, :3] for points in seen)
     rig = model.rig.rectified.rig
-    if near.sum() >= 3:
+    T: Array = inverse(second.T_world_left) @ first.T_world_left
+    R, t = T[:3, :3], T[:3, 3] / rig.baseline
+    agree = _agreeing(model, one, two, R, t)
+    near = (one[:, 2] > 1.0) & (two[:, 2] > 1.0)  # 1.0: least disparity of a point that helps to find the motion [px]
+    if 2 * agree.sum() < len(agree) and near.sum() >= 3:
         before, after = model.rows(one[near]), model.rows(two[near])
         local = rig.triangulate(before[:, :2], before[:, [2, 1]])
         # 100: poses tried in the geometric check of a pair of views
         found = find_consensus(rig, local, after, inverse(T), _AGREES, 100, seed)
         T = np.asarray(inverse(found.T_world_left))
-    R, t = T[:3, :3], T[:3, 3] / rig.baseline
-    moved, J, _ = move(one, R, t, model.focal)
-    with np.errstate(invalid="ignore"):
-        agree = (np.abs(moved - two) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
+        R, t = T[:3, :3], T[:3, 3] / rig.baseline
+        agree = _agreeing(model, one, two, R, t)
     for _ in range(2):  # 2: times that motion and inliers are recomputed
         fitted = fit_motion(one[agree], two[agree], R, t, model.focal, noise) if agree.sum() >= 3 else None
         if fitted is None:
@@ -98,6 +99,13 @@ def pair_of(
         # 16.3: χ²(3) at 99.9 %, largest squared distance of a match that agrees
         agree = distance <= 16.3 * median(distance[agree]) / _MEDIAN_3
     return Pair(one[agree], two[agree], R, t)
+
+
+def _agreeing(model: RigModel, first: Array, second: Array, R: Array, t: Array) -> NDArray[np.bool_]:
+    """Which points (N,) of two views agree with a motion."""
+    moved, J, _ = move(first, R, t, model.focal)
+    with np.errstate(invalid="ignore"):
+        return (np.abs(moved - second) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
 
 
 class Linear(NamedTuple):
