@@ -89,12 +89,12 @@ def residual_field(points, focal, centre, half, degrees):
 
 
 @kernel
-def fit(first, second, R, t, focal, noise, median):
-    """Gauss-Newton of `slam.calibration.pairs.fit_motion`; see there for the arguments.
+def fit(first, second, R, t, focal, noise, median, steps):
+    """Gauss-Newton of `slam.calibration.pairs.fit_motion`, of some steps at most; see there for the arguments.
 
-    Points are weighted by Student's t distribution of four degrees of freedom, `median` being that of χ². Returns the
-    fields of `slam.calibration.pairs.Fit`, and the last change of a predicted point [px], infinite where there is no
-    solution.
+    Without any, the problem is linearised at the first guess. Points are weighted by Student's t distribution of four
+    degrees of freedom, `median` being that of χ². Returns the fields of `slam.calibration.pairs.Fit`, and the last
+    change of a predicted point [px], infinite where there is no solution.
     """
     n, last = len(first), np.inf
     R, t, points, weights = R.copy(), t.copy(), first.copy(), np.empty(len(first))
@@ -102,8 +102,10 @@ def fit(first, second, R, t, focal, noise, median):
     _, J_point, J_motion, residual, information = at
     H, step, turn, before = np.empty((6, 6)), np.empty(6), np.empty((3, 4)), np.empty((3, 3))
     rest, weighted = np.empty(3), np.empty(3)
-    for _ in range(20):  # 20: iterations at most
+    for _ in range(max(steps, 1)):
         _linearise(first, second, points, R, t, focal, noise, *at)
+        if steps == 0:
+            break
         total = 0.0
         for p in range(n):
             weights[p] = square(information[p], residual[p])
@@ -155,7 +157,7 @@ def fit(first, second, R, t, focal, noise, median):
 
 @helper
 def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, residual, information):
-    """`linearise` into arrays."""
+    """Fill in the fields of `slam.calibration.pairs.Linear`, at a motion and estimates of the first view's points."""
     by_all, by_depth, B, C = np.empty((3, 9)), np.empty(9), np.empty((3, 3)), np.empty((3, 3))
     for p in range(len(points)):
         x, y, d = points[p, 0], points[p, 1], points[p, 2]
@@ -194,12 +196,3 @@ def _linearise(first, second, points, R, t, focal, noise, moved, J_point, J_moti
                 for k in range(3):
                     C[i, j] += B[i, k] * J_point[p, j, k]
         invert_symmetric(C, 0.0, information[p])
-
-
-@kernel
-def linearise(first, second, points, R, t, focal, noise):
-    """The fields of `slam.calibration.pairs.Linear`; see `slam.calibration.pairs.linearised` for the arguments."""
-    n = len(points)
-    out = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6)), np.empty((n, 3)), np.empty((n, 3, 3))
-    _linearise(first, second, points, R, t, focal, noise, *out)
-    return out
