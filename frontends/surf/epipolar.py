@@ -211,7 +211,7 @@ def _search(image, shape, band, y, first, last, own, limits, space):
     looks better than the true one between two.
     """
     scores, (min_correlation, uniqueness, unresolved), (rows, stride) = space.scores, limits, shape
-    count, one = last - first + 1, np.float32(1.0)  # no literal number: Numba would compile a helper again for it
+    count, one = last - first + 1, np.float32(1.0)
     found, row, score, height, rival = -1, -1, np.float32(-1.0), np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
         _correlate(image, stride, v, first, count, own, space)

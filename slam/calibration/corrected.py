@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from slam.calibration.model import LENS, RigModel, field_and_turn
+from slam.calibration.kernels import field
+from slam.calibration.model import LENS, RigModel
 from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
@@ -58,7 +59,7 @@ def _camera(
     pixels, seen = pixels[good], seen[good]
     if 2 * len(pixels) < 4 + max(len(camera.distortion), 4):
         raise CalibrationError("the camera's pixels have no rays: its distortion cannot be undone")
-    by_lens = field_and_turn(np.column_stack([seen, np.zeros(len(seen))]), 1.0)[:, :2, : len(LENS)]
+    by_lens = field(np.column_stack([seen, np.zeros(len(seen))]), 1.0)[:, :2, : len(LENS)]
     true = seen + by_lens @ theta
     rays = np.column_stack([true, np.ones(len(true))]) @ R
     distortion = camera.distortion or (0.0,) * 4

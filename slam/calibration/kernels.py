@@ -63,28 +63,24 @@ def residual_field(points, focal, centre, half, degrees):
     The image has its `centre` and half sizes in focal lengths; `degrees` are the polynomials' in x and y.
     """
     k = (degrees[0] + 1) * (degrees[1] + 1) - 3
-    out, values = np.zeros((len(points), 4, 4 * k)), np.ones((2, max(degrees) + 1))
+    out, values = np.zeros((len(points), 4, 4 * k)), np.ones((3, max(degrees) + 1))
     for p in range(len(points)):
-        for side in range(2):
-            for axis in range(2):
-                at = points[p, axis] - (points[p, 2] if side > axis else 0.0)
-                at = (at / focal - centre[axis]) / half[axis]
-                # 1.1: half widths from the centre, beyond which they are held constant; NaN stays NaN
-                at = 1.1 if at > 1.1 else -1.1 if at < -1.1 else at
-                values[axis, 1] = at
-                for i in range(2, degrees[axis] + 1):
-                    values[axis, i] = ((2 * i - 1) * at * values[axis, i - 1] - (i - 1) * values[axis, i - 2]) / i
-            column = 2 * k * side
-            for i in range(degrees[0] + 1):
-                for j in range(degrees[1] + 1):
-                    if i + j > 1:  # for a mean square of one over the image
-                        value = focal * np.sqrt((2 * i + 1) * (2 * j + 1)) * values[0, i] * values[1, j]
-                        if side == 0:
-                            out[p, 0, column] = value
-                            out[p, 1, column + k] = value
-                        out[p, 2, column] = -value if side else value
-                        out[p, 3, column + k] = value if side else -value
-                        column += 1
+        at = points[p, 0], points[p, 1], points[p, 0] - points[p, 2]  # of the left image, and x of the right one
+        for line in range(3):
+            x = (at[line] / focal - centre[line % 2]) / half[line % 2]
+            x = 1.1 if x > 1.1 else -1.1 if x < -1.1 else x  # 1.1: beyond so many half widths they are constant
+            values[line, 1] = x  # NaN stays NaN
+            for i in range(2, len(values[0])):
+                values[line, i] = ((2 * i - 1) * x * values[line, i - 1] - (i - 1) * values[line, i - 2]) / i
+        c = 0
+        for i in range(degrees[0] + 1):
+            for j in range(degrees[1] + 1):
+                if i + j > 1:  # with a mean square of one over the image
+                    value = focal * np.sqrt((2 * i + 1) * (2 * j + 1)) * values[1, j]
+                    left, right = value * values[0, i], value * values[2, i]
+                    out[p, 0, c], out[p, 1, c + k], out[p, 2, c], out[p, 3, c + k] = left, left, left, -left
+                    out[p, 2, c + 2 * k], out[p, 3, c + 3 * k] = -right, right
+                    c += 1
     return out
 
 

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from slam.calibration import kernels
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -77,36 +78,25 @@ class RigModel:
         A shift of both principal points looks almost like a rotation of the whole rig, and neither is known well. Lest
         the pose rotate with each revision, the ideal rig is rotated such that the left image as a whole does not move.
         """
-        field, n = field_and_turn(points, self.focal), len(self.names)
+        field, n = kernels.field(np.ascontiguousarray(points, float), self.focal), len(self.names)
         return np.asarray(field[:, :, :n] + field[:, :, n:] @ self._gauge)
 
     def shift(self, points: Array, parameters: Array) -> Array:
         """Change (N, 4) [px] of points ``(x, y, d)`` (N, 3) [px] and of vertical disparities by parameters (n,)."""
-        from slam.calibration.kernels import shift
-
         amounts = np.concatenate([parameters, self._gauge @ parameters])
-        return np.asarray(shift(np.ascontiguousarray(points, float), self.focal, amounts))
+        return np.asarray(kernels.shift(np.ascontiguousarray(points, float), self.focal, amounts))
 
     @cached_property
     def _gauge(self) -> Array:
         """Rotation of the ideal rig (3, n) [rad] that cancels the left image's mean displacement by the parameters."""
         n = len(self.names)
-        rows = field_and_turn(self.far(), self.focal)[:, :2].reshape(-1, n + 3)
+        rows = kernels.field(self.far(), self.focal)[:, :2].reshape(-1, n + 3)
         return -np.asarray(np.linalg.lstsq(rows[:, n:], rows[:, :n], rcond=None)[0])
 
     def residual_field(self, points: Array) -> Array:
         """As `field`, by the residual fields (N, 4, m): of x and y of the left camera, then of the right one."""
-        from slam.calibration.kernels import residual_field
-
         points = np.ascontiguousarray(points, float)
-        return np.asarray(residual_field(points, self.focal, self._centre, self._half, _DEGREES))
-
-
-def field_and_turn(points: Array, focal: float) -> Array:
-    """Change (N, 4, n + 3) [px] of points (N, 3) [px] and their vertical disparities by parameters and a turn."""
-    from slam.calibration.kernels import field
-
-    return np.asarray(field(np.ascontiguousarray(points, float), focal))
+        return np.asarray(kernels.residual_field(points, self.focal, self._centre, self._half, _DEGREES))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.calibration import kernels
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import Evidence
 from slam.chi_square import chi_square_limit
@@ -95,7 +96,7 @@ def pair_of(
         if fitted is None:
             break
         R, t = fitted.R, fitted.t
-        distance = linearised(one, two, R, t, model.focal, noise).squared
+        distance = _fitted(one, two, R, t, model.focal, noise, 0)[0].linear.squared
         # 16.3: χ²(3) at 99.9 %, largest squared distance of a match that agrees
         agree = distance <= 16.3 * median(distance[agree]) / _MEDIAN_3
     return Pair(one[agree], two[agree], R, t)
@@ -109,7 +110,11 @@ def _agreeing(model: RigModel, first: Array, second: Array, R: Array, t: Array) 
 
 
 class Linear(NamedTuple):
-    """A motion linearised at estimates of the first view's points."""
+    """A motion linearised at estimates of the first view's points.
+
+    The residuals carry the points' own corrections to first order. The motion amplifies the disparity errors of near
+    points, so that a limit in pixels would keep only points whose errors happen to be small.
+    """
 
     moved: Array  # where the motion takes the points (N, 3) [px]
     J_point: Array  # derivatives of `moved` by the points (N, 3, 3)
@@ -198,24 +203,13 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     shares, with D the true disparity. It has no singularity at infinity, where D = 0. Returns moved points (N, 3),
     Jacobians by the points (N, 3, 3), and by ``[rotation (left), t]`` (N, 3, 6).
     """
-    return linearised(points, points, R, t, focal, np.eye(3))[:3]
-
-
-def linearised(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
-    """A motion linearised at the first view's points; for the arguments see `fit_motion`.
-
-    The residuals carry the points' own corrections to first order. The motion amplifies the disparity errors of near
-    points, so that a limit in pixels would keep only points whose errors happen to be small.
-    """
-    return _fitted(first, second, R, t, focal, noise, 0)[0].linear
+    return _fitted(points, points, R, t, focal, np.eye(3), 0)[0].linear[:3]
 
 
 def _fitted(
     first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array, steps: int
 ) -> tuple[Fit, float]:
     """The motion after `steps` at most, and the last change of a predicted point [px], infinite without a solution."""
-    from slam.calibration.kernels import fit
-
     arrays = (np.ascontiguousarray(a, float) for a in (first, second, R, t))
-    R, t, points, at, weights, last = fit(*arrays, focal, noise, _MEDIAN_3, steps)
+    R, t, points, at, weights, last = kernels.fit(*arrays, focal, noise, _MEDIAN_3, steps)
     return Fit(R, t, points, Linear(*at), weights), float(last)

@@ -35,6 +35,7 @@ try:
     from numba.core import event
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
+    from numba.core.types.misc import unliteral
 except ValueError as error:
     if not any(name.startswith("NUMBA_") for name in os.environ):
         raise
@@ -211,7 +212,18 @@ class _Disjoint(_Helper):
 def _helper(compiler: type[Compiler] = _Helper, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """A decorator of helpers."""
     options = {**options, **_INNER, "pipeline_class": compiler}
-    return lambda function: njit(**options, _nrt=makes_arrays(function))(function)
+
+    def made(function: Callable[..., Any]) -> Any:
+        compiled = njit(**options, _nrt=makes_arrays(function))(function)
+        if compiled is not function:  # NUMBA_DISABLE_JIT
+            template = compiled.get_call_template
+            # Else Numba would compile it for each number or truth that a caller writes as a constant.
+            compiled.get_call_template = lambda args, kws: template(
+                tuple(map(unliteral, args)), {name: unliteral(kind) for name, kind in kws.items()}
+            )
+        return compiled
+
+    return made
 
 
 helper = _helper()

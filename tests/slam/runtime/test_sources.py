@@ -10,11 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from slam.kernels.linear import factorise
 from slam.kernels.se3 import move
-from slam.runtime.compilation import kernel, makes_arrays, stamp
+from slam.runtime.compilation import helper, kernel, makes_arrays, stamp
 
 ROOT = Path(__file__).parents[3]
 
@@ -116,3 +117,17 @@ def test_every_kernel_stands_below_its_helpers():
                     if file._source_stamp[1] != stamp(function, kernel):
                         wrong.append(f"{found.name}.{name}")
     assert kernels > 40 and not wrong
+
+
+@helper
+def _nth(x, n, twice):
+    return x[n] * (2.0 if twice else 1.0)
+
+
+def test_a_helper_is_compiled_once_for_all_constants():
+    numba = pytest.importorskip("numba")
+    if not hasattr(_nth, "overloads"):
+        pytest.skip("Numba's compiler is off")
+    two_of = numba.njit(lambda x, twice: _nth(x, 0, True) + _nth(x, 1, False) + _nth(x, n=1, twice=twice))
+    assert two_of(np.array([1.0, 10.0]), True) == 32.0
+    assert len(_nth.overloads) == 1
