@@ -177,11 +177,10 @@ class SelfCalibration:
             return
         self._looked = T_world_left
         view = View.of(self.model, features, T_world_left, _MOST_FEATURES)
-        count = len(view)
-        if count < self.config.minimum_common:
+        if len(view) < self.config.minimum_common:
             return
         # 250: features of a frame whose rows are used: more add little
-        some = np.linspace(0, count - 1, min(count, 250)).astype(int)
+        some = np.linspace(0, len(view) - 1, min(len(view), 250)).astype(int)
         rows, fields = row_evidence(self.model, view.points[some], view.vertical[some], self._own.mean)
         self._rows.add(rows)
         self._fields = fields if self._fields is None else self._fields + fields
