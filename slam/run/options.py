@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -136,19 +133,6 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
-
-
-@cache
-def running_code() -> dict[str, str]:
-    """`versions`, and twelve hex digits for the sources of this distribution as ``code``; looked up once."""
-    digest = hashlib.sha256()
-    for name in ("slam", "frontends", "backends"):
-        spec = find_spec(name)
-        for root in () if spec is None else map(Path, spec.submodule_search_locations or ()):
-            for path in sorted(root.rglob("*.py")):
-                place = f"{root.name}/{path.relative_to(root).as_posix()}"
-                digest.update(f"{place}\0".encode() + path.read_bytes() + b"\0")
-    return {**versions(), "code": digest.hexdigest()[:12]}
 
 
 def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -30,11 +30,6 @@ def test_places_that_cannot_be_written_are_said(steps, tmp_path):
         p.show(frame, result, system)
 
 
-def test_a_body_has_one_colour_in_images_and_maps():
-    """It was orange in the video and violet in the picture of the run."""
-    assert _bgr(2) == body_colour(2)[::-1] and len({body_colour(body) for body in range(1, 6)}) == 5
-
-
 def test_the_map_beside_a_frame_says_what_its_marks_are(steps, tmp_path):
     """Below the map there was white paper: its colours were to be guessed."""
     system, ((frame, result), _) = steps
