@@ -6,8 +6,7 @@ import pytest
 import slam
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.run.drawing import _IN_MAP, _LEGEND, FramePictures, _bgr
-from slam.run.schema import body_colour
+from slam.run.drawing import _IN_MAP, _LEGEND, FramePictures
 from tests.fuzz.runs import disk_of
 
 
