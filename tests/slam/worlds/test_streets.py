@@ -14,7 +14,6 @@ from slam.worlds.streets import ASIDE
 from slam.worlds.surfaces import Facade
 
 LAP = 450  # frames of a round in `loop`
-SMALL = "width=310&height=94"
 
 
 @pytest.fixture(scope="session")
