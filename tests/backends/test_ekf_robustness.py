@@ -14,7 +14,6 @@ from slam.data import Observations, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, models_for
-from slam.testing.hostile import play
 from tests.backends.ekf_runs import (
     FORWARD,
     MODELS,
@@ -27,6 +26,7 @@ from tests.backends.ekf_runs import (
     predicted,
     turning_drive,
 )
+from tests.backends.hostile_calls import play
 from tests.backends.scenes import RIG, Scene, cloud, observe, path, run, scene, step
 
 # --- gaps and turns ---
