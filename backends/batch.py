@@ -153,8 +153,8 @@ class _BatchSolution:
             pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
             for i, number in enumerate(hangs.tolist())
         ]
-        problem, tracks = GraphProblem(), Tracks(make, None)
-        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.spread[s.of(s.begun)]))
+        problem, tracks = GraphProblem(), Tracks(make, None, smoother.config.track)
+        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.prior))
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))

@@ -80,11 +80,17 @@ class Covariance:
         out[there] = self.by_rig[len(self.head) + numbers_of(rows[there])].reshape(-1, *out.shape[1:])
         return out
 
-    def displaced(self, rows: IndexArray, change: Array) -> Covariance:
-        """After a change (M, 3) of some landmarks' coordinates that is none of their error: the last of the rig's."""
-        by_rig, there = self.by_rig.copy(), rows < self.correlated
-        by_rig[len(self.head) + numbers_of(rows[there]), -1:] -= change[there].reshape(-1, 1)
-        return replace(self, by_rig=by_rig)
+    def displaced(self, change: Array, shift: Array) -> Covariance:
+        """After a change (B + A, 3) of the landmarks' coordinates that is none of their error: the last of the rig's.
+
+        To their errors `shift` (B + A, 3, 6) times that of the pose is added.
+        """
+        h, head, shift = len(self.head), self.head.copy(), shift.reshape(-1, POSE)
+        by_rig = np.concatenate([self.by_rig[:h], self.by_rig[h:] + shift @ self.by_rig[:POSE]])
+        by_rig[h:, -1:] -= change.reshape(-1, 1)
+        half = shift @ (head[:POSE, h:] + 0.5 * self.pose @ shift.T)
+        head[:, h:] += head[:, :POSE] @ shift.T
+        return replace(self, head=head, marks=self.marks + half + half.T, by_rig=by_rig)
 
     def joint_poses(self, J: Array, n: int) -> Array:
         """Joint covariance (6n, 6n) of the last poses, the present one, J (6, 6) times [r, φ], last."""

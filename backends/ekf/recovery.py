@@ -40,10 +40,13 @@ def agreement(update: Update, noises: Iterable[Array], search: Search) -> Poster
     found, error, majority = None, None, (len(update.z) + 1) // 2
     try:
         for gated in _gated(update, noises, max(MIN_OBSERVATIONS, majority)):
-            found = _agreed(gated) or found
+            try:
+                found = _agreed(gated) or found
+            except UnsolvableError as reason:
+                error = reason
             if found is not None and found.used.sum() >= majority:
                 return found
-    except UnsolvableError as reason:
+    except UnsolvableError as reason:  # of the prior itself
         error = reason
     least = max(MIN_CONSENSUS, majority)
     finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
@@ -71,10 +74,15 @@ def _gated(update: Update, noises: Iterable[Array], majority: int) -> Iterable[G
     if len(update.z) >= majority > first.used.sum():
         places = (False, True) if update.guess is not None else (False,)
         priors = itertools.chain([update], map(update.wider, noises))
-        tries = (gate(prior, at_guess) for prior in priors for at_guess in places if at_guess or prior is not update)
-        enough = next((gated for gated in tries if gated.used.sum() >= majority), None)
-        if enough is not None:
-            yield enough
+        for prior, at_guess in itertools.product(priors, places):
+            with suppress(UnsolvableError):
+                gated = first if prior is update and not at_guess else gate(prior, at_guess)
+                if gated.used.sum() >= majority:
+                    break
+        else:
+            gated = first
+        if gated is not first:
+            yield gated
     yield first
 
 

@@ -89,13 +89,14 @@ class Update:
     def at(self, camera: Any = None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
         """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose.
 
-        Where the covariance is transported, so is an error of the pose: it moves landmarks as it does at the prior.
+        The coordinates of measured landmarks have changed by no more than they can.
         """
-        there, J, mean, marks = self.camera, np.eye(CAMERA), np.zeros(CAMERA), self.landmarks
+        there, J, mean, numbers = self.camera, np.eye(CAMERA), np.zeros(CAMERA), CAMERA + self.numbers
         size = CAMERA + len(self.covariance.marks) - 3 * self.covariance.left
-        change = np.zeros(size) if change is None else change.copy()
-        if not there.transports:
-            marks = marks.moved(self.coordinates, slice(None), change[CAMERA + self.numbers].reshape(-1, 3))
+        change, marks = (np.zeros(size), self.landmarks) if change is None else (change.copy(), self.landmarks)
+        if change[numbers].any():
+            marks = marks.moved(self.coordinates, slice(None), change[numbers].reshape(-1, 3))
+            change[numbers] = (marks.c - self.landmarks.c).reshape(-1)
         if camera is not None:
             there = self.camera.at(camera.pose)
             J = self.camera.transport(there)
@@ -118,6 +119,10 @@ class Linearisation:
     own: Array  # its derivatives (M, 3, 3) by the coordinates
     lever: Array  # (M, 3, 6), see the module
     from_prior: float  # squared distance from the prior
+
+    def at_prior(self) -> Linearisation:
+        """With the lever as it is at the prior: no sequence of updates with such measures the gauge."""
+        return replace(self, lever=self.update.landmarks.gauge @ (self.camera.world() @ self.J[:POSE, :POSE]))
 
     def cost(self, rows: BoolArray) -> float:
         """Squared distance from prior and measurements; ∞ where one cannot be seen."""
@@ -187,6 +192,14 @@ class Whitened:
     inverse: Array  # L⁻¹ (3M, 3M), lower triangular, with zero rows for the others
 
     @cached_property
+    def consistent(self) -> Whitened:
+        """That from which the covariance follows: where it is transported, pose and landmarks move as at the prior."""
+        nu = self.innovation
+        if not nu.at.update.camera.transports or not nu.at.change.any():
+            return self
+        return nu.at.at_prior().innovation(nu.rows).whitened(self.used)
+
+    @cached_property
     def w(self) -> Array:
         """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
         return np.asarray(self.inverse @ self.nu)
@@ -231,7 +244,7 @@ class Whitened:
 class Posterior:
     """The maximum of the posterior (or one step towards it)."""
 
-    whitened: Whitened  # the last innovation, from which the covariance follows
+    whitened: Whitened  # the last innovation; the covariance follows from that which is `consistent`
     change: Array  # of the state (n,) from the prior; the pose's part counts from the last linearisation
 
     @property
@@ -255,7 +268,7 @@ def gate(update: Update, at_guess: bool = False) -> Gated:
 
     Raises UnsolvableError where the prior is not finite, or S is not positive definite.
     """
-    start = update.at(update.camera.at(update.guess)) if at_guess else update.at()
+    start = _at_guess(update) if at_guess else update.at()
     P, measured = update.covariance, np.isfinite(update.z)
     if not (np.isfinite(start.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
         raise UnsolvableError("the predicted state is not finite")
@@ -283,7 +296,8 @@ def solve(gated: Gated) -> Posterior | None:
         excess = found.whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            left = gated.innovation.at.update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
+            taken = found.whitened.consistent.by_pose
+            left = gated.innovation.at.update.covariance.pose - taken.T @ taken
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
             return found
@@ -294,10 +308,8 @@ def solve(gated: Gated) -> Posterior | None:
 def _iterate(whitened: Whitened) -> Posterior:
     """An update whose first linearisation is that of `whitened`.
 
-    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. The prior is
-    transported from its own coordinates, not from those of the iterate: where landmarks move by much, the result is not
-    quite the posterior's maximum. Where the first is far from linear, the guess may be the better next place. One
-    iteration is taken as it is: the papers' filter.
+    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
+    is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
     """
     rows, reached = whitened.innovation.rows & whitened.used[:, None], None
     now, update = whitened.innovation.at, whitened.innovation.at.update

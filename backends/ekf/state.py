@@ -145,5 +145,6 @@ class FilterState:
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
         shift = (marks.gauge - before.gauge)[state] @ camera.world() * camera.transports
-        covariance = update.covariance.corrected(*found.whitened.lost(), self.camera.transport(camera), shift)
+        lost = found.whitened.consistent.lost()
+        covariance = update.covariance.corrected(*lost, self.camera.transport(camera), shift)
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()

@@ -154,8 +154,10 @@ class SmootherLandmarks(LandmarkRows):
         Poses before it are kept no more. The numbers of the poses stay: they say when a landmark was measured last.
         Landmarks that pose `oldest` or a later one measured go on with the measurements that are left.
         """
-        old = ((self.pose >= 0) & (self.pose < first)).any(axis=1) & (self.pose.max(axis=1) < oldest) & ~self.world
-        return replace(self._known_by(old, self.own), z=np.where(old[:, None, None], np.nan, self.z))
+        gone, lately = (self.pose >= 0) & (self.pose < first), self.pose.max(axis=1) >= oldest
+        old = gone.any(axis=1) & ~lately & ~self.world
+        z = np.where((old[:, None] | gone)[:, :, None], np.nan, self.z)
+        return replace(self._known_by(old, self.own), z=z, pose=np.where(gone & lately[:, None], -1, self.pose))
 
     def _known_by(self, chosen: BoolArray, covariances: Array) -> Self:
         """Where some (S,) stand is what is known of them, with covariances (S, 3, 3)."""

@@ -48,11 +48,12 @@ class Tracks:
     A landmark is a smart factor that grows until the landmark goes on in a new one (`SmootherLandmarks.measured`):
     factors end before their first pose leaves the lag. A landmark of which more is known than what was measured is a
     variable of its own, and so are some that were measured for longer: those take over what is in their smart factor.
-    So many poses before the newest one as `lag` says are smoothed with it; None for all.
+    So many poses before the newest one as `lag` says are smoothed with it; None for all: then a smart factor that has
+    the measurements of what was a variable has at most so many as `most` says.
     """
 
-    def __init__(self, make: FactorMaker, lag: int | None) -> None:
-        self._make, self._lag = make, lag
+    def __init__(self, make: FactorMaker, lag: int | None, most: int) -> None:
+        self._make, self._lag, self._most = make, lag, most
         self._smart: dict[int, Track] = {}
         self._variables: dict[int, int] = {}  # numbers of the poses as long as which they stay
         self._solved = -1  # number of the newest pose that was solved for
@@ -84,8 +85,7 @@ class Tracks:
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
             track = self._smart.get(serial)
-            goes_on = track is not None and (track.poses[0] >= first - 1 if begun == VARIABLE else track.begun == begun)
-            if track is None or not goes_on:
+            if track is None or not self._goes_on(track, begun, first):
                 self._smart[serial] = track = Track(begun)
             track.poses.append(number)
             track.keys.append(key)
@@ -94,6 +94,12 @@ class Tracks:
             problem.grown[serial, track.begun] = track
             if begun == VARIABLE and track.stereo:
                 self._turn(problem, s, serial, number)
+
+    def _goes_on(self, track: Track, begun: int, first: int) -> bool:
+        """Whether a measurement goes into a smart factor; one of a landmark that was a variable goes into any."""
+        if begun != VARIABLE:
+            return track.begun == begun
+        return track.poses[0] >= first - 1 and (self._lag is not None or len(track.poses) < self._most)
 
     def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
         """Variables that the state keeps do not leave; their serial numbers."""
@@ -128,11 +134,17 @@ class Tracks:
     def _is_variable(
         self, problem: GraphProblem, s: SmootherState, serial: int, begun: int, number: int, first: int
     ) -> bool:
-        """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
+        """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet.
+
+        The covariance of a first pose has used it up if the landmark was measured by then; that of the pose with which
+        the problem begins is from before.
+        """
         known = s.known.get(serial)
         if serial in self._variables and (begun == VARIABLE or known is not None):
             return self._is_there(serial)
         if known is None or 0 <= known.pose < first:
+            return False
+        if known.pose < 0 <= known.used <= first and first > s.begun:
             return False
         self.add_known(problem, s, serial)
         return True
@@ -167,5 +179,5 @@ class Tracks:
         self._solved = s.number
         if self._lag is not None and not s.number % self._lag:
             oldest = s.number - self._lag
-            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] > oldest}
+            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] >= oldest}
             self._variables = {n: last for n, last in self._variables.items() if last >= oldest or n in s.known}
