@@ -80,9 +80,9 @@ class LandmarkFilter:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         s = self._started("update")
-        require_not_measured(self.name, s.measured)
+        require_not_measured(self.name, s.closed)
         require_guess(self.name, guess)
-        s = replace(s.with_all_of(observations.ids), measured=True)
+        s = replace(s.with_all_of(observations.ids), closed=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
         return report
@@ -184,7 +184,7 @@ class LandmarkFilter:
         prior map that were not measured yet were placed by no pixels: they stay. The covariance is transported to where
         they are now, see `FilterState.corrected`.
         """
-        s, stereo = replace(self.state, measured=True), self._measure.stereo
+        s, stereo = replace(self.state, closed=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
             before, all_of = s.landmarks, slice(s.covariance.correlated)
@@ -215,7 +215,7 @@ class LandmarkFilter:
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
-            after = replace(s, stamp=float(stamp), frame=0, measured=False)
+            after = replace(s, stamp=float(stamp), frame=0, closed=False)
         else:
             after = s.advanced(float(stamp), moved(s.camera, stamp - s.stamp))
         T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)

@@ -18,12 +18,11 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import bdtrc
 
 from backends.ekf.solve import Gated, Posterior, UnsolvableError, Update, gate, solve
 from slam.geometry import se3
 from slam.geometry.se3 import Array
-from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
 
 #: The pose (4, 4) on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]
@@ -92,8 +91,9 @@ def _agreed(gated: Gated) -> Posterior | None:
     used, count = 0 if found is None else int(found.used.sum()), len(gated.used)
     if count < MIN_OBSERVATIONS or ONE_AGREES_IN * used >= count:
         return found
-    rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
-    if not len(rejected):
-        return None
-    share, models = share_by_chance(rejected, float(gated.limits.max())), gated.innovation.at.update.measure.models
-    return None if bdtrc(used - 1, count, share) > 1 - models.gate_probability else found
+    rejected, models = (
+        gated.distances[~gated.used & np.isfinite(gated.distances)],
+        gated.innovation.at.update.measure.models,
+    )
+    chance = by_chance(rejected, used, count, float(gated.limits.max()), models.gate_probability)
+    return None if chance else found

@@ -57,7 +57,7 @@ class SmootherBackend:
         self.config = from_options(SmootherConfig, "smoother", options)
         self._steps = Steps(rig, models, self.config)
         self.factor_maker = FactorMaker(self._steps.stereo, models)
-        self._graph = Graph(self.factor_maker, self.config.lag, self._steps.track)
+        self._graph = Graph(self.factor_maker, self.config.lag)
         self.state = SmootherState.empty(np.zeros((6, 0)))
         self.path = Path()
         self._mended = False  # whether measurements were revised while poses were kept
@@ -145,7 +145,7 @@ class SmootherBackend:
         """
         s = self.state
         if self._answer is None or self._answer[0] is not s:
-            graph = path_solved(s, self._steps, self.factor_maker, self.path.graph(s.first)) if self._mended else None
+            graph = path_solved(s, self.factor_maker, self.path.graph(s.first)) if self._mended else None
             self._answer = s, self.path.trajectory(s, graph)
         return Trajectory(self._answer[1].stamps.copy(), self._answer[1].poses.copy())
 

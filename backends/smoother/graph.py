@@ -48,13 +48,13 @@ class Graph:
     Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
     world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
     known in the world the first pose has its own covariance instead. So many poses before the newest one as
-    `lag` says are smoothed with it; None for all. `most` is as in `Tracks`.
+    `lag` says are smoothed with it; None for all.
     """
 
-    def __init__(self, make: FactorMaker, lag: int | None, most: int) -> None:
+    def __init__(self, make: FactorMaker, lag: int | None) -> None:
         self.rebuilds = 0  # how often it was built anew after a failure
         self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
-        self._make, self._lag, self._most = make, lag, most
+        self._make, self._lag = make, lag
         self.restart()
 
     def restart(self) -> None:
@@ -66,7 +66,7 @@ class Graph:
         self._solver = gtsam.IncrementalFixedLagSmoother(
             _ENDLESS if self._lag is None else float(self._lag), parameters
         )
-        self._tracks = Tracks(self._make, self._lag, self._most)
+        self._tracks = Tracks(self._make, self._lag)
         self._number, self._taken = -1, 0
         self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}

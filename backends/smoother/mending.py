@@ -59,14 +59,14 @@ def rebuilt(s: SmootherState, steps: Steps, graph: Graph) -> SmootherState:
     return s
 
 
-def path_solved(s: SmootherState, steps: Steps, make: FactorMaker, before: Array) -> Array:
+def path_solved(s: SmootherState, make: FactorMaker, before: Array) -> Array:
     """All poses of the graph, those that are kept solved for together; as they are where that fails.
 
     The newest pose stays where it is, and the path moves, but where landmarks are known in the world. Those that are
     kept no more are `before` (N, 4, 4).
     """
     first = max(s.begun, s.first)
-    problem, tracks, kept = GraphProblem(), Tracks(make, None, steps.track), s.poses.copy()
+    problem, tracks, kept = GraphProblem(), Tracks(make, None), s.poses.copy()
     problem.factors.add(make.prior(first, s.poses[s.of(first)], held(s, first)[0]))
     for number in range(first, s.number + 1):
         tracks.add_pose(problem, s, number, first)

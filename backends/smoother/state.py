@@ -18,7 +18,7 @@ class Sight(Table):
     """What was measured from one pose."""
 
     serials: IdArray  # of the landmarks (M,)
-    begun: IndexArray  # which of each one's smart factors it goes into (M,), see `SmootherLandmarks.begun`
+    factor: IndexArray  # which of each one's smart factors it goes into (M,), see `SmootherLandmarks.factor`
     z: Array  # measurements (M, 3) of the rectified rig, uR NaN where missing
 
     @classmethod
@@ -29,7 +29,7 @@ class Sight(Table):
     @classmethod
     def of(cls, marks: SmootherLandmarks, rows: IndexArray, z: Array) -> Sight:
         """Of measurements z (M, 3) that landmarks have just had."""
-        return cls(marks.serial[rows], marks.begun[rows], z)
+        return cls(marks.serial[rows], marks.factor[rows], z)
 
 
 @dataclass(frozen=True, eq=False)

@@ -219,7 +219,7 @@ class Steps(RectifiedMeasurement):
         """Covariances (M, 3, 3) of landmarks in the world."""
         marks, joint = s.landmarks, graph.joint_covariance(s)[1]
         C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, s.first, s.poses, joint)
-        for i in np.flatnonzero(marks.begun[rows] == VARIABLE):
+        for i in np.flatnonzero(marks.factor[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
         return C

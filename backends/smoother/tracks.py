@@ -16,18 +16,24 @@ from slam.geometry.se3 import transform
 #: Times of variables, as gtsam's stubs have them.
 Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
 
+_LONGEST = 64  # cost: measurements in a factor of what was a variable; its cost grows with their square
+
 
 @dataclass
 class Track:
     """A landmark's smart factor."""
 
-    begun: int  # see `SmootherLandmarks.begun`
+    factor: int  # see `SmootherLandmarks.factor`
     poses: list[int] = field(default_factory=list)  # numbers of the poses that measured it
     keys: list[int] = field(default_factory=list)  # their variables, and the measurements
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
     # whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only
     stereo: bool = False
     slot: int = -1  # of the factor in the solver, −1 while there is none
+
+    def takes_any(self, first: int) -> bool:
+        """Whether it takes a measurement of what was a variable, if all its poses are to be from `first` on."""
+        return self.poses[0] >= first and len(self.poses) < _LONGEST
 
 
 @dataclass
@@ -37,7 +43,8 @@ class GraphProblem:
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)  # for gtsam
     values: gtsam.Values = field(default_factory=gtsam.Values)
     removed: list[int] = field(default_factory=list)  # slots of factors that others replace
-    grown: dict[tuple[int, int], Track] = field(default_factory=dict)  # smart factors with new measurements
+    # smart factors with new measurements, by serial number of the landmark and number of the first pose
+    grown: dict[tuple[int, int], Track] = field(default_factory=dict)
     # times of variables for the fixed lag: numbers of poses
     stamps: Stamps = field(default_factory=dict)
 
@@ -48,12 +55,11 @@ class Tracks:
     A landmark is a smart factor that grows until the landmark goes on in a new one (`SmootherLandmarks.measured`):
     factors end before their first pose leaves the lag. A landmark of which more is known than what was measured is a
     variable of its own, and so are some that were measured for longer: those take over what is in their smart factor.
-    So many poses before the newest one as `lag` says are smoothed with it; None for all: then a smart factor that has
-    the measurements of what was a variable has at most so many as `most` says.
+    So many poses before the newest one as `lag` says are smoothed with it; None for all.
     """
 
-    def __init__(self, make: FactorMaker, lag: int | None, most: int) -> None:
-        self._make, self._lag, self._most = make, lag, most
+    def __init__(self, make: FactorMaker, lag: int | None) -> None:
+        self._make, self._lag = make, lag
         self._smart: dict[int, Track] = {}
         self._variables: dict[int, int] = {}  # numbers of the poses as long as which they stay
         self._solved = -1  # number of the newest pose that was solved for
@@ -77,33 +83,30 @@ class Tracks:
         """What was measured from a pose, from some row on."""
         sight, make, known = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
         key = pose_key(number)
-        rows = (column[begin:].tolist() for column in (sight.serials, sight.begun, sight.z))
-        for serial, begun, z in zip(*rows):
+        rows = (column[begin:].tolist() for column in (sight.serials, sight.factor, sight.z))
+        for serial, factor, z in zip(*rows):
             point = make.point(z)
-            if known and self._is_variable(problem, s, serial, begun, number, first):
+            if known and self._is_variable(problem, s, serial, factor, number, first):
                 self._stays(problem, serial, number)
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
             track = self._smart.get(serial)
-            if track is None or not self._goes_on(track, begun, first):
-                self._smart[serial] = track = Track(begun)
+            goes_on = track is not None and (
+                track.factor == factor if factor != VARIABLE else track.takes_any(first - 1)
+            )
+            if track is None or not goes_on:
+                self._smart[serial] = track = Track(factor)
             track.poses.append(number)
             track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
-            problem.grown[serial, track.begun] = track
-            if begun == VARIABLE and track.stereo:
+            problem.grown[serial, track.poses[0]] = track
+            if factor == VARIABLE and track.stereo:
                 self._turn(problem, s, serial, number)
-
-    def _goes_on(self, track: Track, begun: int, first: int) -> bool:
-        """Whether a measurement goes into a smart factor; one of a landmark that was a variable goes into any."""
-        if begun != VARIABLE:
-            return track.begun == begun
-        return track.poses[0] >= first - 1 and (self._lag is not None or len(track.poses) < self._most)
 
     def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
         """Variables that the state keeps do not leave; their serial numbers."""
-        kept = list(filter(self._is_there, s.landmarks.serial[s.landmarks.begun == VARIABLE].tolist()))
+        kept = list(filter(self._is_there, s.landmarks.serial[s.landmarks.factor == VARIABLE].tolist()))
         for serial in kept:
             self._stays(problem, serial, s.number)
         return kept
@@ -119,11 +122,11 @@ class Tracks:
 
     def _turn(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
         """A landmark becomes a variable, if the state has it as one, with the measurements of its smart factor."""
-        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.begun == VARIABLE))
+        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.factor == VARIABLE))
         if not len(row):
             return
         track = self._smart.pop(serial)
-        del problem.grown[serial, track.begun]
+        del problem.grown[serial, track.poses[0]]
         if track.slot >= 0:
             problem.removed.append(track.slot)
         for pose, point in zip(track.poses, track.points):
@@ -132,7 +135,7 @@ class Tracks:
         self._stays(problem, serial, number)
 
     def _is_variable(
-        self, problem: GraphProblem, s: SmootherState, serial: int, begun: int, number: int, first: int
+        self, problem: GraphProblem, s: SmootherState, serial: int, factor: int, number: int, first: int
     ) -> bool:
         """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet.
 
@@ -140,7 +143,7 @@ class Tracks:
         the problem begins is from before.
         """
         known = s.known.get(serial)
-        if serial in self._variables and (begun == VARIABLE or known is not None):
+        if serial in self._variables and (factor == VARIABLE or known is not None):
             return self._is_there(serial)
         if known is None or 0 <= known.pose < first:
             return False

@@ -443,7 +443,7 @@ def test_what_is_taken_out_was_never_there():
             assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
         fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)), np.ones(12, bool))
         np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
-        V, W = (np.concatenate(one.lost()[0]) for one in (without, fresh))
+        V, W = (np.concatenate(one.gain_root()[0]) for one in (without, fresh))
         np.testing.assert_allclose(in_deviations(V @ V.T, P), in_deviations(W @ W.T, P), atol=1e-9)
 
 
