@@ -149,12 +149,12 @@ class _BatchSolution:
         numbers = range(s.begun, s.number + 1)
         stamps, hangs = smoother.path.frames(s.begun)
         before = smoother.path.trajectory(s).poses[-len(stamps) :]
-        keys = [
+        keys = [  # frames that are no pose of the smoother's graph are variables of their own, f
             pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
             for i, number in enumerate(hangs.tolist())
         ]
         problem, tracks = GraphProblem(), Tracks(make, None)
-        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.spread[s.of(s.begun)]))
+        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.prior))
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))

@@ -9,6 +9,8 @@ In the papers' order:
 - `covariance`: ``A P Aᵀ + W Q Wᵀ`` (B, section 2), landmarks that join (A, Eq. 10), ``P − K S Kᵀ`` (A, Eq. 11).
 - `state`: camera, landmarks and covariance, and the steps from one such state to the next.
 - `filter`: a back end for any camera; `backend`: the papers'.
+
+An error is what is true less what is believed: the estimate is corrected by adding it (`EulerCamera.moved`).
 """
 
 from backends.ekf.backend import EkfBackend, EkfConfig

@@ -80,9 +80,9 @@ class LandmarkFilter:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         s = self._started("update")
-        require_not_measured(self.name, s.measured)
+        require_not_measured(self.name, s.closed)
         require_guess(self.name, guess)
-        s = replace(s.with_all_of(observations.ids), measured=True)
+        s = replace(s.with_all_of(observations.ids), closed=True)
         s, report = self._updated(s, observations, guess)
         self.state = s
         return report
@@ -181,20 +181,24 @@ class LandmarkFilter:
 
         The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
         were corrected before, and seen at pixels as they are now, would look as if the camera had moved. Those of a
-        prior map that were not measured yet were placed by no pixels: they stay.
+        prior map that were not measured yet were placed by no pixels: they stay. The covariance is transported to where
+        they are now, see `FilterState.corrected`.
         """
-        s, stereo = replace(self.state, measured=True), self._measure.stereo
+        s, stereo = replace(self.state, closed=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
-            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[: s.covariance.correlated])
+            before, all_of = s.landmarks, slice(s.covariance.correlated)
+            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[all_of])
             z = stereo.corrected(self.name, z[rows], correct)
             points = se3.transform(s.pose, stereo.triangulate(z))
             good = np.isfinite(points).all(axis=1)
             rows, points = rows[good], points[good]
             change = self._coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
             if np.isfinite(change).all():
-                marks = s.landmarks.moved(self._coordinates, rows, change)
-                s = replace(s, landmarks=marks, covariance=s.covariance.displaced(rows, change))
+                marks = before.moved(self._coordinates, rows, change)
+                shift = (marks.gauge - before.gauge)[all_of] @ s.camera.world() * s.camera.transports
+                moved = s.covariance.displaced((marks.c - before.c)[all_of], shift)
+                s = replace(s, landmarks=marks, covariance=moved)
         self.state = s
 
     # --- the filter's parts ---
@@ -211,7 +215,7 @@ class LandmarkFilter:
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
-            after = replace(s, stamp=float(stamp), frame=0, measured=False)
+            after = replace(s, stamp=float(stamp), frame=0, closed=False)
         else:
             after = s.advanced(float(stamp), moved(s.camera, stamp - s.stamp))
         T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)

@@ -7,8 +7,14 @@ The papers' ``R(φ) = Rz(φz) Ry(φy) Rx(φx)`` (paper B, below Eq. 2) takes cam
 be chosen; it is singular at φy = ±90°. With z forward, y down and the first camera as the world, turning 90° about the
 vertical would be that. So the angles refer to a world of their own, turned against the user's by a constant rotation:
 its x is where the camera looks at the start, its y the camera's right, its z down. Heading is then φz, looking up and
-down φx, and φy a roll about the optical axis: only a camera held on its side comes near the singularity. There the
-angles' world is chosen again (`reanchor`), exactly for the state, to first order for the covariance.
+down φx, and φy a roll about the optical axis: only a camera held on its side comes near the singularity. Before a step
+there the angles' world is chosen again (`reanchored`), exactly for the state, to first order for the covariance. An
+update keeps it: after a roll by some 80° that no prediction foresaw, this camera is far too sure of itself, and
+`backends.iekf` is not.
+
+``world()`` is the displacement of the world by an error of the pose, ``FilterLandmarks.gauge`` that of a landmark's
+coordinates by one of the world; their product is what an error of the pose does to a landmark that it takes along (the
+`lever` of `backends.ekf.solve`). Transport keeps the displacement: ``world(to) · J = world(from)``.
 
 What the Euler model costs: a constant ω is a constant rate of the angles, which is a constant body rate only for turns
 about one axis. Turning at w [rad/s] while another angle changes at u, the predicted body rate is off by about u w Δt
@@ -92,7 +98,7 @@ class EulerCamera:
         nearest = before + changes[np.argmin(np.linalg.norm(changes, axis=1))]
         return replace(self, x=np.concatenate([T[:3, 3], nearest, self.x[POSE:]]))
 
-    def seen_from(self, other: EulerCamera) -> Array:
+    def minus(self, other: EulerCamera) -> Array:
         """The error (12,) that would bring the other camera here."""
         return self.x - other.x
 
@@ -126,7 +132,8 @@ class EulerCamera:
             phi_y, rate = camera.x[[4, 10]]
             if max(abs(phi_y), abs(phi_y + rate * dt / pieces)) > LIMIT:
                 camera, G = camera.reanchored()
-                J, W = G @ J, G @ W if piece else W
+                J = G @ J
+                W = G @ W if piece else W  # the impulses come when the first world is chosen
             camera, A = camera._transition(dt / pieces)
             J, W = A @ J, A @ W
         return camera, J, motion_noise(models, dt, W)

@@ -18,12 +18,11 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import bdtrc
 
 from backends.ekf.solve import Gated, Posterior, UnsolvableError, Update, gate, solve
 from slam.geometry import se3
 from slam.geometry.se3 import Array
-from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
 
 #: The pose (4, 4) on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]
@@ -40,10 +39,13 @@ def agreement(update: Update, noises: Iterable[Array], search: Search) -> Poster
     found, error, majority = None, None, (len(update.z) + 1) // 2
     try:
         for gated in _gated(update, noises, max(MIN_OBSERVATIONS, majority)):
-            found = _agreed(gated) or found
+            try:
+                found = _agreed(gated) or found
+            except UnsolvableError as reason:
+                error = reason
             if found is not None and found.used.sum() >= majority:
                 return found
-    except UnsolvableError as reason:
+    except UnsolvableError as reason:  # of the prior itself
         error = reason
     least = max(MIN_CONSENSUS, majority)
     finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
@@ -71,10 +73,15 @@ def _gated(update: Update, noises: Iterable[Array], majority: int) -> Iterable[G
     if len(update.z) >= majority > first.used.sum():
         places = (False, True) if update.guess is not None else (False,)
         priors = itertools.chain([update], map(update.wider, noises))
-        tries = (gate(prior, at_guess) for prior in priors for at_guess in places if at_guess or prior is not update)
-        enough = next((gated for gated in tries if gated.used.sum() >= majority), None)
-        if enough is not None:
-            yield enough
+        for prior, at_guess in itertools.product(priors, places):
+            with suppress(UnsolvableError):
+                gated = first if prior is update and not at_guess else gate(prior, at_guess)
+                if gated.used.sum() >= majority:
+                    break
+        else:
+            gated = first
+        if gated is not first:
+            yield gated
     yield first
 
 
@@ -84,8 +91,9 @@ def _agreed(gated: Gated) -> Posterior | None:
     used, count = 0 if found is None else int(found.used.sum()), len(gated.used)
     if count < MIN_OBSERVATIONS or ONE_AGREES_IN * used >= count:
         return found
-    rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
-    if not len(rejected):
-        return None
-    share, models = share_by_chance(rejected, float(gated.limits.max())), gated.innovation.at.update.measure.models
-    return None if bdtrc(used - 1, count, share) > 1 - models.gate_probability else found
+    rejected, models = (
+        gated.distances[~gated.used & np.isfinite(gated.distances)],
+        gated.innovation.at.update.measure.models,
+    )
+    chance = by_chance(rejected, used, count, float(gated.limits.max()), models.gate_probability)
+    return None if chance else found

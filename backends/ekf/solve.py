@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg.lapack import dpotrf
 
 from backends.ekf.covariance import CAMERA, POSE, Covariance, numbers_of
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
@@ -28,6 +28,7 @@ from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.window.gating import squared_distances
+from slam.window.solver import upper_inverse
 from slam.window.stereo import RectifiedMeasurement
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
@@ -37,7 +38,6 @@ _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its deviations: with a wide prior all have the same sign.
 _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
-_SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
 
 
 class UnsolvableError(ArithmeticError):
@@ -70,7 +70,7 @@ class Update:
     @cached_property
     def numbers(self) -> IndexArray:
         """Where the coordinates (3M,) of the measured landmarks stand among those of the state's."""
-        return numbers_of(self.rows - self.covariance.left)
+        return numbers_of(self.rows - self.covariance.parked)
 
     def among_measured(self, change: Array) -> Array:
         """The part (6 + 3M,) of a change of the state (n,) that the measurements depend on."""
@@ -89,18 +89,19 @@ class Update:
     def at(self, camera: Any = None, change: Array | None = None, from_prior: float = 0.0) -> Linearisation:
         """Linearised at another camera's pose, or the prior's own, and a change of the state (n,) but for the pose.
 
-        Where the covariance is transported, so is an error of the pose: it moves landmarks as it does at the prior.
+        The coordinates of measured landmarks have changed by no more than they can.
         """
-        there, J, mean, marks = self.camera, np.eye(CAMERA), np.zeros(CAMERA), self.landmarks
-        size = CAMERA + len(self.covariance.marks) - 3 * self.covariance.left
-        change = np.zeros(size) if change is None else change.copy()
-        if not there.transports:
-            marks = marks.moved(self.coordinates, slice(None), change[CAMERA + self.numbers].reshape(-1, 3))
+        there, J, mean, numbers = self.camera, np.eye(CAMERA), np.zeros(CAMERA), CAMERA + self.numbers
+        size = CAMERA + len(self.covariance.marks) - 3 * self.covariance.parked
+        change, marks = (np.zeros(size), self.landmarks) if change is None else (change.copy(), self.landmarks)
+        if change[numbers].any():
+            marks = marks.moved(self.coordinates, slice(None), change[numbers].reshape(-1, 3))
+            change[numbers] = (marks.c - self.landmarks.c).reshape(-1)
         if camera is not None:
             there = self.camera.at(camera.pose)
             J = self.camera.transport(there)
-            mean = np.linalg.solve(J, self.camera.seen_from(there))
-            change[:CAMERA] = np.concatenate([np.zeros(POSE), camera.seen_from(there)[POSE:]])
+            mean = np.linalg.solve(J, self.camera.minus(there))
+            change[:CAMERA] = np.concatenate([np.zeros(POSE), camera.minus(there)[POSE:]])
         lever = marks.gauge @ (there.world() @ J[:POSE, :POSE])
         return Linearisation(self, there, J, mean, change, *self.seen(there.pose, change), lever, from_prior)
 
@@ -119,6 +120,10 @@ class Linearisation:
     lever: Array  # (M, 3, 6), see the module
     from_prior: float  # squared distance from the prior
 
+    def at_prior(self) -> Linearisation:
+        """With the lever as it is at the prior: no sequence of updates with such measures the gauge."""
+        return replace(self, lever=self.update.landmarks.gauge @ (self.camera.world() @ self.J[:POSE, :POSE]))
+
     def cost(self, rows: BoolArray) -> float:
         """Squared distance from prior and measurements; ∞ where one cannot be seen."""
         residual = np.where(rows, self.update.z - self.z, 0.0)
@@ -132,7 +137,7 @@ class Linearisation:
     def innovation(self, rows: BoolArray) -> Innovation:
         """ν and S of some rows (M, 3)."""
         update, P = self.update, self.update.covariance
-        numbers, b, h = 3 * P.left + update.numbers, 3 * P.left, len(P.head)
+        numbers, b, h = 3 * P.parked + update.numbers, 3 * P.parked, len(P.head)
         own = self.own if rows.all() else np.where(rows[:, :, None], self.own, 0.0)
         by_pose, moved = -(own @ self.lever).reshape(-1, POSE), self.change[CAMERA + update.numbers]
         nu = np.where(rows, update.z - self.z, 0.0).reshape(-1)
@@ -165,7 +170,7 @@ class Innovation:
         upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
         if info != 0:
             raise UnsolvableError("the innovation covariance is not positive definite")
-        inverse = _inverse(upper).T
+        inverse = upper_inverse(upper).T
         inverse[out, out] = 0.0
         return Whitened(self, used, nu, inverse)
 
@@ -187,6 +192,14 @@ class Whitened:
     inverse: Array  # L⁻¹ (3M, 3M), lower triangular, with zero rows for the others
 
     @cached_property
+    def consistent(self) -> Whitened:
+        """That from which the covariance follows: where it is transported, pose and landmarks move as at the prior."""
+        nu = self.innovation
+        if not nu.at.update.camera.transports or not nu.at.change.any():
+            return self
+        return nu.at.at_prior().innovation(nu.rows).whitened(self.used)
+
+    @cached_property
     def w(self) -> Array:
         """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
         return np.asarray(self.inverse @ self.nu)
@@ -201,11 +214,11 @@ class Whitened:
         """The whitened innovation's covariance (3M, 6) with the pose."""
         return np.asarray(self.inverse @ self.innovation.HP[0][:, :POSE])
 
-    def lost(self) -> tuple[tuple[Array, Array, Array], Array]:
+    def gain_root(self) -> tuple[tuple[Array, Array, Array], Array]:
         """``P Hᵀ L⁻ᵀ``, and L⁻¹ times derivatives of ν by errors of the rig; see `Covariance.corrected`."""
         nu, (with_camera, with_marks), update = self.innovation, self.innovation.HP, self.innovation.at.update
         P, H = update.covariance, (nu.own, nu.by_pose)
-        h, b, numbers = len(P.head), 3 * P.left, 3 * P.left + update.numbers
+        h, b, numbers = len(P.head), 3 * P.parked, 3 * P.parked + update.numbers
         poses_and_left = np.concatenate([P.head[CAMERA:, h + numbers].T, P.marks[:, :b][numbers]], axis=1)
         rest = _times(*H, P.head[:POSE, CAMERA : h + b], poses_and_left)
         V = dtrmm(1.0, self.inverse.T, np.concatenate([with_camera, rest], axis=1).T, side=1)
@@ -231,7 +244,7 @@ class Whitened:
 class Posterior:
     """The maximum of the posterior (or one step towards it)."""
 
-    whitened: Whitened  # the last innovation, from which the covariance follows
+    whitened: Whitened  # the last innovation; the covariance follows from that which is `consistent`
     change: Array  # of the state (n,) from the prior; the pose's part counts from the last linearisation
 
     @property
@@ -255,7 +268,7 @@ def gate(update: Update, at_guess: bool = False) -> Gated:
 
     Raises UnsolvableError where the prior is not finite, or S is not positive definite.
     """
-    start = update.at(update.camera.at(update.guess)) if at_guess else update.at()
+    start = _at_guess(update) if at_guess else update.at()
     P, measured = update.covariance, np.isfinite(update.z)
     if not (np.isfinite(start.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
         raise UnsolvableError("the predicted state is not finite")
@@ -283,7 +296,8 @@ def solve(gated: Gated) -> Posterior | None:
         excess = found.whitened.distances() / gated.limits
         worst = excess.max()
         if worst <= 1:
-            left = gated.innovation.at.update.covariance.pose - found.whitened.by_pose.T @ found.whitened.by_pose
+            taken = found.whitened.consistent.by_pose
+            left = gated.innovation.at.update.covariance.pose - taken.T @ taken
             if dpotrf(left, lower=1)[1] != 0:
                 raise UnsolvableError("the pose's covariance would not stay positive definite")
             return found
@@ -294,10 +308,8 @@ def solve(gated: Gated) -> Posterior | None:
 def _iterate(whitened: Whitened) -> Posterior:
     """An update whose first linearisation is that of `whitened`.
 
-    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. The prior is
-    transported from its own coordinates, not from those of the iterate: where landmarks move by much, the result is not
-    quite the posterior's maximum. Where the first is far from linear, the guess may be the better next place. One
-    iteration is taken as it is: the papers' filter.
+    Gauss-Newton on the posterior (an iterated Kalman filter); a step that raises the cost is shortened. Where the first
+    is far from linear, the guess may be the better next place. One iteration is taken as it is: the papers' filter.
     """
     rows, reached = whitened.innovation.rows & whitened.used[:, None], None
     now, update = whitened.innovation.at, whitened.innovation.at.update
@@ -321,18 +333,6 @@ def _iterate(whitened: Whitened) -> Posterior:
     if reached is None:
         raise UnsolvableError("no step towards the solution lowers the cost")
     return reached
-
-
-def _inverse(U: Array) -> Array:
-    """``U⁻¹`` of an upper triangular U (N, N), by halves: LAPACK's own takes twice as long for many rows."""
-    half = len(U) // 2
-    if half < _SMALL:
-        return np.asarray(dtrtri(U)[0])
-    first, last = _inverse(U[:half, :half]), _inverse(U[half:, half:])
-    out = np.zeros(U.shape, order="F")
-    out[:half, :half], out[half:, half:] = first, last
-    out[:half, half:] = dtrmm(-1.0, first, dtrmm(1.0, last, U[:half, half:], side=1))
-    return out
 
 
 def _linear(whitened: Whitened, change: Array) -> bool:

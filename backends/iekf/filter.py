@@ -70,7 +70,7 @@ class InvariantCamera:
         """See `EulerCamera`."""
         return replace(self, pose=T)
 
-    def seen_from(self, other: InvariantCamera) -> Array:
+    def minus(self, other: InvariantCamera) -> Array:
         """See `EulerCamera`."""
         turn = se3.so3_log(self.pose[:3, :3] @ other.pose[:3, :3].T)
         shift = self.pose[:3, 3] - other.pose[:3, 3]

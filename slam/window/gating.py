@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammainc
+from scipy.special import bdtrc, comb, gammainc
 
 from slam.chi_square import chi_square_limit
 from slam.geometry import kernels
@@ -24,6 +24,21 @@ def share_by_chance(rejected: Array, limit: float) -> float:
     median = chi_square_limit(3, 0.5)
     spread = float(np.median(rejected)) / median  # in units of the innovation covariances
     return float(gammainc(1.5, limit / spread / 2))
+
+
+def by_chance(rejected: Array, agree: int, count: int, limit: float, probability: float, fitted: int = 0) -> bool:
+    """Whether as many of `count` wrong observations may pass a gate as agree, at the gate's own level.
+
+    `fitted` observations agree with the pose that was made to fit them, whatever they are, and it may have been made to
+    fit any so many: the number of others that agree is tested for all such choices together (an a contrario test, as in
+    Moisan & Stival, IJCV 2004). The gate has a `limit` for squared distances, and a `probability`. Where none is
+    `rejected`, nothing shows how wrong ones scatter: True.
+    """
+    if not len(rejected) or agree <= fitted:
+        return True
+    share = share_by_chance(rejected, limit)
+    others = bdtrc(agree - fitted - 1, count - fitted, share)
+    return bool(comb(count, fitted) * others > 1 - probability)
 
 
 def squared_distances(residuals: Array, covariances: Array) -> Array:

@@ -88,9 +88,9 @@ def rounds(monkeypatch, make, most: int) -> EkfBackend:
 @pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
 def test_landmarks_leave_the_state_and_come_back(make, monkeypatch):
     whole, some = rounds(monkeypatch, make, 1000), rounds(monkeypatch, make, 60)
-    assert whole.state.covariance.left == 0
-    assert some.state.covariance.correlated - some.state.covariance.left <= 60
-    assert some.state.covariance.left > 60
+    assert whole.state.covariance.parked == 0
+    assert some.state.covariance.correlated - some.state.covariance.parked <= 60
+    assert some.state.covariance.parked > 60
     a, b = whole.estimate(), some.estimate()
     np.testing.assert_array_equal(a.ids, b.ids)
     # what is no longer corrected is known a little less well, but not much: nor does it spoil the camera
@@ -232,3 +232,19 @@ def test_the_last_poses_are_known_together():
         low, high = chi2.ppf([0.001, 0.999], dof * runs) / runs
         assert low < np.mean(distances) < high
     assert len(backend.recent(1)) == 1 and len(backend.recent(100)) == 5
+
+
+@pytest.mark.parametrize("make", [EkfBackend, IekfBackend])
+def test_a_revision_does_not_measure_where_the_world_is(make):
+    models = EstimatorModels(
+        MotionModel(0.3, 0.3), pixel_sigma=0.3, initial_rotation_sigma=0.05, initial_position_sigma=1e-3
+    )
+    backend, known = make(RIG, models), set()
+    backend.consider(lambda z: np.zeros((*z.shape, 1)))
+    for k, (stamp, _, seen) in enumerate(scene(path(20, 0.1, np.array([0, 0, 1.0]), np.zeros(3)), sigma=0.3)):
+        if k and k % 5 == 0:
+            shift = np.array([0, 0, 1.0 if k % 10 else -1.0])
+            backend.revise(lambda z, shift=shift: z + shift)
+        step(backend, stamp, seen, known)
+    deviations = np.sqrt(np.diag(backend.estimate(landmarks=False).covariance)[:3])
+    np.testing.assert_allclose(deviations, 0.05, rtol=0.01)

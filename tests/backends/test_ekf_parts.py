@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
+from backends.ekf.recovery import agreement
 from backends.ekf.solve import UnsolvableError, Update, Whitened, _descend, gate, solve
 from backends.ekf.state import FilterState
 from slam.geometry import se3
@@ -359,6 +360,54 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, spread, monk
     assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_transported_covariance_does_not_change_the_maximum(seed, monkeypatch):
+    """Inverse depths move by a fifth: an error of the pose displaces landmarks from where they are by now."""
+    monkeypatch.setattr("backends.ekf.solve._LINEAR", 1e-3)
+    rng, coordinates, found = np.random.default_rng(seed), InverseDepth(), []
+    points, sigmas = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (15, 3)), np.repeat([0.3, 0.1, 0.1], [3, 3, 6])
+    anchors = np.tile(np.eye(3, 4), (15, 1, 1))
+    true = coordinates.of(anchors, points)
+    off = np.stack([np.full(15, 1e-3), np.full(15, 1e-3), 0.2 * true[:, 2]], axis=1)
+    known = true + off * rng.standard_normal((15, 3)).clip(-2, 2)
+    error, noise = sigmas * rng.standard_normal(12), 0.5 * rng.standard_normal((15, 3))
+    for transports in (True, False):
+        s = FilterState.first(*EulerCamera.first(MODELS, transports))
+        truth = s.camera.moved(error).pose
+        z = RIG.project_stereo(se3.transform(se3.inverse(truth), points))[0] + noise
+        marks = FilterLandmarks.at(coordinates, np.arange(15), anchors, coordinates.points(anchors, known), 0)
+        P = covariance_of(np.diag(np.concatenate([sigmas, off.ravel()]) ** 2))
+        s = replace(s, landmarks=marks, covariance=P)
+        gated = gate(update_of(s, z, coordinates, 50, 1 - 1e-15))
+        found.append(s.corrected(solve(replace(gated, limits=np.full(15, 1e9)))))
+    between = se3.log(se3.inverse(found[0].pose) @ found[1].pose)
+    assert between @ np.linalg.solve(found[1].pose_covariance(), between) < 0.3**2
+
+
+def test_an_inverse_depth_that_is_held_back_counts_as_it_is():
+    s, h, _ = state_of(4, InverseDepth())
+    update = update_of(s, RIG.project_stereo(h)[0], InverseDepth(), 5)
+    change = np.zeros(24)
+    change[14] = -2 * s.landmarks.c[0, 2]
+    there = update.at(None, change)
+    moved = InverseDepth().moved(s.landmarks.c, change[12:].reshape(-1, 3)) - s.landmarks.c
+    expected = update.z - there.z + (there.own @ moved[:, :, None])[:, :, 0]
+    np.testing.assert_allclose(there.innovation(np.ones((4, 3), bool)).nu, expected.ravel(), atol=1e-9)
+
+
+def test_a_try_that_fails_does_not_keep_others_from_being_made(monkeypatch):
+    _, update = far_off(5, True)
+    first = replace(gate(update), used=np.arange(12) < 5)
+
+    def gated(prior, at_guess=False):
+        if prior is update and not at_guess:
+            return first
+        raise UnsolvableError("any")
+
+    monkeypatch.setattr("backends.ekf.recovery.gate", gated)
+    assert agreement(update, iter([]), lambda: None).used.sum() <= 5
+
+
 def test_a_step_that_lowers_no_cost_is_no_information(monkeypatch):
     """Where the mean does not move towards the measurements, the variance must not fall either."""
     monkeypatch.setattr("backends.ekf.solve._descend", lambda now, rows, s, change: (now, change))
@@ -394,7 +443,7 @@ def test_what_is_taken_out_was_never_there():
             assert fall == pytest.approx(every.distances()[gone[0]], rel=1e-6)
         fresh = whitened(replace(update, z=np.where(mask[:, None], np.nan, update.z)), np.ones(12, bool))
         np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
-        V, W = (np.concatenate(one.lost()[0]) for one in (without, fresh))
+        V, W = (np.concatenate(one.gain_root()[0]) for one in (without, fresh))
         np.testing.assert_allclose(in_deviations(V @ V.T, P), in_deviations(W @ W.T, P), atol=1e-9)
 
 
@@ -410,6 +459,7 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
     for camera in (None, there):
         change = 0.02 * rng.standard_normal((12, 3)) * s.landmarks.c
         at = update.at(camera, np.append(np.zeros(12), change))
+        at = at.at_prior() if transports else at
         H = np.concatenate(at.innovation(np.ones((12, 3), bool)).HP, axis=1)
         U = np.zeros((48, 6))
         U[:6] = np.linalg.inv((s.camera if transports else at.camera).world())
