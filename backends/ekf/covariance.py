@@ -81,7 +81,10 @@ class Covariance:
         return out
 
     def displaced(self, rows: IndexArray, change: Array) -> Covariance:
-        """After a change (M, 3) of some landmarks' coordinates that is none of their error: the last of the rig's."""
+        """After a change (M, 3) of some landmarks' coordinates that is none of their error.
+
+        It is that of the last of the rig's errors, which is known to be 1 (`slam.interfaces.ConsideringBackend`).
+        """
         by_rig, there = self.by_rig.copy(), rows < self.correlated
         by_rig[len(self.head) + numbers_of(rows[there]), -1:] -= change[there].reshape(-1, 1)
         return replace(self, by_rig=by_rig)
@@ -188,6 +191,12 @@ class Covariance:
         by_rig[h + b :] += shift @ by_rig[:POSE] - V_marks @ lost_by_rig
         head[:, h + b :] += head[:, :POSE] @ shift.T
         return replace(self, head=head, marks=marks, by_rig=by_rig)
+
+    def transported(self, shift: Array) -> Covariance:
+        """With a shift (A, 3, 6) as `corrected` adds it, and nothing measured."""
+        h, b = len(self.head), 3 * self.left
+        V = np.zeros((h, 1)), np.zeros((b, 1)), np.zeros((len(self.marks) - b, 1), order="F")
+        return self.corrected(V, np.zeros((1, self.by_rig.shape[1])), np.eye(CAMERA), shift)
 
 
 def numbers_of(rows: IndexArray) -> IndexArray:

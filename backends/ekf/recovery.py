@@ -11,11 +11,8 @@ Then the prediction is wrong, not the observations. There are three cases, tried
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 from scipy.special import bdtrc
@@ -37,45 +34,51 @@ def agreement(update: Update, noises: Iterable[Array], search: Search) -> Poster
     smallest first; `search` is only called where nothing else helps. Raises UnsolvableError where the reason is
     numerical.
     """
-    found, error, majority = None, None, (len(update.z) + 1) // 2
+    majority, first, found, error = (len(update.z) + 1) // 2, gate(update), None, None
+    if len(update.z) >= max(MIN_OBSERVATIONS, majority) > first.used.sum():
+        for prior, at_guess in _others(update, noises):
+            try:
+                gated = gate(prior, at_guess)
+                if gated.used.sum() >= max(MIN_OBSERVATIONS, majority):
+                    found = _agreed(gated)
+                    break
+            except UnsolvableError:  # the others may do
+                continue
     try:
-        for gated in _gated(update, noises, max(MIN_OBSERVATIONS, majority)):
-            found = _agreed(gated) or found
-            if found is not None and found.used.sum() >= majority:
-                return found
+        if found is None or found.used.sum() < majority:
+            found = _agreed(first) or found
     except UnsolvableError as reason:
         error = reason
-    least = max(MIN_CONSENSUS, majority)
-    finite = math.isfinite(update.covariance.camera.trace() + update.covariance.marks.trace())
-    T = search() if finite and len(update.z) >= least else None
-    if T is not None:
-        models, before = update.measure.models, update.camera.pose
-        far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
-        sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
-        there = replace(update, guess=T).wider(np.diag(np.repeat(np.array(sigmas, float) ** 2, 3)))
-        with suppress(UnsolvableError):
-            restarted = solve(gate(there, at_guess=True))
-            if restarted is not None and restarted.used.sum() >= least:
-                return restarted
+    if found is None or found.used.sum() < majority:
+        found = _restarted(update, search, max(MIN_CONSENSUS, majority)) or found
     if found is None and error is not None:
         raise error
     return found
 
 
-def _gated(update: Update, noises: Iterable[Array], majority: int) -> Iterable[Gated]:
-    """The first prior, with more noise or seen from the guess, with which most pass the gate; then it as it is.
+def _others(update: Update, noises: Iterable[Array]) -> Iterable[tuple[Update, bool]]:
+    """Priors beside the usual one, with more noise or, if so it says, seen from the guess."""
+    if update.guess is not None:
+        yield update, True
+    for wider in map(update.wider, noises):
+        yield wider, False
+        if update.guess is not None:
+            yield wider, True
 
-    What still disagrees is taken out later by `solve`.
-    """
-    first = gate(update)
-    if len(update.z) >= majority > first.used.sum():
-        places = (False, True) if update.guess is not None else (False,)
-        priors = itertools.chain([update], map(update.wider, noises))
-        tries = (gate(prior, at_guess) for prior in priors for at_guess in places if at_guess or prior is not update)
-        enough = next((gated for gated in tries if gated.used.sum() >= majority), None)
-        if enough is not None:
-            yield enough
-    yield first
+
+def _restarted(update: Update, search: Search, least: int) -> Posterior | None:
+    """At the pose on which landmarks agree, if at least so many do."""
+    T = search() if len(update.z) >= least else None
+    if T is None:
+        return None
+    models, before = update.measure.models, update.camera.pose
+    far, turned = np.linalg.norm(T[:3, 3] - before[:3, 3]), se3.rotation_angle(before[:3, :3].T @ T[:3, :3])
+    sigmas = far, turned, models.initial_velocity_sigma, models.initial_angular_velocity_sigma
+    there = update.facing(T).wider(np.diag(np.repeat(np.array(sigmas, float) ** 2, 3)))
+    with suppress(UnsolvableError):
+        found = solve(gate(there, at_guess=True))
+        return found if found is not None and found.used.sum() >= least else None
+    return None
 
 
 def _agreed(gated: Gated) -> Posterior | None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from backends.ekf.camera import Camera, Motion
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.motion import Motion
 from backends.ekf.solve import Posterior, UnsolvableError
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
@@ -29,13 +28,13 @@ class FilterState:
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
     dt: float  # time since the last one [s], 0 for the first
-    measured: bool  # whether the pose may not be updated any more
-    camera: Any  # `backends.ekf.motion.EulerCamera`, or another: pose and velocities, and what their error means
+    closed: bool  # whether the pose may not be updated any more
+    camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
 
     @classmethod
-    def first(cls, camera: Any, P: Array) -> FilterState:
+    def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
         return cls(float("nan"), -1, 0.0, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
 
@@ -57,7 +56,7 @@ class FilterState:
         camera, J, noise = motion
         covariance = self.covariance.with_pose(self.camera.by_error(), RECENT).camera_moved(J, noise)
         dt, frame = stamp - self.stamp, self.frame + 1
-        return replace(self, stamp=stamp, frame=frame, dt=dt, measured=False, camera=camera, covariance=covariance)
+        return replace(self, stamp=stamp, frame=frame, dt=dt, closed=False, camera=camera, covariance=covariance)
 
     # --- landmarks join and leave ---
 
@@ -79,7 +78,7 @@ class FilterState:
         covariance = self.covariance.appended(new.gauge @ self.camera.world(), noise, by_rig)
         end = self.covariance.correlated
         landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
-        return replace(self, measured=True, landmarks=landmarks, covariance=covariance).relieved()
+        return replace(self, closed=True, landmarks=landmarks, covariance=covariance).relieved()
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
@@ -138,12 +137,33 @@ class FilterState:
         and Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none. Raises
         UnsolvableError where the new state is not finite.
         """
-        at, before, P = found.whitened.innovation.at, self.landmarks, self.covariance
-        update, camera, state = at.update, at.camera_after(found.change), slice(P.left, P.correlated)
-        marks = before.moved(update.coordinates, state, found.change[CAMERA:].reshape(-1, 3))
+        update, camera = found.whitened.innovation.at.update, found.camera
+        marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
-        shift = (marks.gauge - before.gauge)[state] @ camera.world() * camera.transports
-        covariance = update.covariance.corrected(*found.whitened.lost(), self.camera.transport(camera), shift)
+        J, shift = update.camera.transport(camera), self._shift(marks, camera)
+        covariance = update.covariance.corrected(*found.information.gain_root(), J, shift)
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
+
+    def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
+        """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
+
+        What moves them is an error of the rig, the last that is considered, and none of the state's.
+        """
+        s = self.with_all_of(ids)
+        rows = s.landmarks.rows_of(ids)
+        marks = s.landmarks.moved(
+            coordinates, rows, coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
+        )
+        if not np.isfinite(marks.points).all():
+            return self
+        covariance = s.covariance.displaced(rows, marks.c[rows] - s.landmarks.c[rows]).transported(
+            s._shift(marks, s.camera)
+        )
+        return replace(s, landmarks=marks, covariance=covariance).relieved()
+
+    def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
+        """What is added to the errors (A, 3, 6) of landmarks that have moved, by the error of the pose."""
+        change = (marks.gauge - self.landmarks.gauge)[self._parts()[1]]
+        return np.asarray(change @ camera.world() if camera.transports else np.zeros_like(change))
