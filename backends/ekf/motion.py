@@ -147,7 +147,7 @@ class EulerCamera:
 
     def facing(self, T: Array) -> tuple[EulerCamera, Array]:
         """See `Camera`."""
-        return self.reanchored(T) if abs(self.at(T).x[4]) > LIMIT else (self, np.eye(CAMERA))
+        return self.reanchored(T) if abs(math.sin(self.at(T).x[4])) > math.sin(LIMIT) else (self, np.eye(CAMERA))
 
     def reanchored(self, T: Array | None = None) -> tuple[EulerCamera, Array]:
         """In a new angles' world, chosen for its attitude; and the Jacobian (12, 12) of its numbers by the old.

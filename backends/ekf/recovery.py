@@ -11,6 +11,7 @@ Then the prediction is wrong, not the observations. There are three cases, tried
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 
@@ -34,36 +35,35 @@ def agreement(update: Update, noises: Iterable[Array], search: Search) -> Poster
     smallest first; `search` is only called where nothing else helps. Raises UnsolvableError where the reason is
     numerical.
     """
-    majority, first, found, error = (len(update.z) + 1) // 2, gate(update), None, None
-    if len(update.z) >= max(MIN_OBSERVATIONS, majority) > first.used.sum():
-        for prior, at_guess in _others(update, noises):
-            try:
-                gated = gate(prior, at_guess)
-                if gated.used.sum() >= max(MIN_OBSERVATIONS, majority):
-                    found = _agreed(gated)
-                    break
-            except UnsolvableError:  # the others may do
-                continue
-    try:
-        if found is None or found.used.sum() < majority:
-            found = _agreed(first) or found
-    except UnsolvableError as reason:
-        error = reason
-    if found is None or found.used.sum() < majority:
-        found = _restarted(update, search, max(MIN_CONSENSUS, majority)) or found
+    found, error, majority = None, None, (len(update.z) + 1) // 2
+    for prior, at_guess, least in _tries(update, noises):
+        try:
+            gated = gate(prior, at_guess)
+            agreed = _agreed(gated) if gated.used.sum() >= least else None
+        except UnsolvableError as reason:  # another prior may do
+            error = reason
+            continue
+        found = agreed or found
+        if agreed is not None and agreed.used.sum() >= majority:
+            return agreed
+    found = _restarted(update, search, max(MIN_CONSENSUS, majority)) or found
     if found is None and error is not None:
         raise error
     return found
 
 
-def _others(update: Update, noises: Iterable[Array]) -> Iterable[tuple[Update, bool]]:
-    """Priors beside the usual one, with more noise or, if so it says, seen from the guess."""
-    if update.guess is not None:
-        yield update, True
-    for wider in map(update.wider, noises):
-        yield wider, False
-        if update.guess is not None:
-            yield wider, True
+def _tries(update: Update, noises: Iterable[Array]) -> Iterable[tuple[Update, bool, int]]:
+    """Priors, whether each is seen from the guess, and how many observations shall pass its gate.
+
+    The usual one; with more noise, or from the guess; the usual one again, of which `solve` takes out what disagrees.
+    """
+    majority = max(MIN_OBSERVATIONS, (len(update.z) + 1) // 2)
+    if len(update.z) >= majority:
+        for prior in itertools.chain([update], map(update.wider, noises)):
+            yield prior, False, majority
+            if update.guess is not None:
+                yield prior, True, majority
+    yield update, False, 0
 
 
 def _restarted(update: Update, search: Search, least: int) -> Posterior | None:

@@ -135,7 +135,7 @@ class FilterState:
         the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
         old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
         and Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none. Raises
-        UnsolvableError where the new state is not finite.
+        UnsolvableError where the new state is not finite, or a variance is lost in rounding.
         """
         update, camera = found.whitened.innovation.at.update, found.camera
         marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))
@@ -144,6 +144,8 @@ class FilterState:
         marks.seen[update.rows[found.used]] = self.frame
         J, shift = update.camera.transport(camera), self._shift(marks, camera)
         covariance = update.covariance.corrected(*found.information.gain_root(), J, shift)
+        if not (covariance.marks.diagonal() > 0).all():
+            raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
 
     def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
