@@ -9,9 +9,9 @@ import numpy as np
 
 from backends.ekf.camera import Camera, Motion, motion_noise
 from backends.ekf.covariance import CAMERA, POSE, Covariance, positive
+from backends.ekf.innovation import UnsolvableError, Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
 from backends.ekf.recovery import agreement
-from backends.ekf.solve import UnsolvableError, Update
 from backends.ekf.state import FilterState
 from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus

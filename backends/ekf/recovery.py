@@ -12,13 +12,15 @@ Then the prediction is wrong, not the observations. There are three cases, tried
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 import numpy as np
 from scipy.special import bdtrc
 
-from backends.ekf.solve import Gated, Posterior, UnsolvableError, Update, gate, solve
+from backends.ekf.innovation import UnsolvableError, Update
+from backends.ekf.solve import Gated, Posterior, gate, solve
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
@@ -35,6 +37,9 @@ def agreement(update: Update, noises: Iterable[Array], search: Search) -> Poster
     smallest first; `search` is only called where nothing else helps. Raises UnsolvableError where the reason is
     numerical.
     """
+    P = update.covariance
+    if not (np.isfinite(update.camera.pose).all() and math.isfinite(P.camera.trace() + P.marks.trace())):
+        raise UnsolvableError("the predicted state is not finite")
     found, error, majority = None, None, (len(update.z) + 1) // 2
     for prior, at_guess, least in _tries(update, noises):
         try:

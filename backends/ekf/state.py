@@ -8,8 +8,9 @@ import numpy as np
 
 from backends.ekf.camera import Camera, Motion
 from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.innovation import UnsolvableError
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.solve import Posterior, UnsolvableError
+from backends.ekf.solve import Posterior
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 

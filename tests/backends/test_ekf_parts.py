@@ -9,10 +9,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.innovation import UnsolvableError, Update, Whitened
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
 from backends.ekf.motion import EulerCamera
 from backends.ekf.recovery import agreement
-from backends.ekf.solve import Posterior, UnsolvableError, Update, Whitened, _descend, gate, solve
+from backends.ekf.solve import Posterior, _descend, gate, solve
 from backends.ekf.state import FilterState
 from slam.geometry import se3
 from slam.geometry.se3 import body_rate_matrix, rotation
