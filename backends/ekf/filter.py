@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
+from backends.ekf.camera import Camera, Motion, motion_noise
 from backends.ekf.covariance import CAMERA, POSE, Covariance, positive
+from backends.ekf.innovation import UnsolvableError, Update
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.motion import Motion, motion_noise
 from backends.ekf.recovery import agreement
-from backends.ekf.solve import UnsolvableError, Update
 from backends.ekf.state import FilterState
 from slam.checks import known_landmarks, require_guess, require_not_measured, require_recent, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
@@ -38,7 +37,7 @@ class LandmarkFilter:
     Args:
         rig: the cameras, rectified.
         models: noise, priors, motion and gate.
-        camera: the first one: `backends.ekf.motion.EulerCamera`, or another.
+        camera: the first one.
         P: covariance (12, 12) of its error.
         coordinates: of the landmarks.
         iterations: most linearisations of an update.
@@ -54,8 +53,8 @@ class LandmarkFilter:
     most_landmarks = 2000
 
     def __init__(
-        self, rig: StereoRig, models: EstimatorModels, camera: Any, P: Array, coordinates: Coordinates, iterations: int,
-        stereo: bool = True, /,
+        self, rig: StereoRig, models: EstimatorModels, camera: Camera, P: Array, coordinates: Coordinates,
+        iterations: int, stereo: bool = True, /,
     ) -> None:  # fmt: skip
         # by position alone: they are no options of a back end
         self.rig, self.models = rig, models
@@ -181,24 +180,16 @@ class LandmarkFilter:
 
         The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
         were corrected before, and seen at pixels as they are now, would look as if the camera had moved. Those of a
-        prior map that were not measured yet were placed by no pixels: they stay. The covariance is transported to where
-        they are now, see `FilterState.corrected`.
+        prior map that were not measured yet were placed by no pixels: they stay.
         """
         s, stereo = replace(self.state, closed=True), self._measure.stereo
         if s.frame >= 0 and len(s.landmarks):
             z, _ = stereo.project(se3.transform(se3.inverse(s.pose), s.landmarks.points))
-            before, all_of = s.landmarks, slice(s.covariance.correlated)
-            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[all_of])
+            rows = np.flatnonzero(self.rig.left.in_image(z[:, :2])[: s.covariance.correlated])
             z = stereo.corrected(self.name, z[rows], correct)
             points = se3.transform(s.pose, stereo.triangulate(z))
             good = np.isfinite(points).all(axis=1)
-            rows, points = rows[good], points[good]
-            change = self._coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
-            if np.isfinite(change).all():
-                marks = before.moved(self._coordinates, rows, change)
-                shift = (marks.gauge - before.gauge)[all_of] @ s.camera.world() * s.camera.transports
-                moved = s.covariance.displaced((marks.c - before.c)[all_of], shift)
-                s = replace(s, landmarks=marks, covariance=moved)
+            s = s.displaced(self._coordinates, s.landmarks.ids[rows[good]], points[good])
         self.state = s
 
     # --- the filter's parts ---
@@ -210,7 +201,7 @@ class LandmarkFilter:
         path = [*before, (s.stamp, s.pose)] if s.frame >= 0 else []
         return np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4)
 
-    def _predicted(self, stamp: float, moved: Callable[[Any, float], Motion]) -> Prediction:
+    def _predicted(self, stamp: float, moved: Callable[[Camera, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile. What is in the angle of view then."""
         s = self.state
         require_stamp(self.name, stamp, s.stamp if s.frame >= 0 else None)
@@ -241,8 +232,9 @@ class LandmarkFilter:
             z[:, 2] = np.nan
         update = Update(
             s.camera, s.covariance, s.landmarks.select(rows), rows, z, self._measure, self._coordinates,
-            self._iterations, guess,
+            self._iterations,
         )  # fmt: skip
+        update = update if guess is None else update.facing(guess)
         noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)
 
         def search() -> Array | None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from backends.ekf.camera import Camera, Motion
 from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.innovation import UnsolvableError
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.motion import Motion
-from backends.ekf.solve import Posterior, UnsolvableError
+from backends.ekf.solve import Posterior
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
@@ -30,12 +30,12 @@ class FilterState:
     frame: int  # number of the prediction, −1 before the first
     dt: float  # time since the last one [s], 0 for the first
     closed: bool  # whether the pose may not be updated any more
-    camera: Any  # `backends.ekf.motion.EulerCamera`, or another: pose and velocities, and what their error means
+    camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
 
     @classmethod
-    def first(cls, camera: Any, P: Array) -> FilterState:
+    def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
         return cls(float("nan"), -1, 0.0, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
 
@@ -136,15 +136,37 @@ class FilterState:
         the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
         old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
         and Bonnabel, 2015). Landmarks that are parked do not move, so that their coordinates need none. Raises
-        UnsolvableError where the new state is not finite.
+        UnsolvableError where the new state is not finite, or a variance is lost in rounding.
         """
-        at, before, P = found.whitened.innovation.at, self.landmarks, self.covariance
-        update, camera, state = at.update, at.camera_after(found.change), slice(P.parked, P.correlated)
-        marks = before.moved(update.coordinates, state, found.change[CAMERA:].reshape(-1, 3))
+        update, camera = found.whitened.innovation.at.update, found.camera
+        marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
-        shift = (marks.gauge - before.gauge)[state] @ camera.world() * camera.transports
-        lost = found.whitened.consistent.gain_root()
-        covariance = update.covariance.corrected(*lost, self.camera.transport(camera), shift)
+        J, shift = update.camera.transport(camera), self._shift(marks, camera)
+        covariance = update.covariance.corrected(*found.information.gain_root(), J, shift)
+        if not (covariance.marks.diagonal() > 0).all():
+            raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
+
+    def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
+        """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
+
+        What moves them is an error of the rig, the last that is considered, and none of the state's.
+        """
+        s = self.with_all_of(ids)
+        rows = s.landmarks.rows_of(ids)
+        marks = s.landmarks.moved(
+            coordinates, rows, coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
+        )
+        if not np.isfinite(marks.points).all():
+            return self
+        covariance = s.covariance.displaced(rows, marks.c[rows] - s.landmarks.c[rows]).transported(
+            s._shift(marks, s.camera)
+        )
+        return replace(s, landmarks=marks, covariance=covariance).relieved()
+
+    def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
+        """What is added to the errors (A, 3, 6) of landmarks that have moved, by the error of the pose."""
+        change = (marks.gauge - self.landmarks.gauge)[self._parts()[1]]
+        return np.asarray(change @ camera.world() if camera.transports else np.zeros_like(change))

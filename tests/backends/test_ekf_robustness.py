@@ -262,3 +262,22 @@ def test_no_pixel_of_a_camera(drive, pixel):
     uv[3, 0] = 0.9e5  # no camera has it, but a number that can be worked with
     report = backend.update(Observations(seen.ids, uv, seen.uv_right))
     np.testing.assert_array_equal(report.rejected, seen.ids[[3]])
+
+
+@pytest.mark.parametrize("make", [EkfBackend, IekfBackend], ids=["ekf", "iekf"])
+@pytest.mark.parametrize("degrees", [80, 88, 180])
+def test_a_roll_in_one_step(make, degrees):
+    """Beyond what the motion model expects, to where Euler angles are singular: all landmarks count in the end."""
+    poses, found = path(10, 0.1, np.array([0, 0, 0.5]), STILL), []
+    for seed in range(5):
+        rng, known, backend = np.random.default_rng(seed), set(), make(RIG, MODELS)
+        points = cloud(poses, 60, rng)
+        for k, T in enumerate(poses):
+            step(backend, 0.1 * k, observe(T, points, 0.5, rng), known)
+        rolled = poses[-1] @ se3.exp(np.array([0, 0, np.radians(degrees), 0, 0, 0.05]))
+        seen = observe(rolled, points, 0.5, rng, 60)
+        backend.predict(1.9)
+        report = backend.update(seen.select(np.isin(seen.ids, list(known))), rolled)
+        assert report.status is UpdateStatus.OK and len(report.rejected) <= 1
+        found.append(nees(backend, rolled))
+    assert max(found) < chi2.ppf(0.9999, 6)
