@@ -79,8 +79,7 @@ FAULTS = (
     ),
     Fault(
         "pixel noise not scaled to the rectified image", "slam/input/features.py",
-        "return replace(models, pixel_sigma=models.pixel_sigma * scale, T_world_left=T.tolist(), objects=objects)",
-        "return replace(models, T_world_left=T.tolist(), objects=objects)",
+        "models.pixel_sigma * scale", "models.pixel_sigma",
         "tests/slam/input/test_rectification.py",
     ),
     # the sliding window

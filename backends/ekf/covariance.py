@@ -125,6 +125,14 @@ class Covariance:
 
     # --- landmarks join and leave ---
 
+    def widened(self, rows: IndexArray, noise: Array) -> Covariance:
+        """With more noise (M, 3, 3) of some landmarks, by rows of the table."""
+        marks, known, there = self.marks.copy(), self.known.copy(), rows < self.correlated
+        each = numbers_of(rows[there]).reshape(-1, 3)
+        marks[each[:, :, None], each[:, None, :]] += noise[there]
+        known[rows[~there] - self.correlated] += noise[~there]
+        return replace(self, marks=marks, known=known)
+
     def appended(self, J: Array, noise: Array, by_rig: Array) -> Covariance:
         """With landmarks ``Y = g(r, φ) + noise`` (paper A, Eq. 10), by derivatives (M, 3, 6) and covariances (M, 3, 3).
 

@@ -59,7 +59,7 @@ class LandmarkFilter:
         # by position alone: they are no options of a back end
         self.rig, self.models = rig, models
         self._coordinates, self._iterations, self._stereo = coordinates, iterations, stereo
-        self._measure = RectifiedMeasurement(rig, models)
+        self._measure = RectifiedMeasurement(rig, models.with_slide())
         self.state = FilterState.first(camera, P)
         self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
@@ -140,7 +140,7 @@ class LandmarkFilter:
         anchors = np.tile(np.eye(3, 4), (len(ids), 1, 1))
         anchors[:, :, 3] = positions
         anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
-        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame)
+        new = FilterLandmarks.at(self._coordinates, ids, anchors, positions, s.frame, np.pi)
         D = self._coordinates.inverse_jacobian(anchors, new.c)
         self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
@@ -210,6 +210,7 @@ class LandmarkFilter:
         else:
             after = s.advanced(float(stamp), moved(s.camera, stamp - s.stamp))
         T, rows = after.pose, self._measure.visible(after.pose, after.landmarks.points)
+        after = after.slid(self._coordinates, rows, self.models.slide.density / self._measure.stereo.f)
         marks, (blocks, cross) = after.landmarks.select(rows), after.covariance.marginals(rows)
         toward = T[:3, :3].T @ self._coordinates.jacobian(marks.anchors, marks.c)
         A = -toward @ (marks.gauge @ after.camera.world())  # derivatives (M, 3, 6) of them, seen from the camera
@@ -238,8 +239,8 @@ class LandmarkFilter:
         noises = (factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION if s.frame > 0)
 
         def search() -> Array | None:
-            T = s.pose if guess is None else guess
-            return landmarks_pose(self._measure, update.landmarks.points, z, T, s.frame + 1)
+            T, measure = s.pose if guess is None else guess, RectifiedMeasurement(self.rig, self.models)
+            return landmarks_pose(measure, update.landmarks.points, z, T, s.frame + 1)
 
         try:
             found = agreement(update, noises, search)

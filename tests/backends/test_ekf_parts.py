@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
+from backends.ekf.backend import EkfBackend
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.innovation import UnsolvableError, Update, Whitened
 from backends.ekf.landmarks import Euclidean, FilterLandmarks, InverseDepth
@@ -15,10 +17,11 @@ from backends.ekf.motion import EulerCamera
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import Posterior, _descend, gate, solve
 from backends.ekf.state import FilterState
+from slam.data import Observations
 from slam.geometry import se3
 from slam.geometry.se3 import body_rate_matrix, rotation
-from slam.models import EstimatorModels, MotionModel
-from slam.window.stereo import RectifiedMeasurement, RectifiedStereo
+from slam.models import EstimatorModels, MotionModel, SlideModel
+from slam.window.stereo import RectifiedMeasurement, RectifiedStereo, relative_covariance
 from tests.backends.ekf_runs import dense
 from tests.backends.scenes import RIG
 from tests.slam.numeric import assert_equal_to_rounding, jacobian, positive
@@ -534,3 +537,65 @@ def test_no_linearisation_measures_a_displacement_of_the_world(coordinates, tran
         marks = s.landmarks if transports else s.landmarks.moved(coordinates, slice(None), change)
         U[12:] = marks.gauge.reshape(-1, 6)
         np.testing.assert_allclose(H @ U, 0, atol=1e-7)  # [px/m], [px/rad]
+
+
+# --- features that slide ---
+
+
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
+def test_a_landmark_slides_across_its_line_of_sight_with_the_angle_of_view(coordinates):
+    s, _, _ = state_of(4, coordinates)
+    density, rows, x = 0.01, np.array([0, 2]), s.camera.x.copy()
+    x[0] += 0.5
+    there = replace(s, camera=replace(s.camera, x=x))
+    found = there.slid(coordinates, rows, density)
+    first, now = (s.landmarks.points - T[:3, 3] for T in (s.pose, there.pose))
+    distance = np.linalg.norm(now, axis=1)
+    angle = np.arccos(np.einsum("ni,ni->n", first, now) / distance / np.linalg.norm(first, axis=1))
+    added = dense(found.covariance) - dense(there.covariance)
+    for row in range(4):
+        at = slice(CAMERA + 3 * row, CAMERA + 3 * row + 3)
+        D = coordinates.jacobian(s.landmarks.anchors[row : row + 1], s.landmarks.c[row : row + 1])[0]
+        n = now[row] / distance[row]
+        across = density**2 * angle[row] * distance[row] ** 2 * (np.eye(3) - np.outer(n, n))
+        np.testing.assert_allclose(D @ added[at, at] @ D.T, across if row in rows else 0 * across, atol=1e-12)
+        added[at, at] = 0
+    assert not added.any()
+    assert found.slid(coordinates, rows, density) is found  # no more until it is seen from farther round
+    assert replace(found, camera=s.camera).slid(coordinates, rows, density).landmarks.turned.tolist() == (
+        found.landmarks.turned.tolist()
+    )
+
+
+def nees_among_sliding_features(density: float, seed: int) -> float:
+    """Of the pose relative to that four frames before, on a drive past points whose features slide by 3 px / √rad."""
+    rng = np.random.default_rng(seed)
+    models = EstimatorModels(MotionModel(1.0, 0.3, wheels=True), 0.28, SlideModel(density), initial_velocity_sigma=15.0)
+    points = rng.uniform((-10, -2, 4), (10, 3, 30), (120, 3))
+    backend, slides, last, ids = EkfBackend(RIG, models), np.zeros((120, 2)), points, np.zeros(0, np.int64)
+    for k in range(12):
+        sight, before = points - (0, 0, 0.8 * k), ids
+        cosine = (sight * last).sum(1) / np.linalg.norm(sight, axis=1) / np.linalg.norm(last, axis=1)
+        slides += 3.0 * np.sqrt(np.arccos(np.clip(cosine, -1, 1)))[:, None] * rng.standard_normal(slides.shape)
+        z, last = RIG.project_stereo(sight)[0] + 0.28 * rng.standard_normal((120, 3)), sight
+        z += slides[:, [0, 1, 0]]
+        near = (sight[:, 2] > 3) & (sight[:, 2] < 20)
+        ids = np.flatnonzero(near & (z > 0).all(1) & (z < (RIG.width, RIG.height, RIG.width)).all(1))
+        seen, old = Observations(ids, z[ids, :2], z[ids][:, [2, 1]]), np.isin(ids, before)
+        backend.predict(0.1 * k)
+        backend.update(seen.select(old))
+        backend.remove(np.setdiff1d(before, ids))
+        backend.add(seen.select(~old))
+    recent = backend.recent(5)
+    ends = np.r_[0:6, 24:30]
+    P = relative_covariance(recent.covariance[np.ix_(ends, ends)], recent.poses[0], recent.poses[-1])
+    true = np.eye(4)
+    true[2, 3] = 3.2
+    error = se3.log(se3.inverse(recent.poses[-1]) @ recent.poses[0] @ true)
+    return float(error @ np.linalg.solve(P, error))
+
+
+def test_a_filter_that_models_the_slide_is_as_sure_as_it_may_be():
+    modelled, left_out = (np.mean([nees_among_sliding_features(q, seed) for seed in range(10)]) for q in (3.0, 0.0))
+    least, most = chi2.ppf([0.001, 0.999], 60) / 10
+    assert least < modelled < most < left_out, (modelled, left_out)

@@ -13,7 +13,7 @@ from backends.iekf import IekfBackend
 from slam.data import Observations, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
-from slam.models import EstimatorModels, MotionModel, models_for
+from slam.models import EstimatorModels, MotionModel, SlideModel, models_for
 from tests.backends.ekf_runs import (
     FORWARD,
     MODELS,
@@ -141,7 +141,7 @@ def test_an_update_that_ends_a_great_uncertainty_keeps_all_its_digits(landmarks)
 def test_a_pair_that_is_not_in_step_moves_nothing(make):
     """The first right images were taken at other times, at 10 m/s: their landmarks contradict all that follows."""
     poses, rng = path(10, 0.1, 6.7 * FORWARD, STILL), np.random.default_rng(1)
-    models = replace(models_for("driving"), pixel_sigma=0.5)
+    models = replace(models_for("driving"), pixel_sigma=0.5, slide=SlideModel())
     points = cloud(poses, 150, rng, 10.0, 50.0)
     backend, known = make(RIG, models), set()
     late = se3.pose(np.eye(3), [0, 0, 0.5])
@@ -190,7 +190,7 @@ def test_wrong_matches_are_found(make, drive, share):
 
 def test_a_landmark_in_contradiction_with_the_others_is_found(drive):
     """An innovation within its own wide gate, but not where the others say: the velocity is unknown at first."""
-    models = replace(models_for("driving"), pixel_sigma=0.5)
+    models = replace(models_for("driving"), pixel_sigma=0.5, slide=SlideModel())
     backend, seen = predicted(drive, 1, models=models)
     uv_left, uv_right = seen.uv_left.copy(), seen.uv_right.copy()
     uv_left[5] += [8.0, -6.0]
