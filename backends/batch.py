@@ -7,7 +7,7 @@ three successive frames; nothing is approximated.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -19,7 +19,7 @@ from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_po
 from backends.smoother.graph import FAILURES, line, minimised
 from backends.smoother.state import SmootherState
 from backends.smoother.tracks import GraphProblem, Tracks
-from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
+from slam.data import Estimate
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
@@ -27,7 +27,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.threads import one_blas_thread
 from slam.window.motion import LONGEST, is_first
-from slam.window.stereo import Field, RectifiedStereo
+from slam.window.stereo import RectifiedStereo
 
 _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
 _DISTINCT = 1.0  # numerics: disparity [px] from which on one sight alone determines a landmark well enough for Cholesky
@@ -39,8 +39,9 @@ class BatchBackend:
     `estimate` and `trajectory` raise `SlamError` where gtsam cannot solve the problem.
 
     A smoother runs along, of whose graph every measured frame is a pose: it predicts, gates and gives the first values.
-    The problem is solved when the trajectory or the landmarks are asked for; the pose alone is the smoother's. Where
-    gtsam cannot give covariances for the solution they are the smoother's, too, and a warning is logged.
+    All but `estimate` and `trajectory` are its own methods (`SmootherBackend`). The problem is solved when the path or
+    the landmarks are asked for; the pose alone is the smoother's. Where gtsam cannot give covariances for the solution,
+    they are the smoother's, too, and a warning is logged.
 
     Args:
         rig: the cameras.
@@ -51,55 +52,18 @@ class BatchBackend:
         ConfigurationError: an option is given.
     """
 
+    revises_path = True
+
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         if options:
             raise ConfigurationError(f"batch: unknown option {min(options)!r}; there are none")
         self.rig = rig
         self.models = models
-        self._smoother = SmootherBackend(rig, models, lag=None)
+        along = self._smoother = SmootherBackend(rig, models, lag=None)
+        self.predict, self.update, self.add, self.remove = along.predict, along.update, along.add, along.remove
+        self.positions, self.insert, self.place = along.positions, along.insert, along.place
+        self.consider, self.sensitivities, self.revise = along.consider, along.sensitivities, along.revise
         self._solution: _BatchSolution | None = None
-
-    def predict(self, stamp: float) -> Prediction:
-        """See `slam.interfaces.Backend.predict`: the smoother's."""
-        return self._smoother.predict(stamp)
-
-    def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
-        """See `slam.interfaces.Backend.update`: the smoother's."""
-        return self._smoother.update(observations, guess)
-
-    def add(self, observations: Observations) -> None:
-        """See `slam.interfaces.Backend.add`."""
-        self._smoother.add(observations)
-
-    def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
-        """See `slam.interfaces.MapBackend.insert`."""
-        self._smoother.insert(ids, positions, covariances)
-
-    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
-        """See `slam.interfaces.MapBackend.place`."""
-        self._smoother.place(ids, local, covariances)
-
-    def consider(self, field: Field, pose: Array | None = None) -> None:
-        """See `slam.interfaces.ConsideringBackend.consider`: the smoother follows the errors."""
-        self._smoother.consider(field, pose)
-
-    def sensitivities(self, ids: IdArray) -> tuple[Array, Array]:
-        """See `slam.interfaces.ConsideringBackend.sensitivities`: the smoother's."""
-        return self._smoother.sensitivities(ids)
-
-    @property
-    def revises_path(self) -> bool:
-        """A revision changes the whole path, see `slam.interfaces.RevisingBackend`."""
-        return True
-
-    @one_blas_thread
-    def revise(self, correct: Callable[[Array], Array]) -> None:
-        """See `slam.interfaces.RevisingBackend.revise`."""
-        self._smoother.revise(correct)
-
-    def remove(self, ids: IdArray | Sequence[int]) -> None:
-        """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
-        self._smoother.remove(ids)
 
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
@@ -118,10 +82,6 @@ class BatchBackend:
                 positions[row] = transform(solution.once[serial], positions[row : row + 1])[0]
         T, P = solution.poses[-1].copy(), solution.covariance(solution.newest, rough.covariance)
         return Estimate(rough.stamp, T, P, rough.ids, positions, covariances)
-
-    def positions(self, ids: IdArray) -> Array:
-        """See `slam.interfaces.Backend.positions`: the smoother's."""
-        return self._smoother.positions(ids)
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
@@ -149,12 +109,12 @@ class _BatchSolution:
         numbers = range(s.begun, s.number + 1)
         stamps, hangs = smoother.path.frames(s.begun)
         before = smoother.path.trajectory(s).poses[-len(stamps) :]
-        keys = [
+        keys = [  # frames that are no pose of the smoother's graph are variables of their own, f
             pose_key(number) if not i or number != hangs[i - 1] else int(gtsam.symbol("f", i))
             for i, number in enumerate(hangs.tolist())
         ]
         problem, tracks = GraphProblem(), Tracks(make, None)
-        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.spread[s.of(s.begun)]))
+        problem.factors.add(make.prior(s.begun, s.poses[s.of(s.begun)], s.prior))
         tracks.add_pose(problem, s, s.begun, s.begun)
         for key, T in zip(keys[1:], before[1:]):
             problem.values.insert(key, to_pose3(T))

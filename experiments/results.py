@@ -109,7 +109,7 @@ EXPERIMENTS = (
         }, left_out=("with 10 % wrong", "rejected"),
     ),
     Experiment(
-        "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "4"), pictures={
+        "corridor", "honesty", "The camera along a corridor without end", arguments=("--seeds", "8"), pictures={
             "corridor": "Left: mean NEES and its band. Right: what is claimed of the heading, which nothing measures."
         }, left_out=("lost updates",),
     ),

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from backends.ekf.camera import Camera, Motion
 from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.innovation import UnsolvableError
 from backends.ekf.landmarks import Coordinates, FilterLandmarks
-from backends.ekf.motion import Motion
-from backends.ekf.solve import Posterior, UnsolvableError
+from backends.ekf.solve import Posterior
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array
 
@@ -29,13 +29,13 @@ class FilterState:
     stamp: float  # time [s]; NaN before the first prediction
     frame: int  # number of the prediction, −1 before the first
     dt: float  # time since the last one [s], 0 for the first
-    measured: bool  # whether the pose may not be updated any more
-    camera: Any  # `backends.ekf.motion.EulerCamera`, or another: pose and velocities, and what their error means
+    closed: bool  # whether the pose may not be updated any more
+    camera: Camera
     landmarks: FilterLandmarks  # all of them
     covariance: Covariance  # of everything
 
     @classmethod
-    def first(cls, camera: Any, P: Array) -> FilterState:
+    def first(cls, camera: Camera, P: Array) -> FilterState:
         """Before the first prediction, with the covariance (12, 12) of the camera's error."""
         return cls(float("nan"), -1, 0.0, True, camera, FilterLandmarks.none(), Covariance.of_camera(P))
 
@@ -57,7 +57,28 @@ class FilterState:
         camera, J, noise = motion
         covariance = self.covariance.with_pose(self.camera.by_error(), RECENT).camera_moved(J, noise)
         dt, frame = stamp - self.stamp, self.frame + 1
-        return replace(self, stamp=stamp, frame=frame, dt=dt, measured=False, camera=camera, covariance=covariance)
+        return replace(self, stamp=stamp, frame=frame, dt=dt, closed=False, camera=camera, covariance=covariance)
+
+    def slid(self, coordinates: Coordinates, rows: IndexArray, density: float) -> FilterState:
+        """With the slide of some landmarks' features (rows (M,)), seen now from farther round than ever before.
+
+        A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
+        landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad].
+        """
+        marks, at = self.landmarks.select(rows), self.pose[:3, 3]
+        first, now = marks.points - marks.anchors[:, :, 3], marks.points - at
+        distance = np.linalg.norm(now, axis=1)
+        cosine = np.einsum("ni,ni->n", first, now) / (np.linalg.norm(first, axis=1) * distance)
+        turned = np.maximum(marks.turned, np.arccos(np.clip(cosine, -1.0, 1.0)))
+        more = turned - marks.turned
+        if not density or not (more > 0).any():
+            return self
+        n = now / distance[:, None]
+        across = (density**2 * more * distance**2)[:, None, None] * (np.eye(3) - n[:, :, None] * n[:, None, :])
+        D, angles = coordinates.inverse_jacobian(marks.anchors, marks.c), self.landmarks.turned.copy()
+        angles[rows] = turned
+        covariance = self.covariance.widened(rows, D @ across @ D.transpose(0, 2, 1))
+        return replace(self, landmarks=replace(self.landmarks, turned=angles), covariance=covariance)
 
     # --- landmarks join and leave ---
 
@@ -79,7 +100,7 @@ class FilterState:
         covariance = self.covariance.appended(new.gauge @ self.camera.world(), noise, by_rig)
         end = self.covariance.correlated
         landmarks = self.landmarks.select(slice(end)).joined(new).joined(self.landmarks.select(slice(end, None)))
-        return replace(self, measured=True, landmarks=landmarks, covariance=covariance).relieved()
+        return replace(self, closed=True, landmarks=landmarks, covariance=covariance).relieved()
 
     def inserted(self, new: FilterLandmarks, covariances: Array) -> FilterState:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
@@ -96,33 +117,33 @@ class FilterState:
         return self._rearranged(*(part[stay[part]] for part in self._parts()))
 
     def with_all_of(self, ids: IdArray) -> FilterState:
-        """With some landmarks (M,), which may have left it or be known from elsewhere, in the state."""
-        rows, (left, state, known) = self.landmarks.rows_of(ids), self._parts()
-        back = np.sort(rows[(rows < len(left)) | (rows >= len(left) + len(state))])
+        """With some landmarks (M,), which may be parked or known from elsewhere, in the state."""
+        rows, (parked, state, known) = self.landmarks.rows_of(ids), self._parts()
+        back = np.sort(rows[(rows < len(parked)) | (rows >= len(parked) + len(state))])
         if not len(back):
             return self
-        return self._rearranged(np.setdiff1d(left, back), np.concatenate([state, back]), np.setdiff1d(known, back))
+        return self._rearranged(np.setdiff1d(parked, back), np.concatenate([state, back]), np.setdiff1d(known, back))
 
     def relieved(self) -> FilterState:
         """Where the state is too large, without those not measured for longest."""
-        (left, state, known), seen = self._parts(), self.landmarks.seen
+        (parked, state, known), seen = self._parts(), self.landmarks.seen
         if len(state) <= _MOST:
             return self
         old = state[seen[state] < self.frame]
         leave = np.sort(old[np.argsort(seen[old], kind="stable")][: max(len(state) - _LEAST, 0)])
         if not len(leave):
             return self
-        return self._rearranged(np.concatenate([left, leave]), np.setdiff1d(state, leave), known)
+        return self._rearranged(np.concatenate([parked, leave]), np.setdiff1d(state, leave), known)
 
     def _parts(self) -> tuple[IndexArray, IndexArray, IndexArray]:
-        """Rows of the landmarks that have left the state, are in it, or are known from elsewhere."""
-        rows, a, b = np.arange(len(self.landmarks)), self.covariance.left, self.covariance.correlated
+        """Rows of the landmarks that are parked, in the state, or are known from elsewhere."""
+        rows, a, b = np.arange(len(self.landmarks)), self.covariance.parked, self.covariance.correlated
         return rows[:a], rows[a:b], rows[b:]
 
-    def _rearranged(self, left: IndexArray, state: IndexArray, known: IndexArray) -> FilterState:
+    def _rearranged(self, parked: IndexArray, state: IndexArray, known: IndexArray) -> FilterState:
         """With the landmarks of these rows of the table in each part."""
-        landmarks = self.landmarks.select(np.concatenate([left, state, known]))
-        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(left, state, known))
+        landmarks = self.landmarks.select(np.concatenate([parked, state, known]))
+        return replace(self, landmarks=landmarks, covariance=self.covariance.rearranged(parked, state, known))
 
     # --- updates ---
 
@@ -135,15 +156,38 @@ class FilterState:
         Mourikis and Roumeliotis, 2010). If the camera transports its error, the covariance is therefore transported to
         the corrected state: the error is taken to be the displacement that the camera's pose has, by its Jacobian in
         old coordinates and in new, and what it leaves, which stays as it is: the error of an invariant filter (Barrau
-        and Bonnabel, 2015). Landmarks that have left do not move, so that their coordinates need none. Raises
-        UnsolvableError where the new state is not finite.
+        and Bonnabel, 2015). Landmarks that are parked do not move, so that their coordinates need none. Raises
+        UnsolvableError where the new state is not finite, or a variance is lost in rounding.
         """
-        at, before, P = found.whitened.innovation.at, self.landmarks, self.covariance
-        update, camera, state = at.update, at.camera_after(found.change), slice(P.left, P.correlated)
-        marks = before.moved(update.coordinates, state, found.change[CAMERA:].reshape(-1, 3))
+        update, camera = found.whitened.innovation.at.update, found.camera
+        marks = self.landmarks.moved(update.coordinates, self._parts()[1], found.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera.pose).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
         marks.seen[update.rows[found.used]] = self.frame
-        shift = (marks.gauge - before.gauge)[state] @ camera.world() * camera.transports
-        covariance = update.covariance.corrected(*found.whitened.lost(), self.camera.transport(camera), shift)
+        J, shift = update.camera.transport(camera), self._shift(marks, camera)
+        covariance = update.covariance.corrected(*found.information.gain_root(), J, shift)
+        if not (covariance.marks.diagonal() > 0).all():
+            raise UnsolvableError("a landmark's variance would not stay positive")
         return replace(self, camera=camera, landmarks=marks, covariance=covariance).relieved()
+
+    def displaced(self, coordinates: Coordinates, ids: IdArray, points: Array) -> FilterState:
+        """With some landmarks at points (M, 3) [m]: their error stays, and the covariance is transported as above.
+
+        What moves them is an error of the rig, the last that is considered, and none of the state's.
+        """
+        s = self.with_all_of(ids)
+        rows = s.landmarks.rows_of(ids)
+        marks = s.landmarks.moved(
+            coordinates, rows, coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
+        )
+        if not np.isfinite(marks.points).all():
+            return self
+        covariance = s.covariance.displaced(rows, marks.c[rows] - s.landmarks.c[rows]).transported(
+            s._shift(marks, s.camera)
+        )
+        return replace(s, landmarks=marks, covariance=covariance).relieved()
+
+    def _shift(self, marks: FilterLandmarks, camera: Camera) -> Array:
+        """What is added to the errors (A, 3, 6) of landmarks that have moved, by the error of the pose."""
+        change = (marks.gauge - self.landmarks.gauge)[self._parts()[1]]
+        return np.asarray(change @ camera.world() if camera.transports else np.zeros_like(change))

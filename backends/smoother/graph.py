@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key
-from backends.smoother.state import SmootherState
+from backends.smoother.state import SmootherState, Tie, follows
 from backends.smoother.tracks import GraphProblem, Stamps, Tracks
 from slam.data import IdArray
 from slam.errors import SlamError
@@ -36,6 +36,7 @@ class Solved:
     points: Array  # and where they are (V, 3)
     linearised: Array  # and where they are linearised (V, 3)
     covariance: Array  # joint covariance (12, 12) of the last two poses; (6, 6) of a single one
+    spread: Array  # covariances (N, 6, 6) of those that are new
 
 
 class Graph:
@@ -71,6 +72,7 @@ class Graph:
         self._poses: dict[int, Array] = {}
         self._first = np.eye(4)
         self._kind = False, 0
+        self._tie: Tie | None = None  # of its newest pose
 
     def followed(self, s: SmootherState) -> tuple[Solved, str]:
         """The solution for a state with more poses than the last one; and why gtsam failed, if it did.
@@ -130,6 +132,7 @@ class Graph:
             self._solver.update()
         self._solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), problem.stamps)
         self._tracks.forget(s)
+        new = [i for i in numbers if i >= oldest] if self._poses else [s.number]
         values = self._solver.calculateEstimate()
         poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(oldest, s.number + 1)])
         self._poses = dict(zip(range(oldest, s.number + 1), poses))
@@ -138,10 +141,11 @@ class Graph:
             for v in (values, self._solver.getLinearizationPoint() if kept else values)
         )
         joint = self._joint(list(range(max(oldest, s.number - 1), s.number + 1)))
+        spread = np.array([*(self._joint([i]) for i in new[:-1]), joint[-6:, -6:]])
         if not (np.isfinite(poses).all() and np.isfinite(joint).all() and (np.diag(joint) > 0).all()):
             raise ValueError("the solution is not finite, or a variance not positive")
-        self._number = s.number
-        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint)
+        self._number, self._tie = s.number, s.ties[s.of(s.number)]
+        return Solved(oldest, poses, np.array(kept, np.int64), points, linearised, joint, spread)
 
     def joint_covariance(self, s: SmootherState, first: int | None = None) -> tuple[int, Array]:
         """Number of the first pose, and the joint covariance (6 K, 6 K) of all poses from there on.
@@ -158,9 +162,9 @@ class Graph:
         P = self._joint(list(range(begin, self._number + 1)))
         for tie in s.ties[s.of(self._number) + 1 :]:
             assert tie is not None  # only the pose with which the problem begins has none
-            A = adjoint(inverse(tie.relative))
-            cross = A @ P[-6:]
-            P = np.block([[P, cross.T], [cross, cross[:, -6:] @ A.T + tie.covariance]])
+            gain, rest = follows(adjoint(inverse(tie.relative)), P[-6:, -6:], tie.shared, tie.covariance)
+            cross = gain @ P[-6:]
+            P = np.block([[P, cross.T], [cross, cross[:, -6:] @ gain.T + rest]])
         return first, P[6 * (first - begin) :, 6 * (first - begin) :]
 
     def landmark_covariance(self, s: SmootherState, serial: int, position: Array) -> Array | None:
@@ -178,8 +182,12 @@ class Graph:
         return self._number
 
     def _is_of(self, s: SmootherState) -> bool:
-        """Whether it is the state's graph, up to poses that entered since the last update."""
-        return s.begun <= self._number <= s.number and self._kind == _kind(s)
+        """Whether it is the state's graph, up to poses that entered since the last update.
+
+        A pose of that number may be another frame, if the call that had added it was interrupted.
+        """
+        known = max(s.begun, s.first) <= self._number <= s.number
+        return known and self._kind == _kind(s) and self._tie is s.ties[s.of(self._number)]
 
     def _joint(self, numbers: list[int]) -> Array:
         isam, keys = self._solver.getISAM2(), [pose_key(i) for i in numbers]
@@ -195,8 +203,12 @@ def _kind(s: SmootherState) -> tuple[bool, int]:
 
 
 def held(s: SmootherState, number: int) -> tuple[Array, Array]:
-    """Covariance of the prior of a pose that comes first (6, 6), and what is known of it in the world besides."""
-    P = s.spread[s.of(number)]
+    """Covariance of the prior of a pose that comes first (6, 6), and what is known of it in the world besides.
+
+    What was measured from the pose with which the problem begins is in the graph, and not in its prior. Of a later one
+    it is in both: what known landmarks told of it is not told again, see `Tracks`.
+    """
+    P = s.prior if number == s.begun else s.spread[s.of(number)]
     if s.anchored:
         return P, np.zeros((6, 6))
     prior = np.diag(np.minimum(np.diag(P), _FIRM))

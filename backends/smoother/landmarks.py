@@ -30,7 +30,7 @@ class SmootherLandmarks(LandmarkRows):
     world: BoolArray  # whether that does not depend on any pose (S,)
     z: Array  # its last measurements (S, RECENT, 3)
     pose: IndexArray  # and the numbers of their poses (S, RECENT), −1 for none
-    begun: IndexArray  # number of the pose from which its smart factor counts (S,), or later; or VARIABLE
+    factor: IndexArray  # its smart factor, by the number of the pose from which its span counts (S,); or VARIABLE
     linearised: Array  # where the graph has it linearised, if it is a variable (S, 3) [m]
     by_rig: Array  # derivatives of the positions by errors of the rig (S, 3, m)
 
@@ -70,14 +70,14 @@ class SmootherLandmarks(LandmarkRows):
         What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
         was known beforehand.
         """
-        last, begun = self.pose[rows].max(axis=1), self.begun.copy()
-        half, full = max(track // 2, 1), begun[rows] <= pose - track
+        last, factor = self.pose[rows].max(axis=1), self.factor.copy()
+        half, full = max(track // 2, 1), factor[rows] <= pose - track
         anew = (last < 0) | (last < pose - half)
         held = (
-            (last >= 0) & (0 <= before < pose - 1) & (begun[rows] > before - track) & (self.serial[rows] // 2 % 2 == 0)
+            (last >= 0) & (0 <= before < pose - 1) & (factor[rows] > before - track) & (self.serial[rows] // 2 % 2 == 0)
         )
-        smart = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, begun[rows]))
-        begun[rows] = np.where(held | (begun[rows] == VARIABLE), begun[rows], smart)
+        smart = np.where(anew, pose - self.serial[rows] % half, np.where(full, pose, factor[rows]))
+        factor[rows] = np.where(held | (factor[rows] == VARIABLE), factor[rows], smart)
         old = np.zeros(len(self), bool)
         old[rows] = (last < oldest) & self.away[rows].any(axis=(1, 2))
         if old.any():
@@ -87,7 +87,7 @@ class SmootherLandmarks(LandmarkRows):
         zs, poses = self.z.copy(), self.pose.copy()
         slot = poses[rows].argmin(axis=1)
         zs[rows, slot], poses[rows, slot] = z, pose
-        return replace(self, z=zs, pose=poses, away=away, begun=begun)
+        return replace(self, z=zs, pose=poses, away=away, factor=factor)
 
     def with_variables(
         self, rows: IndexArray, z: Array, pose: int, track: int, most: int, T: Array, linear: float
@@ -105,23 +105,23 @@ class SmootherLandmarks(LandmarkRows):
         """
         if len(rows) > most:
             return self
-        last, variable = self.pose.max(axis=1), self.begun == VARIABLE
+        last, variable = self.pose.max(axis=1), self.factor == VARIABLE
         deviation = np.sqrt(np.trace(self.own[rows], axis1=1, axis2=2))
         offset = np.linalg.norm(self.position[rows] - self.linearised[rows], axis=1)
         apart = linear * np.where(variable[rows], offset, deviation)
         nonlinear = apart >= np.linalg.norm(self.position[rows] - T[:3, 3], axis=1)
-        full = ~variable[rows] & (self.begun[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
+        full = ~variable[rows] & (self.factor[rows] <= pose - track) & (last[rows] >= pose - max(track // 2, 1))
         new = rows[full & ~nonlinear & np.isfinite(z[:, 2])]
         leaving = np.flatnonzero(variable & (last < pose - track))
         leaving = leaving[np.argsort(last[leaving], kind="stable")][: max(int(variable.sum()) + len(new) - most, 0)]
-        begun = self.begun.copy()
-        begun[leaving] = 0
-        begun[rows[variable[rows] & nonlinear]] = 0
+        factor = self.factor.copy()
+        factor[leaving] = 0
+        factor[rows[variable[rows] & nonlinear]] = 0
         new = np.sort(new)[: most - int(variable.sum()) + len(leaving)]
-        begun[new] = VARIABLE
+        factor[new] = VARIABLE
         linearised = self.linearised.copy()
         linearised[new] = self.position[new]
-        return replace(self, begun=begun, linearised=linearised)
+        return replace(self, factor=factor, linearised=linearised)
 
     def solved(self, serials: IdArray, points: Array, linearised: Array) -> Self:
         """With variables (V,), by serial number, at points (V, 3), and where the graph has them linearised (V, 3)."""
@@ -131,7 +131,7 @@ class SmootherLandmarks(LandmarkRows):
 
     def without_variables(self, pose: int) -> Self:
         """With smart factors that begin at pose number `pose` in place of all variables."""
-        return replace(self, begun=np.where(self.begun == VARIABLE, pose, self.begun))
+        return replace(self, factor=np.where(self.factor == VARIABLE, pose, self.factor))
 
     def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Self:
         """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""
@@ -154,8 +154,10 @@ class SmootherLandmarks(LandmarkRows):
         Poses before it are kept no more. The numbers of the poses stay: they say when a landmark was measured last.
         Landmarks that pose `oldest` or a later one measured go on with the measurements that are left.
         """
-        old = ((self.pose >= 0) & (self.pose < first)).any(axis=1) & (self.pose.max(axis=1) < oldest) & ~self.world
-        return replace(self._known_by(old, self.own), z=np.where(old[:, None, None], np.nan, self.z))
+        gone, lately = (self.pose >= 0) & (self.pose < first), self.pose.max(axis=1) >= oldest
+        old = gone.any(axis=1) & ~lately & ~self.world
+        z = np.where((old[:, None] | gone)[:, :, None], np.nan, self.z)
+        return replace(self._known_by(old, self.own), z=z, pose=np.where(gone & lately[:, None], -1, self.pose))
 
     def _known_by(self, chosen: BoolArray, covariances: Array) -> Self:
         """Where some (S,) stand is what is known of them, with covariances (S, 3, 3)."""

@@ -72,8 +72,10 @@ class Path:
             rows, k = slice(6 * i, 6 * i + 6), self._number[f] - first
             J[rows, 6 * k : 6 * k + 6] = adjoint(inverse(self._relative[f]))
             own[rows, rows] = self._own[f]
-        if len(frames) > 1 and self._number[frames[-2]] == s.number:
-            own[-12:, -12:] = s.pair
+        near = sum(self._number[f] == s.number for f in frames[-2:])
+        if not s.inside:
+            gain, rest = s.followed
+            J[-6 * near :, -6:], own[-6 * near :, -6 * near :] = gain[-6 * near :], rest[-6 * near :, -6 * near :]
         P = J @ joint @ J.T + own
         poses = np.array([self._poses[self._number[f]] @ self._relative[f] for f in frames])
         poses[-1] = s.last[1]

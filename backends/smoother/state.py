@@ -18,7 +18,7 @@ class Sight(Table):
     """What was measured from one pose."""
 
     serials: IdArray  # of the landmarks (M,)
-    begun: IndexArray  # which of each one's smart factors it goes into (M,), see `SmootherLandmarks.begun`
+    factor: IndexArray  # which of each one's smart factors it goes into (M,), see `SmootherLandmarks.factor`
     z: Array  # measurements (M, 3) of the rectified rig, uR NaN where missing
 
     @classmethod
@@ -29,7 +29,7 @@ class Sight(Table):
     @classmethod
     def of(cls, marks: SmootherLandmarks, rows: IndexArray, z: Array) -> Sight:
         """Of measurements z (M, 3) that landmarks have just had."""
-        return cls(marks.serial[rows], marks.begun[rows], z)
+        return cls(marks.serial[rows], marks.factor[rows], z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +44,7 @@ class Tie:
 
     relative: Array  # the pose relative to the one before it in the graph (4, 4)
     covariance: Array  # of that (6, 6)
+    shared: Array  # of the error in the world of the one before it with that of this (6, 6)
     span: float | None = None  # time since that one [s]; None where the model's velocity does not tell what it moved by
     weight: float = 0.0  # sum [s²] over the frames since of their intervals times the time from their start to the pose
     times: Array | None = None  # (3,) of the three poses [s]; the first is NaN where the velocity is unknown
@@ -57,6 +58,7 @@ class Known:
     position: Array  # in the world, or in the camera's coordinates (3,) [m]
     covariance: Array  # of that (3, 3) [m²]
     pose: int  # number of the pose that it is relative to; −1 for the world
+    used: int = -1  # number of the pose that measured the landmark first; −1 for none
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +74,15 @@ class SmootherState:
     poses: Array  # T_world_left (K, 4, 4)
     sights: tuple[Sight, ...]  # what was measured from each
     ties: tuple[Tie | None, ...]  # of each to the one before it; None of the one with which the problem begins
-    spread: Array  # covariance in the world of each when it was the newest (K, 6, 6)
+    spread: Array  # covariance in the world of each when it was the newest that was solved for (K, 6, 6)
     stamps: Array  # times of the last frame but one and the last (2,) [s]; NaN where there is none
     last: Array  # their poses (2, 4, 4)
-    pair: Array  # their joint covariance (12, 12), where the newest pose of the graph is known
+    pair: Array  # joint covariance (12, 12) of their errors relative to the newest pose of the graph
+    shared: Array  # covariance (6, 12) of that pose's own error in the world with these
     by_rig: Array  # their derivatives by errors of the rig (12, m)
-    # covariance of the attitude of the pose with which the problem begins (3, 3) [rad²], about the world's axes
+    # covariance (6, 6) of the pose with which the problem begins before anything was measured from it, and that of its
+    # attitude about the world's axes (3, 3) [rad²]
+    prior: Array = field(default_factory=lambda: np.zeros((6, 6)))
     turned: Array = field(default_factory=lambda: np.zeros((3, 3)))
     tie: Tie | None = None  # of the newest frame to the newest pose of the graph that is before it
     frame: int = -1  # number of the newest frame
@@ -96,7 +101,8 @@ class SmootherState:
         none = np.zeros((0, 4, 4))
         return cls(
             0, 0, none, (), (), np.zeros((0, 6, 6)), np.full(2, np.nan), np.tile(np.eye(4), (2, 1, 1)),
-            np.zeros((12, 12)), np.tile(by_rig, (2, 1)), landmarks=SmootherLandmarks.none(by_rig.shape[1]),
+            np.zeros((12, 12)), np.zeros((6, 12)), np.tile(by_rig, (2, 1)),
+            landmarks=SmootherLandmarks.none(by_rig.shape[1]),
         )  # fmt: skip
 
     @property
@@ -116,15 +122,24 @@ class SmootherState:
 
     @property
     def own(self) -> Array:
-        """Covariance (6, 6) of the newest frame, where the newest pose of the graph is known."""
+        """Covariance (6, 6) of the newest frame's error relative to the newest pose of the graph."""
         return self.pair[6:, 6:]
 
     @property
     def covariance(self) -> Array:
-        """Covariance (6, 6) of the newest frame in the world."""
+        """Covariance (6, 6) of the newest frame in the world.
+
+        It moves as the last poses did, so what it is off by relative to the newest one has to do with that one's error.
+        """
         A = adjoint(inverse(self.last[1]) @ self.poses[-1])
-        P = A @ self.spread[-1] @ A.T + self.own
+        P = A @ (self.spread[-1] @ A.T + 2 * self.shared[:, 6:]) + self.own
         return np.asarray(0.5 * (P + P.T))
+
+    @property
+    def followed(self) -> tuple[Array, Array]:
+        """How the last two frames follow the newest pose of the graph, see `follows`."""
+        A = adjoint(inverse(self.last) @ self.poses[-1]).reshape(12, 6)
+        return follows(A, self.spread[-1], self.shared, self.pair)
 
     def of(self, number: int) -> int:
         """Row of a pose of the graph."""
@@ -140,3 +155,12 @@ class SmootherState:
             spread=self.spread[gone:], landmarks=self.landmarks.folded(self.first + gone, self.number - lag),
             known={k: one for k, one in self.known.items() if not 0 <= one.pose < self.first + gone},
         )  # fmt: skip
+
+
+def follows(A: Array, P: Array, shared: Array, own: Array) -> tuple[Array, Array]:
+    """Gain G (n, 6) and covariance (n, n) of an error ``G x + rest``, whose rest has nothing to do with a pose's x.
+
+    P (6, 6) is the covariance of x. The error less ``A x`` has a covariance `own` (n, n), and `shared` (6, n) with x.
+    """
+    gain = np.linalg.solve(P, shared).T
+    return A + gain, own - gain @ shared

@@ -60,8 +60,9 @@ class Steps(RectifiedMeasurement):
         return replace(
             s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), frame=s.frame + 1,
             pair=np.block([[s.own, cross.T], [cross, own]]),
+            shared=np.concatenate([s.shared[:, 6:], s.shared @ J.T], axis=1),
             by_rig=np.concatenate([s.by_rig[6:], J @ s.by_rig]), since=s.since + 1, inside=False, measured=False,
-            tie=_tie(s, inverse(s.poses[-1]) @ T, own, dt, first, rests),
+            tie=_tie(s, inverse(s.poses[-1]) @ T, own, s.shared @ J.T, dt, first, rests),
         )  # fmt: skip
 
     def in_view(self, s: SmootherState) -> tuple[IndexArray, Array, Array, Array]:
@@ -150,19 +151,26 @@ class Steps(RectifiedMeasurement):
     def settled(self, s: SmootherState, solved: Solved) -> SmootherState:
         """The state with what the graph says: the newest frame is a pose of it."""
         poses = np.concatenate([s.poses[: s.of(solved.first)], solved.poses])
-        P, pair, last = solved.covariance, np.zeros((12, 12)), s.last.copy()
+        P, last = solved.covariance, s.last.copy()
+        pair: Array = np.zeros((12, 12))
+        shared: Array = np.zeros((6, 12))
         if s.since:
             newest_first = np.roll(s.pair, 6, (0, 1))
             if len(P) == 12 and not s.pair[:6, :6].any():  # the frame before is a pose of the graph
                 newest_first, last[0] = np.roll(P, 6, (0, 1)), poses[-2]
             else:
                 last[0] = poses[-1] @ inverse(s.last[1]) @ s.last[0]
-            pair[:6, :6] = relative_covariance(newest_first, poses[-1], last[0])
+            pair, shared = _before(newest_first, poses[-1], last[0])
         last[1] = poses[-1]
-        spread = np.concatenate([s.spread[:-1], P[None, -6:, -6:]])
+        spread = np.concatenate([s.spread[: -len(solved.spread)], solved.spread])
         marks = s.landmarks.refined(self.stereo, self.models.pixel_sigma, s.first, poses)
         marks = marks.solved(solved.serials, solved.points, solved.linearised)
-        s = replace(s, poses=poses, last=last, pair=pair, spread=spread, landmarks=marks)
+        known = {n: s.known[n] for n in s.sights[-1].serials.tolist() if n in s.known and s.known[n].used < 0}
+        used = {n: replace(one, used=s.number) for n, one in known.items()}
+        s = replace(
+            s, poses=poses, last=last, pair=pair, shared=shared, spread=spread, landmarks=marks,
+            known={**s.known, **used} if used else s.known,
+        )  # fmt: skip
         if self.past is None or self.config.lag is None or len(s.poses) < 1.5 * self.past:
             return s
         return s.without_old(self.past, self.config.lag)
@@ -211,13 +219,15 @@ class Steps(RectifiedMeasurement):
         """Covariances (M, 3, 3) of landmarks in the world."""
         marks, joint = s.landmarks, graph.joint_covariance(s)[1]
         C = marks.covariances(self.stereo, self.models.pixel_sigma, rows, s.first, s.poses, joint)
-        for i in np.flatnonzero(marks.begun[rows] == VARIABLE):
+        for i in np.flatnonzero(marks.factor[rows] == VARIABLE):
             found = graph.landmark_covariance(s, int(marks.serial[rows[i]]), marks.position[rows[i]])
             C[i] = C[i] if found is None else found
         return C
 
 
-def _tie(s: SmootherState, relative: Array, own: Array, dt: float, first: bool, rests: bool) -> Tie:
+def _tie(
+    s: SmootherState, relative: Array, own: Array, shared: Array, dt: float, first: bool, rests: bool
+) -> Tie:  # fmt: skip
     """What the motion model says of the frame `dt` [s] after the last one, which is there relative to the graph.
 
     In a gap of frames of d_j [s], T together, impulses w_j change the velocity: the mean one in the gap differs from
@@ -226,7 +236,7 @@ def _tie(s: SmootherState, relative: Array, own: Array, dt: float, first: bool, 
     the variance of its own and the covariance of both besides, with which they are as good as independent, and never
     too sure: ``Σ d_j a_j / T`` at its beginning and ``Σ d_j b_j / T`` at its end, times the model's variance by time.
     """
-    tie, span, weight = Tie(relative, own), dt, dt * dt
+    tie, span, weight = Tie(relative, own, shared), dt, dt * dt
     if not s.inside:
         if s.tie is None or s.tie.span is None or s.tie.times is None or first or rests:
             return tie
@@ -238,7 +248,7 @@ def _tie(s: SmootherState, relative: Array, own: Array, dt: float, first: bool, 
     if not first:
         if before is None or before.span is None or motion.is_first(before.span, span):
             return tie
-        turn = rotation_angle(before.relative[:3, :3]) * span / before.span
+        turn = rotation_angle(s.poses[-2][:3, :3].T @ s.poses[-1][:3, :3]) * span / before.span
         if not s.inside and turn + _SURE * math.sqrt(own[:3, :3].diagonal().max()) > math.pi:
             return tie
         earlier, changed = -before.span, before.span - before.weight / before.span
@@ -251,7 +261,8 @@ def _begun(s: SmootherState, T: Array, covariance: Array, sight: Sight) -> Smoot
     return replace(
         s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
         spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
-        turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T, since=0, inside=True, tie=None,
+        shared=np.zeros((6, 12)), prior=covariance, turned=T[:3, :3] @ covariance[:3, :3] @ T[:3, :3].T,
+        since=0, inside=True, tie=None,
     )  # fmt: skip
 
 
@@ -281,10 +292,22 @@ def _joined(s: SmootherState, sight: Sight) -> SmootherState:
 
 def _entered(s: SmootherState) -> SmootherState:
     """With the newest frame as a pose of the graph where it is predicted; the graph has it from the next update on."""
-    pair = np.zeros((12, 12))
-    pair[:6, :6] = relative_covariance(np.roll(s.pair, 6, (0, 1)), s.last[1], s.last[0])
+    pair, shared = _before(np.roll(s.pair, 6, (0, 1)), s.last[1], s.last[0])
+    A, B = (adjoint(inverse(T) @ one) for T, one in ((s.last[1], s.poses[-1]), (s.last[0], s.last[1])))
+    shared[:, :6] += A @ (s.shared[:, :6] - s.shared[:, 6:] @ B.T)
     marks = s.landmarks.left_behind(np.zeros(0, np.intp), s.last[1], s.own)
-    return replace(_joined(s, Sight.none()), pair=pair, landmarks=marks, measured=True)
+    return replace(_joined(s, Sight.none()), pair=pair, shared=shared, landmarks=marks, measured=True)
+
+
+def _before(P: Array, newest: Array, before: Array) -> tuple[Array, Array]:
+    """`SmootherState.pair` and `shared` where the newest frame is the newest pose of the graph.
+
+    P (12, 12) is the joint covariance of that (4, 4), and of the frame before (4, 4).
+    """
+    pair, shared = np.zeros((12, 12)), np.zeros((6, 12))
+    pair[:6, :6] = relative_covariance(P, newest, before)
+    shared[:, :6] = P[:6, 6:] - P[:6, :6] @ adjoint(inverse(before) @ newest).T
+    return pair, shared
 
 
 def _by_pose_and_rig(one: pose_only.PoseProblem, T: Array, by_rig: Array, field: Array) -> tuple[Array, Array]:

@@ -16,18 +16,24 @@ from slam.geometry.se3 import transform
 #: Times of variables, as gtsam's stubs have them.
 Stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]
 
+_LONGEST = 64  # cost: measurements in a factor of what was a variable; its cost grows with their square
+
 
 @dataclass
 class Track:
     """A landmark's smart factor."""
 
-    begun: int  # see `SmootherLandmarks.begun`
+    factor: int  # see `SmootherLandmarks.factor`
     poses: list[int] = field(default_factory=list)  # numbers of the poses that measured it
     keys: list[int] = field(default_factory=list)  # their variables, and the measurements
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
     # whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only
     stereo: bool = False
     slot: int = -1  # of the factor in the solver, −1 while there is none
+
+    def takes_any(self, first: int) -> bool:
+        """Whether it takes a measurement of what was a variable, if all its poses are to be from `first` on."""
+        return self.poses[0] >= first and len(self.poses) < _LONGEST
 
 
 @dataclass
@@ -37,7 +43,8 @@ class GraphProblem:
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)  # for gtsam
     values: gtsam.Values = field(default_factory=gtsam.Values)
     removed: list[int] = field(default_factory=list)  # slots of factors that others replace
-    grown: dict[tuple[int, int], Track] = field(default_factory=dict)  # smart factors with new measurements
+    # smart factors with new measurements, by serial number of the landmark and number of the first pose
+    grown: dict[tuple[int, int], Track] = field(default_factory=dict)
     # times of variables for the fixed lag: numbers of poses
     stamps: Stamps = field(default_factory=dict)
 
@@ -76,28 +83,30 @@ class Tracks:
         """What was measured from a pose, from some row on."""
         sight, make, known = s.sights[s.of(number)], self._make, bool(s.known or self._variables)
         key = pose_key(number)
-        rows = (column[begin:].tolist() for column in (sight.serials, sight.begun, sight.z))
-        for serial, begun, z in zip(*rows):
+        rows = (column[begin:].tolist() for column in (sight.serials, sight.factor, sight.z))
+        for serial, factor, z in zip(*rows):
             point = make.point(z)
-            if known and self._is_variable(problem, s, serial, begun, number, first):
+            if known and self._is_variable(problem, s, serial, factor, number, first):
                 self._stays(problem, serial, number)
                 problem.factors.add(make.explicit(point, number, serial))
                 continue
             track = self._smart.get(serial)
-            goes_on = track is not None and (track.poses[0] >= first - 1 if begun == VARIABLE else track.begun == begun)
+            goes_on = track is not None and (
+                track.factor == factor if factor != VARIABLE else track.takes_any(first - 1)
+            )
             if track is None or not goes_on:
-                self._smart[serial] = track = Track(begun)
+                self._smart[serial] = track = Track(factor)
             track.poses.append(number)
             track.keys.append(key)
             track.points.append(point)
             track.stereo = track.stereo or z[2] == z[2]  # not NaN
-            problem.grown[serial, track.begun] = track
-            if begun == VARIABLE and track.stereo:
+            problem.grown[serial, track.poses[0]] = track
+            if factor == VARIABLE and track.stereo:
                 self._turn(problem, s, serial, number)
 
     def keep(self, problem: GraphProblem, s: SmootherState) -> list[int]:
         """Variables that the state keeps do not leave; their serial numbers."""
-        kept = list(filter(self._is_there, s.landmarks.serial[s.landmarks.begun == VARIABLE].tolist()))
+        kept = list(filter(self._is_there, s.landmarks.serial[s.landmarks.factor == VARIABLE].tolist()))
         for serial in kept:
             self._stays(problem, serial, s.number)
         return kept
@@ -113,11 +122,11 @@ class Tracks:
 
     def _turn(self, problem: GraphProblem, s: SmootherState, serial: int, number: int) -> None:
         """A landmark becomes a variable, if the state has it as one, with the measurements of its smart factor."""
-        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.begun == VARIABLE))
+        row = np.flatnonzero((s.landmarks.serial == serial) & (s.landmarks.factor == VARIABLE))
         if not len(row):
             return
         track = self._smart.pop(serial)
-        del problem.grown[serial, track.begun]
+        del problem.grown[serial, track.poses[0]]
         if track.slot >= 0:
             problem.removed.append(track.slot)
         for pose, point in zip(track.poses, track.points):
@@ -126,13 +135,19 @@ class Tracks:
         self._stays(problem, serial, number)
 
     def _is_variable(
-        self, problem: GraphProblem, s: SmootherState, serial: int, begun: int, number: int, first: int
+        self, problem: GraphProblem, s: SmootherState, serial: int, factor: int, number: int, first: int
     ) -> bool:
-        """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
+        """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet.
+
+        The covariance of a first pose has used it up if the landmark was measured by then; that of the pose with which
+        the problem begins is from before.
+        """
         known = s.known.get(serial)
-        if serial in self._variables and (begun == VARIABLE or known is not None):
+        if serial in self._variables and (factor == VARIABLE or known is not None):
             return self._is_there(serial)
         if known is None or 0 <= known.pose < first:
+            return False
+        if known.pose < 0 <= known.used <= first and first > s.begun:
             return False
         self.add_known(problem, s, serial)
         return True
@@ -167,5 +182,5 @@ class Tracks:
         self._solved = s.number
         if self._lag is not None and not s.number % self._lag:
             oldest = s.number - self._lag
-            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] > oldest}
+            self._smart = {n: track for n, track in self._smart.items() if track.poses[0] >= oldest}
             self._variables = {n: last for n, last in self._variables.items() if last >= oldest or n in s.known}

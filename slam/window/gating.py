@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammainc
+from scipy.special import bdtrc, comb, gammainc
 
 from slam.chi_square import chi_square_limit
 from slam.geometry import kernels
@@ -15,15 +15,21 @@ MIN_CONSENSUS = 5  #: fewest observations that agree on a pose by more than chan
 INFLATION = (3.0, 10.0)  #: factors on the process noise's standard deviation tried if observations disagree
 
 
-def share_by_chance(rejected: Array, limit: float) -> float:
-    """The share of wrong observations that pass a gate of `limit` by chance.
+def by_chance(rejected: Array, agree: int, count: int, limit: float, probability: float, fitted: int = 0) -> bool:
+    """Whether as many of `count` wrong observations may pass a gate as agree, at the gate's own level.
 
-    The rejected observations show how widely wrong ones scatter about their predictions: `rejected` (R,) has their
-    squared Mahalanobis distances, χ² with three degrees of freedom.
+    The gate has a `limit` for squared distances, χ² with three degrees of freedom, and a `probability`. Those of the
+    observations that it `rejected` (R,) show how widely wrong ones scatter about their predictions; without any: True.
+    `fitted` observations agree with the pose that was made to fit them, whatever they are, and it may have been made to
+    fit any so many: the number of others that agree is tested for all such choices together (an a contrario test, as in
+    Moisan & Stival, IJCV 2004).
     """
-    median = chi_square_limit(3, 0.5)
-    spread = float(np.median(rejected)) / median  # in units of the innovation covariances
-    return float(gammainc(1.5, limit / spread / 2))
+    if not len(rejected) or agree <= fitted:
+        return True
+    spread = float(np.median(rejected)) / chi_square_limit(3, 0.5)  # in units of the innovation covariances
+    share = gammainc(1.5, limit / spread / 2)
+    others = bdtrc(agree - fitted - 1, count - fitted, share)
+    return bool(comb(count, fitted) * others > 1 - probability)
 
 
 def squared_distances(residuals: Array, covariances: Array) -> Array:

@@ -13,14 +13,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import bdtrc, comb
 
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
 from slam.geometry.rig import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, log
 from slam.window import pose_only
-from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
+from slam.window.gating import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, by_chance
 
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
@@ -82,21 +81,10 @@ def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
 
 
 def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> bool:
-    """Whether so many wrong observations may pass the gate as agree, at the gate's own level.
-
-    Three observations agree with the pose that was made to fit them, whatever they are, and it may have been made to
-    fit any three: the number of others that agree is tested for all triples together (an a contrario test, as in
-    Moisan & Stival, IJCV 2004).
-    """
-    distances = problem.distances(T)
+    """Whether as many may agree by chance with a pose that was made to fit three of them."""
+    distances, limit = problem.distances(T), chi_square_limit(3, problem.probability)
     rejected = distances[~used & np.isfinite(distances)]
-    if not len(rejected):
-        return True
-    share = share_by_chance(rejected, chi_square_limit(3, problem.probability))
-    others, many = int(used.sum()) - MINIMAL_POINTS, len(used) - MINIMAL_POINTS
-    return bool(
-        others < 1 or comb(len(used), MINIMAL_POINTS) * bdtrc(others - 1, many, share) > 1 - problem.probability
-    )
+    return by_chance(rejected, int(used.sum()), len(used), limit, problem.probability, MINIMAL_POINTS)
 
 
 def world_covariance(P: Array) -> Array:

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrs, dtrtri
 
 from slam.geometry.arrays import Array, IndexArray
@@ -70,7 +71,7 @@ class Solution:
     def inverse_factor(self) -> Array:
         """``L⁻¹`` of the points that are asked for and of the poses, lower triangular: the last part of the whole."""
         at = self.window.layout.asked
-        return np.asarray(_upper_inverse(self.factor[at:, at:].T).T)
+        return np.asarray(upper_inverse(self.factor[at:, at:].T).T)
 
     @cached_property
     def pose_covariance(self) -> Array:
@@ -169,14 +170,14 @@ def row_distances(w: Window) -> Array:
     return np.asarray(kernels.row_distances(w.stereo.intrinsics, w.poses, w.points, w.rows.arrays))
 
 
-def _upper_inverse(U: Array) -> Array:
+def upper_inverse(U: Array) -> Array:
     """Inverse of an upper triangular matrix (n, n), by halves: products take a fraction of the time of LAPACK's own."""
     n = len(U)
     if n <= _WHOLE:
         return np.asarray(dtrtri(U, lower=0)[0] if n else U)
     half = n // 2
     out = np.zeros((n, n), order="F")
-    first, last = _upper_inverse(U[:half, :half]), _upper_inverse(U[half:, half:])
+    first, last = upper_inverse(U[:half, :half]), upper_inverse(U[half:, half:])
     out[:half, :half], out[half:, half:] = first, last
-    out[:half, half:] = -first @ (U[:half, half:] @ last)
+    out[:half, half:] = dtrmm(-1.0, first, dtrmm(1.0, last, U[:half, half:], side=1))
     return out

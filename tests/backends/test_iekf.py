@@ -22,7 +22,7 @@ ERROR = 0.3 * RNG.standard_normal(12)
 
 def test_a_correction_is_the_error_of_what_was_corrected():
     after = CAMERA.moved(ERROR)
-    np.testing.assert_allclose(after.seen_from(CAMERA), ERROR, atol=1e-12)
+    np.testing.assert_allclose(after.minus(CAMERA), ERROR, atol=1e-12)
     np.testing.assert_allclose(after.pose[:3, :3], se3.so3_exp(ERROR[3:6]) @ CAMERA.pose[:3, :3], atol=1e-12)
 
 
@@ -41,13 +41,13 @@ def test_the_motion_and_its_derivatives():
     np.testing.assert_allclose(camera.pose[:3, 3], T[:3, 3] + dt * CAMERA.v, atol=1e-12)
 
     def moved(xi):
-        return CAMERA.moved(xi).advanced(MODELS, P, dt)[0].seen_from(camera)
+        return CAMERA.moved(xi).advanced(MODELS, P, dt)[0].minus(camera)
 
     np.testing.assert_allclose(J, jacobian(moved, np.zeros(12)), atol=1e-8)
 
     def disturbed(w):  # an impulse at the beginning of the step
         start = replace(CAMERA, v=CAMERA.v + w[:3], rate=CAMERA.rate + w[3:])
-        return start.advanced(MODELS, P, dt)[0].seen_from(camera)
+        return start.advanced(MODELS, P, dt)[0].minus(camera)
 
     W = jacobian(disturbed, np.zeros(6))
     Q = np.diag(np.repeat(MODELS.motion.velocity_variance(dt), 3))
@@ -70,7 +70,7 @@ def test_what_nothing_measures_stays_unknown(iterations):
     backend = IekfBackend(RIG, models, iterations=iterations)
     run(backend, turning_drive())
     s = backend.state
-    assert s.covariance.left == 0
+    assert s.covariance.parked == 0
     shift = np.concatenate([displacement(s.camera), s.landmarks.gauge.reshape(-1, 6)])
     information = sigma**2 * np.diag(shift.T @ np.linalg.solve(dense(s.covariance), shift))
     assert (information < 1.001).all()  # less than 1 where the model's impulses have loosened it

@@ -98,12 +98,22 @@ def test_what_is_inserted_and_never_seen_stays_as_it_is(name):
         backend.positions(np.array([5000]))
 
 
-def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt():
-    scene = Scene()
+@pytest.mark.parametrize(("frames", "atol"), [(12, 1e-3), (30, 1e-2)])  # of 15 mm; with the lag, less is known
+def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt(frames, atol):
+    """And counts nothing twice: neither what the first pose measured, nor what is known of the landmarks."""
+    scene, last = Scene(frames), frames - 7
     plain = tracked("smoother", scene).estimate()
-    rebuilt = tracked("smoother", scene, lambda k, b: b.revise(lambda z: z) if k in (0, 5) else None).estimate()
-    np.testing.assert_allclose(rebuilt.T_world_left, plain.T_world_left, atol=1e-3)  # of 15 mm
-    np.testing.assert_allclose(rebuilt.positions, plain.positions, atol=1e-3)
+    rebuilt = tracked("smoother", scene, lambda k, b: b.revise(lambda z: z) if k in (0, 5, last) else None).estimate()
+    np.testing.assert_allclose(rebuilt.T_world_left, plain.T_world_left, atol=atol)
+    np.testing.assert_allclose(rebuilt.positions, plain.positions, atol=atol)
+    deviations = [np.sqrt(np.diag(one.covariance)) for one in (rebuilt, plain)]
+    assert (deviations[0] > 0.97 * deviations[1]).all() and (deviations[0] < 2 * deviations[1]).all()
+
+
+def test_batch_counts_what_the_first_pose_measured_once():
+    scene = Scene(2)
+    found, window = (tracked(name, scene).estimate().covariance for name in ("batch", "window"))
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(window)), rtol=0.03)
 
 
 @pytest.mark.parametrize("name", NAMES)
