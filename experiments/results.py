@@ -85,7 +85,8 @@ PAGES = {
     "faults": (
         "Faults",
         "What do blackouts, lost frames, a kidnapped camera, and spoilt images do?",
-        "After each of them the camera is tracked again within some frames, and the path stays within centimetres.",
+        "After each of them the camera is tracked again within some frames, and the path stays within centimetres; "
+        "carried to an unknown place, within a decimetre or so.",
     ),
     "cost": (
         "Cost",
