@@ -22,13 +22,7 @@ T = TypeVar("T")
 
 
 def script_options(script: str, doc: str | None, quick: str | None = None) -> argparse.ArgumentParser:
-    """A parser for a script with ``--quick`` and ``--out DIR``, by default ``results/NAME``.
-
-    Args:
-        script: its file.
-        doc: the docstring of its module.
-        quick: what ``--quick`` does.
-    """
+    """A parser for a script, its file, with ``--quick``, which does `quick`, and ``--out DIR``: ``results/NAME``."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=quick)
     parser.add_argument("--out", type=Path, default=Path("results") / Path(script).stem, metavar="DIR")

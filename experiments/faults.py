@@ -31,7 +31,7 @@ from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
 HEADER = (
-    "fault", "back end", "states", "mean after [cm]", "peak after [cm]", "end [cm]", "frames until relocalised",
+    "fault", "back end", "states", "mean after [cm]", "peak after [cm]", "frames until relocalised",
     "right associations [%]",
 )  # fmt: skip
 
@@ -101,7 +101,7 @@ def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) 
     found = [i for i in range(fault.over, len(results)) if results[i].status.value == "tracked"]
     after = errors[found[0] :] if found else [float("nan")]
     row = [
-        fault.name, backend, states(results), float(np.mean(after)), max(after), errors[-1],
+        fault.name, backend, states(results), float(np.mean(after)), max(after),
         found[0] - fault.over if found else None, check.share,
     ]  # fmt: skip
     return row, errors

@@ -40,13 +40,9 @@ Runs = Callable[[set[tuple[str, ...]]], Iterator[Sequence[Any]]]
 
 
 def resumed(path: Path, header: Sequence[str], keys: Sequence[str], runs: Runs) -> list[dict[str, str]]:
-    """All rows of a CSV file, after those that are missing were appended to it one by one.
+    """All rows of a CSV file with this header, after those that are missing were appended to it one by one.
 
-    Args:
-        path: of the file; it and its folder are made where they are missing.
-        header: names of the columns.
-        keys: columns that tell a run from the others.
-        runs: makes the rows of the runs that are missing, given the keys of those that are there.
+    `keys` are the columns that tell a run from the others; `runs` makes the missing rows, given the keys of the others.
     """
 
     def read() -> list[dict[str, str]]:

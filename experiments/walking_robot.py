@@ -13,36 +13,25 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
 from experiments.tables import show
 from slam.compare.plan import Plan
-from slam.compare.sweep import Run, sweep
+from slam.compare.sweep import sweep
 from slam.registry import ONLINE
 from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.runtime.threads import available_cores
 
-HEADER = ("back end", "frames tracked", "ATE online [mm]", "ATE final [mm]", "path [m]", "landmark error, median [mm]",
-          "landmarks in the map, mean", "NEES / 6")  # fmt: skip
-
-
-def row(run: Run) -> list[str]:
-    """A run's cells of the table."""
-    if not run.completed:
-        return [run.trial.backend, run.outcome, *[""] * (len(HEADER) - 2)]
-    m, path = run.metrics, RunData.read(run.folder, run.trial.backend).online.length
-    return [
-        run.trial.backend,
-        f"{100 * m['tracked']:.0f} %",
-        f"{1e3 * m['ate_online_m']:.1f}",
-        f"{1e3 * m['ate_final_m']:.1f}",
-        f"{path:.2f}",
-        f"{1e3 * m['landmark_error_m']:.0f}",
-        f"{m['map_size']:.0f}",
-        f"{m['nees_per_dof']:.2f}",
-    ]
+#: Columns, and what a figure of a run is multiplied by for them.
+FIGURES = {
+    "frames tracked [%]": ("tracked", 100.0), "ATE online [mm]": ("ate_online_m", 1e3),
+    "ATE final [mm]": ("ate_final_m", 1e3), "landmark error, median [mm]": ("landmark_error_m", 1e3),
+    "NEES / 6": ("nees_per_dof", 1.0),
+}  # fmt: skip
 
 
 def main() -> int:
@@ -52,7 +41,8 @@ def main() -> int:
     plan = Plan(("synthetic:field",), ONLINE, stop=stop, replay=False)
     shutil.rmtree(arguments.out / "runs", ignore_errors=True)  # those of another form or version
     runs = sweep(plan, arguments.out / "runs", available_cores())
-    show(arguments.out / "table.json", HEADER, [row(run) for run in runs])
+    rows = [[r.trial.backend, *(f * r.metrics.get(key, np.nan) for key, f in FIGURES.values())] for r in runs]
+    show(arguments.out / "table.json", ("back end", *FIGURES), rows)
     data = [RunData.read(run.folder, run.trial.backend) for run in runs if run.completed]
     plot(data, arguments.out / "errors.png", "errors")
     return 0
