@@ -99,6 +99,7 @@ EXPERIMENTS = (
         "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
     ),
     Experiment("bars", "recordings", "The back ends beside each other"),
+    Experiment("slide", "recordings", "The slide of features"),
     Experiment("ablation", "recordings", "What each part is worth"),
     Experiment(
         "knee", "recordings", "How many features and landmarks", left_out=("±", "ekf", "window", "CPU extract"),
