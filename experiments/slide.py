@@ -39,7 +39,8 @@ _DEVIATION = 1.4826  # of a normal distribution, in its median absolute values
 def measured(sequence: Sequence, frames: int) -> tuple[list[Array], Array, RectifiedStereo]:
     """By landmark, rows (frame, u, v) of all that was used of it; the path (F, 4, 4), and the projection."""
     found: dict[int, list[tuple[float, ...]]] = defaultdict(list)
-    update, add, stamps = WindowBackend.update, WindowBackend.add, []
+    update, add = WindowBackend.update, WindowBackend.add
+    stamps: list[float] = []
 
     def keep(seen: Observations) -> None:
         for i, uv in zip(seen.ids.tolist(), seen.uv_left.tolist()):
