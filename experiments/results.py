@@ -100,6 +100,12 @@ EXPERIMENTS = (
         "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
     ),
     Experiment("bars", "recordings", "The back ends beside each other"),
+    Experiment(
+        "slide", "recordings", "The slide of features",
+        says="Distance of a left pixel from the epipolar line of an earlier one of the same landmark [px], by the "
+        "angle between the two lines of sight. The variance grows with that angle, as by a random walk of 3 px / √rad "
+        "on drives. Features of MH_01 are aligned with their first sight.",
+    ),
     Experiment("ablation", "recordings", "What each part is worth"),
     Experiment(
         "knee", "recordings", "How many features and landmarks", left_out=("±", "ekf", "window", "CPU extract"),

@@ -65,13 +65,15 @@ class FilterState:
         A feature is found where the image looks like it; from another viewpoint that is another point of the surface. A
         landmark's direction walks at random with the angle between its lines of sight, by `density` [rad / √rad].
         """
+        if not density:
+            return self
         marks, at = self.landmarks.select(rows), self.pose[:3, 3]
         first, now = marks.points - marks.anchors[:, :, 3], marks.points - at
         distance = np.linalg.norm(now, axis=1)
         cosine = np.einsum("ni,ni->n", first, now) / (np.linalg.norm(first, axis=1) * distance)
         turned = np.maximum(marks.turned, np.arccos(np.clip(cosine, -1.0, 1.0)))
         more = turned - marks.turned
-        if not density or not (more > 0).any():
+        if not (more > 0).any():
             return self
         n = now / distance[:, None]
         across = (density**2 * more * distance**2)[:, None, None] * (np.eye(3) - n[:, :, None] * n[:, None, :])
