@@ -189,17 +189,26 @@ class PinholeCamera:
         return np.asarray(kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
 
 
+#: guard: Largest distance of a principal point from the middle of an image, as a share of half its width or height, and
+#: the same of one that is off in one proportion in all directions and cameras, as with images of another size.
+_OFF, _OFF_ALIKE = 0.3, 0.05
+
+
 def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     """What is wrong with a principal point far from the middle of the images; empty if it is near."""
-    for side, camera in (("left", left), ("right", right)):
-        point, middle = np.array([camera.u0, camera.v0]), np.array([camera.width, camera.height]) / 2
-        # 0.2: largest distance of a principal point from the middle of an image, as a share of its width or height.
-        # That of a calibration for images half or twice as large is off by a quarter or a half.
-        if (np.abs(point - middle) > 2 * 0.2 * middle).any():
+    cameras = {"left": left, "right": right}
+    shares = {
+        side: np.array([2 * camera.u0 / (camera.width - 1), 2 * camera.v0 / (camera.height - 1)]) - 1
+        for side, camera in cameras.items()
+    }
+    every = np.concatenate(list(shares.values()))
+    alike = bool(every.min() > _OFF_ALIKE or every.max() < -_OFF_ALIKE)
+    for side, camera in cameras.items():
+        if alike or np.abs(shares[side]).max() > _OFF:
             return (
-                f"the principal point of the {side} camera, ({point[0]:.0f}, {point[1]:.0f}) px, is far from the "
-                f"middle of the images, ({middle[0]:.0f}, {middle[1]:.0f}) px: is the calibration for images of "
-                "another size?"
+                f"the principal point of the {side} camera, ({camera.u0:.0f}, {camera.v0:.0f}) px, is far from the "
+                f"middle of the images, ({camera.width / 2:.0f}, {camera.height / 2:.0f}) px: is the calibration for "
+                "images of another size, or were they cropped or turned, or cx and cy exchanged?"
             )
     return ""
 
