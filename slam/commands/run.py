@@ -101,9 +101,9 @@ def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, qu
     if summary["tracking"]:
         no_picture = "; no picture: no frame has a pose" if picture and not drawn else ""
         print(f"slam: {summary['tracking']}{no_picture}", file=sys.stderr)
-    if summary["doubt"] and not summary["tracking"]:
-        print(f"slam: do not trust this path: {summary['doubt']}", file=sys.stderr)
-    if summary["doubt"]:
+    if doubt := summary.get("doubt"):
+        if not summary["tracking"]:
+            print(f"slam: do not trust this path: {doubt}", file=sys.stderr)
         raise typer.Exit(1)
     if summary["frames"] > 1 and not summary["status"].get("tracked"):
         raise typer.Exit(1)

@@ -11,7 +11,7 @@ import numpy as np
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import CalibrationError, SequenceError
 from slam.geometry.camera import size_doubt
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import StereoRig, baseline_doubt
 from slam.grey_range import eight_bits, grey_range
 from slam.input.grain import grain_doubt
 from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of
@@ -25,11 +25,6 @@ REPEATED = "the images are those of the frame before, byte for byte"
 
 #: guard: plausible times between frames [s]: a thousand frames a second to one in ten seconds.
 SHORTEST, LONGEST = 1e-3, 10.0
-
-#: guard: plausible baselines [m]; others are more often a length in another unit.
-SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
-
-_USUAL = (0.02, 2.0)  # guard: baselines [m] that a unit is proposed for
 
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: successive frames that must show too little before a warning
@@ -66,7 +61,7 @@ class InputWarnings:
         self._fits = np.zeros(1 + 2 * _SHIFTS, int)  # matches if right images are a frame late, early, two late, …
         self._level = 0  # of the same frames, if rows are shifted
         self._grain_warned = False
-        for unlikely, no_path in ((baseline_doubt(rig), True), (size_doubt(rig.left, rig.right), False)):
+        for unlikely, no_path in ((baseline_doubt(rig.baseline), True), (size_doubt(rig.left, rig.right), False)):
             if not unlikely:
                 continue
             self._warn(unlikely, no_path)
@@ -280,16 +275,6 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
         f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
         f"{found.row_offset:.1f} px in the median; {cause}"
     )
-
-
-def baseline_doubt(rig: StereoRig) -> str:
-    """What is wrong with an implausible baseline; empty if it is plausible."""
-    if SHORTEST_BASELINE <= rig.baseline <= LONGEST_BASELINE:
-        return ""
-    metres = {unit: rig.baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
-    likely = [f"unit={unit} makes {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
-    hint = f" ({', '.join(likely)})" if likely else ""
-    return f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres?{hint}"
 
 
 def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:

@@ -8,9 +8,9 @@ import numpy as np
 
 from slam.data import StereoFeatures
 from slam.geometry.arrays import BoolArray
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import StereoRig, baseline_doubt
 from slam.geometry.se3 import Array, inverse, log
-from slam.input.warnings import REPEATED, baseline_doubt
+from slam.input.warnings import REPEATED
 from slam.models import MotionModel
 from slam.run.summary import RunRecord
 from slam.tracks.step import ENOUGH_FEATURES, HIDDEN
@@ -41,12 +41,13 @@ def outcome(
     dropped: int = 0,
     doubt: str = "",
     driving: bool = False,
+    backend: str = "",
 ) -> str:
     """What to say of a run in which many frames were not tracked, with the likely cause; empty for others.
 
     The first frame is not counted: there is no map yet, unless the run began `in_map`. The first of the `warnings` is
     taken for a cause; repeated images are counted instead. `dropped` frames of a live run came too late; `doubt`, of
-    `motion_doubt`, is a cause where nothing else is one.
+    `motion_doubt`, is a cause where nothing else is one. `backend` names one of somebody's own, which may be the cause.
     """
     untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
     frames, missed = len(record.statuses) - 1, len(untracked)
@@ -58,6 +59,8 @@ def outcome(
         cause = _starved(record, untracked, rig, in_map) or doubt
         if not cause and dropped < frames:  # where most came, the gaps are hardly all of it
             cause = _unexplained(record, rig, driving)
+            if backend:
+                cause = f"the back end {backend} (`python -m slam.testing {backend}` checks it); or {cause}"
     causes = [cause] if cause else []
     if frozen:
         causes.append(f"in {record.repeated} of them {REPEATED}")
@@ -97,7 +100,7 @@ def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map
             f"in the median of these frames {stereo:.0f} of {features:.0f} features are found in the right image: "
             "check that the images are of two cameras, the left one first, and the calibration"
         )
-    return baseline_doubt(rig)
+    return baseline_doubt(rig.baseline)
 
 
 def _unexplained(record: RunRecord, rig: StereoRig, driving: bool) -> str:

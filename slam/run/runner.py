@@ -282,7 +282,8 @@ class _Run:
         no_path = scale_doubt(record, rig, driving) or moment_doubt(record) or getattr(calibration, "doubt", "")
         doubt = no_path or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
-        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving)
+        own = options.backend if ":" in options.backend else ""
+        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own)
         if doubt and not tracking:
             logger.warning("%s", doubt)
         return {

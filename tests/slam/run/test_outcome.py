@@ -59,6 +59,7 @@ AGAIN = "features are found in both images, but not again in the next frame"
         ((200, 150), 0.12, {"dropped": 1}, AGAIN),
         ((200, 150), 0.12, {"dropped": 2, "warnings": ["A"]}, "A; and 2 frames were dropped, and the frames about"),
         ((200, 150), 0.12, {}, AGAIN),
+        ((200, 150), 0.12, {"backend": "a:B"}, "the back end a:B (`python -m slam.testing a:B` checks it); or feat"),
         ((200, 0), 0.12, {"in_map": True}, "the camera is not where the map was made"),
         ((200, 3), 0.12, {"warnings": ["left and right look swapped", "more"]}, "left and right look swapped"),
     ],
