@@ -54,7 +54,7 @@ def _causes(model: RigModel, covariance: Array, evidence: Evidence, whose: str) 
         cause = "were the coefficients left out?"
     yield gain, f"the images show a lens distortion that is not in the {whose} (k1 about {-k1:+.2f}): {cause}"
     gain, shift = freed(("left_cx", "right_cx"), ("left_cy", "right_cy"))
-    much = f"about {model.focal * np.hypot(*shift):.0f} px from the {whose}'s"
+    much = f"about {model.focal * np.linalg.norm(shift):.0f} px from the {whose}'s"
     cause = "were they cropped, or is it for images of another size?"
     yield gain, f"the images fit a principal point {much}: {cause}"
     gain, (offset,) = freed(("right_cx",))
@@ -62,6 +62,6 @@ def _causes(model: RigModel, covariance: Array, evidence: Evidence, whose: str) 
     cause = "was the right image cropped or shifted, or a camera turned since?"
     yield gain, f"the images fit disparities {much}: {cause}"
     gain, turn = freed(("pitch",), ("roll",))
-    much = f"turned by about {np.degrees(np.hypot(*turn)):.1f}° against the {whose}'s"
+    much = f"turned by about {np.degrees(np.linalg.norm(turn)):.1f}° against the {whose}'s"
     cause = "was a camera moved since, or is its rotation the inverse one?"
     yield gain, f"the images fit a right camera that is {much}: {cause}"
