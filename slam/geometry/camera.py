@@ -189,6 +189,22 @@ class PinholeCamera:
         return np.asarray(kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
 
 
+#: guard: plausible baselines [m]; others are more often a length in another unit.
+_SHORTEST, _LONGEST = 0.005, 10.0
+
+_USUAL = (0.02, 2.0)  # guard: baselines [m] that a unit is proposed for
+
+
+def baseline_doubt(baseline: float) -> str:
+    """What is wrong with an implausible baseline; empty if it is plausible."""
+    if _SHORTEST <= baseline <= _LONGEST:
+        return ""
+    metres = {unit: baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
+    likely = [f"unit={unit} makes {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
+    hint = f" ({', '.join(likely)})" if likely else ""
+    return f"the cameras are {baseline:g} m apart by their calibration: is it in metres?{hint}"
+
+
 #: guard: Largest distance of a principal point from the middle of an image, as a share of half its width or height, and
 #: the same of one that is off in one proportion in all directions and cameras, as with images of another size.
 _OFF, _OFF_ALIKE = 0.3, 0.05

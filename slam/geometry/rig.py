@@ -10,26 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam.errors import CalibrationError
-from slam.geometry.camera import PinholeCamera, floats, size_doubt
+from slam.geometry.camera import PinholeCamera, baseline_doubt, floats, size_doubt
 from slam.geometry.se3 import Array, nearest_rotation
 
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
 MINIMAL_POINTS = 3  #: fixed: points that fix a pose
-
-#: guard: plausible baselines [m]; others are more often a length in another unit.
-_SHORTEST, _LONGEST = 0.005, 10.0
-
-_USUAL = (0.02, 2.0)  # guard: baselines [m] that a unit is proposed for
-
-
-def baseline_doubt(baseline: float) -> str:
-    """What is wrong with an implausible baseline; empty if it is plausible."""
-    if _SHORTEST <= baseline <= _LONGEST:
-        return ""
-    metres = {unit: baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
-    likely = [f"unit={unit} makes {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
-    hint = f" ({', '.join(likely)})" if likely else ""
-    return f"the cameras are {baseline:g} m apart by their calibration: is it in metres?{hint}"
 
 
 def measurement_rows(uv_left: Array, uv_right: Array) -> Array:

@@ -10,8 +10,8 @@ import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import CalibrationError, SequenceError
-from slam.geometry.camera import size_doubt
-from slam.geometry.rig import StereoRig, baseline_doubt
+from slam.geometry.camera import baseline_doubt, size_doubt
+from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
 from slam.input.grain import grain_doubt
 from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of

@@ -8,7 +8,8 @@ import numpy as np
 
 from slam.data import StereoFeatures
 from slam.geometry.arrays import BoolArray
-from slam.geometry.rig import StereoRig, baseline_doubt
+from slam.geometry.camera import baseline_doubt
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log
 from slam.input.warnings import REPEATED
 from slam.models import MotionModel
