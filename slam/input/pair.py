@@ -136,8 +136,10 @@ def _shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right
 def _share(before: Array, after: Array, believed: float) -> float:
     """Share of the change from row differences `before` to those `after` (N,) [px] that is seen, by least squares.
 
-    1 where it is not certainly less than what is `believed`.
+    1 where it is not certainly less than what is `believed`, or rows do not agree before.
     """
+    if not np.nanmedian(np.abs(before)) < _ROWS_AGREE:
+        return 1.0
     good = np.minimum(np.abs(before), np.abs(after)) < _TOLERANCE  # NaN is not
     before, change = before[good], (before - after)[good]
     whole = float(change @ change)

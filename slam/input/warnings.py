@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -158,7 +160,7 @@ class InputWarnings:
         elif not self._pair_is_right and self._before and own.shown < 1:
             if len(self._before) == _SHIFTS:  # hardly a feature fits then, and of another moment's some may by chance
                 self._pair_warned = True
-                self._warn(_rows_differ(own, self._rig), no_path=True)
+                self._warn(self._rows_differ(images, own), no_path=True)
         elif self._before and (not self._moment_is_right or own.as_given < _FITS * own.matches):
             self._check_moment(images, own)
         self._partners_explained |= self._pair_warned  # the reason is known then
@@ -191,7 +193,21 @@ class InputWarnings:
             self._pair_is_right = True
             if own.rows_differ:
                 self._pair_warned = True
-                self._warn(_rows_differ(own, self._rig), no_path=True)
+                self._warn(self._rows_differ(images, own), no_path=True)
+
+    def _rows_differ(self, images: _Images, own: PairGeometry) -> str:
+        """That rows do not agree, and the likely cause."""
+        rig = self._rig
+        if not rig.is_rectified and images.left is not None and images.right is not None:
+            with suppress(CalibrationError):
+                inverse = pair_geometry(replace(rig, R=rig.R.T), images.left, images.right, self._rows)
+                if not inverse.rows_differ and most(inverse.as_given, own.as_given):
+                    return (
+                        f"rows of left and right image agree with the inverse of the calibration's rotation, "
+                        f"{inverse.as_given} features, and {own.as_given} as it is: is R transposed, or from the right "
+                        "camera to the left one?"
+                    )
+        return _rows_differ(own, rig)
 
     def _geometry(self, left: _Images, right: _Images) -> PairGeometry | None:
         """How one frame's left image fits another's right one; None where an image is missing or unusable."""
@@ -261,7 +277,7 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
     if found.turned:
         cause = "the images are turned by 90°, or the cameras stand above each other: turn both, or calibrate them so"
-    elif rig.is_rectified:
+    elif not (rig.left.has_distortion or rig.right.has_distortion or np.abs(rig.R - np.eye(3)).max() > 1e-9):
         cause = "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
     elif found.shown < 1:
         return (

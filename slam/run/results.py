@@ -172,7 +172,7 @@ def facts(summary: Mapping[str, Any]) -> str:
     shown = [m for m in METRICS if "picture" in m.shown and found.get(m.key)]
     words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
     doubt = "do not trust this path, see the run's warnings" if summary.get("doubt") else ""
-    return "; ".join(filter(None, [doubt, *words, verdict_of_run(summary)]))
+    return "; ".join(filter(None, [doubt, *words, verdict_of_run(summary).partition(" (")[0]]))
 
 
 def _measured(summary: Mapping[str, Any]) -> int:

@@ -293,6 +293,14 @@ def test_swapped_cameras_of_an_unrectified_rig():
     assert bad.swapped
 
 
+def test_a_transposed_rotation_is_named():
+    """It was taken for images that are rectified twice."""
+    rig = unlike_cameras([0.02, 0.12, -0.02], (-0.1, 0.02), (-0.12, 0.02))
+    frames = every(3, seen_by_both(rig.left, rig.right, rig.R))
+    (line,) = lines(frames, rig=slam.StereoRig(rig.left, rig.right, rig.R.T, rig.b))
+    assert "agree with the inverse of the calibration's rotation" in line
+
+
 def test_images_undistorted_but_not_rectified_before_are_named():
     plain = [replace(camera, model="none", distortion=()) for camera in (DISTORTED.left, DISTORTED.right)]
     said = lines(every(3, seen_by_both(*plain, DISTORTED.R)), rig=DISTORTED)
