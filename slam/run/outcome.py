@@ -178,19 +178,19 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     )
 
 
-def row_flow(features: StereoFeatures, T_before_now: Array, rig: StereoRig) -> tuple[float, float]:
+def row_flow(features: StereoFeatures, T_other_now: Array, rig: StereoRig) -> tuple[float, float]:
     """Sums of products over a frame's features: vertical disparity times flow, and flow times flow [px²].
 
-    The flow is how many rows a still point moves in the left image from the frame before, by the motion between, of
-    which `T_before_now` (4, 4) is the inverse. The right images of an earlier time are off by a share of it.
+    The flow is how many rows a still point moves in the left image from another frame to this one; `T_other_now` (4, 4)
+    takes this frame's camera coordinates to the other's. A right image from between them is off by a share of it.
     """
     rows, rectified, R = np.flatnonzero(features.has_stereo), rig.rectified, rig.rectified.R_left
     left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
     with np.errstate(all="ignore"):
         points = rectified.rig.triangulate(left, np.column_stack([right[:, 0], left[:, 1]]))
-        there = (points @ R @ T_before_now[:3, :3].T + T_before_now[:3, 3]) @ R.T
-        before = rectified.rig.left.project(there)
-    flow, vertical = left[:, 1] - before[:, 1], right[:, 1] - left[:, 1]
+        there = (points @ R @ T_other_now[:3, :3].T + T_other_now[:3, 3]) @ R.T
+        other = rectified.rig.left.project(there)
+    flow, vertical = left[:, 1] - other[:, 1], right[:, 1] - left[:, 1]
     good = np.isfinite(flow + vertical) & (np.abs(flow) < _FLOW)
     return float(flow[good] @ vertical[good]), float(flow[good] @ flow[good])
 
@@ -198,24 +198,22 @@ def row_flow(features: StereoFeatures, T_before_now: Array, rig: StereoRig) -> t
 def moment_doubt(record: RunRecord) -> str:
     """What to say where rows of left and right features differ as they do between images of two moments.
 
-    The lag of the right images, in frames, is the regression of vertical disparities on the flow along columns. Rows
-    that differ because of the calibration do so in the same way whatever the motion is.
+    The lag of the right images, in frames, is the regression of vertical disparities on the flow along columns from the
+    frame before; how early they are, on that from the frame after. Rows that differ because of the calibration do so in
+    the same way whatever the motion is.
     """
-    flows = np.array(record.row_flows).reshape(-1, 2)
-    lags = []
-    while len(flows) >= _LEAST_FLOWS:  # of all frames, of the last half, … : an image may be missing in the middle
-        products, squares = flows.T
-        lag = -products.sum() / max(squares.sum(), np.finfo(float).tiny)
-        if abs(lag) * squares.sum() > _LAG_SIGMAS * np.sqrt(np.square(products + lag * squares).sum()):
-            lags.append(lag)
-        flows = flows[len(flows) // 2 :]
-    lag = max(lags, key=abs, default=0.0)
-    if abs(lag) < _LAG:
-        return ""
-    return (
-        f"left and right image are not of one moment: rows of their features differ with the motion, as if right "
-        f"images were {'late' if lag > 0 else 'early'} by a part of a frame or more; pair them by their times, and let "
-        "one camera trigger the other"
+    found = {"": _LAG}
+    for word, flows in zip(("late", "early"), np.array(record.row_flows).reshape(-1, 2, 2).swapaxes(0, 1)):
+        while len(flows) >= _LEAST_FLOWS:  # of all frames, of the last half, … : an image may be missing in the middle
+            products, squares = flows.T
+            lag = -products.sum() / max(squares.sum(), np.finfo(float).tiny)
+            if lag * squares.sum() > _LAG_SIGMAS * np.sqrt(np.square(products + lag * squares).sum()):
+                found[word] = max(lag, found.get(word, 0.0))
+            flows = flows[len(flows) // 2 :]
+    word = max(found, key=lambda word: found[word])
+    return word and (
+        "left and right image are not of one moment: rows of their features differ with the motion, as if right images "
+        f"were {word} by a part of a frame or more; pair them by their times, and let one camera trigger the other"
     )
 
 

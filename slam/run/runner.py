@@ -146,6 +146,7 @@ class _Run:
                 reading[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
                 yield frame
 
+        before: FrameResult | None = None
         for frame, result in system.run(timed()):
             result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
             if self.live is not None:
@@ -153,9 +154,11 @@ class _Run:
             if frame.right is None:
                 record.without_right.append(len(record.statuses))
             record.depths.append(median_depth(result.features, system.rig))
-            if result.status.measured and record.measured and record.measured[-1]:
-                step = inverse(record.poses[-1]) @ result.estimate.T_world_left
-                record.row_flows.append(row_flow(result.features, step, system.rig))
+            if result.status.measured and before is not None and before.status.measured:
+                step = inverse(before.estimate.T_world_left) @ result.estimate.T_world_left
+                late = row_flow(result.features, step, system.rig)
+                record.row_flows.append((*late, *row_flow(before.features, inverse(step), system.rig)))
+            before = result
             yield frame.index, result
             for watch in watches:
                 watch(frame, result, system)

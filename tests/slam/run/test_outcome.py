@@ -149,9 +149,11 @@ def test_right_images_of_another_moment_are_known_by_rows_that_follow_the_motion
         points = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], (200, 3))  # in the frame's camera axes
         step = exp(rng.normal(0, 1, 6) * [0.006, 0.006, 0.006, 0.01, 0.01, 0.01])  # from now to the frame before
         left, right = RIG.project(points)
-        before = RIG.left.project(points @ step[:3, :3].T + step[:3, 3])
-        right[:, 1] += late * (before - left)[:, 1] + 0.4 + rng.normal(0, 0.1, len(points))
-        run.row_flows.append(row_flow(features_at(left, right), step, RIG))
+        after = exp(rng.normal(0, 1, 6) * [0.006, 0.006, 0.006, 0.01, 0.01, 0.01])
+        there = points @ (step if late > 0 else after)[:3, :3].T + (step if late > 0 else after)[:3, 3]
+        right[:, 1] += abs(late) * (RIG.left.project(there) - left)[:, 1] + 0.4 + rng.normal(0, 0.1, len(points))
+        features = features_at(left, right)
+        run.row_flows.append((*row_flow(features, step, RIG), *row_flow(features, after, RIG)))
     said = moment_doubt(run)
     assert bool(said) == bool(word) and f"right images were {word} by" in (said or "right images were  by")
 
