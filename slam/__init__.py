@@ -7,7 +7,6 @@ everything else is loaded when it is used.
 from __future__ import annotations
 
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from slam.version import __version__ as __version__
@@ -59,7 +58,7 @@ __all__ = sorted(_PUBLIC)
 
 def __dir__() -> list[str]:
     """The public names, and the attributes of every module."""
-    return sorted({*_PUBLIC, *(n for n, v in globals().items() if n.startswith("__") or isinstance(v, ModuleType))})
+    return sorted({*_PUBLIC, *(name for name in globals() if name.startswith("__"))})
 
 
 def __getattr__(name: str) -> Any:

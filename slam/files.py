@@ -212,7 +212,9 @@ def expanded(text: str | Path, error: type[SlamError] = SequenceError) -> Path:
 
 
 def reason(fault: OSError) -> str:
-    """The operating system's message of a failure, without its number."""
+    """The operating system's message of a failure, without its number; the usual one in our words."""
+    if isinstance(fault, FileNotFoundError):
+        return "there is no such file or folder"
     return fault.strerror or str(fault)
 
 

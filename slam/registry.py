@@ -78,7 +78,9 @@ def resolve(role: str, name: str) -> Any:
         return getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
         where, package = "", (error.name or "").partition(".")[0]
-        if package in BUILT_IN:
+        if own and ("/" in module or module.endswith(".py")):
+            where = f": give the module's name, {Path(module).stem}:{attribute}, in the folder of its file"
+        elif package in BUILT_IN:
             where = f": {_hidden(package) or f'`{package}` is the package of slam, so call yours by another name'}"
         elif own and package == module.partition(".")[0]:
             where = f"; looked for in {Path.cwd()}, where `slam` runs, among the installed packages, and in PYTHONPATH"

@@ -348,6 +348,11 @@ class StereoSlam:
         said = self._extractor.input_warnings
         return [*said.lines, *filter(None, [said.repeated])]
 
+    @property
+    def doubt(self) -> str:
+        """Why no path by these images can be trusted, one of the `warnings`; empty where none says so."""
+        return self._extractor.input_warnings.doubt
+
     def __getstate__(self) -> dict[str, object]:
         """State for copying and pickling; refused while another thread is in a step."""
         with self._stepping:

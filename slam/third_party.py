@@ -28,6 +28,7 @@ _ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
     "patches": (Patches, {"images": ("n", "s", "s"), "centres": ("n", 2), "size": ("n",)}),
     "align": (tuple, {}),
 }
+_DATA = (Prediction, UpdateReport, Estimate, Patches)
 _IDS, _FINITE = ("ids", "used", "rejected"), ("T_world_left", "covariance", "positions", "covariances", "real")
 _COVARIANCES = ("covariance", "covariances", "innovation")
 
@@ -40,7 +41,8 @@ def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
     """
     what, (kind, attributes) = f"{type(owner).__name__}.{method}", _ANSWERS[method]
     if not isinstance(answer, kind):
-        raise SlamError(f"{what}: must be of type {kind.__name__}, got {type(answer).__name__}")
+        hint = f" (see slam.{kind.__module__.removeprefix('slam.')}.{kind.__name__})" if kind in _DATA else ""
+        raise SlamError(f"{what}: must be of type {kind.__name__}, got {type(answer).__name__}{hint}")
     for name, wanted in attributes.items():
         value, where = getattr(answer, name), what if name == "real" else f"{what}: {name}"
         if isinstance(wanted, tuple):

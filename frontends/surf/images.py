@@ -60,7 +60,8 @@ def grey(image: NDArray, what: str = "image") -> NDArray:
             f"{what}: is {image[()]!r:.40} and no array; of a file it cannot read, cv2.imread gives None"
         )
     if image.dtype.newbyteorder("=") not in _FULL_SCALE:
-        raise SequenceError(f"{what}: pixels must be uint8 or uint16, not {image.dtype}")
+        hint = "; of values from 0 to 1: (255 * image).astype(np.uint8)" if image.dtype.kind == "f" else ""
+        raise SequenceError(f"{what}: pixels must be uint8 or uint16, not {image.dtype}{hint}")
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.ndim not in (2, 3) or channels not in (1, 3, 4):
         raise SequenceError(f"{what}: shape {image.shape} is not (H, W), (H, W, 3) or (H, W, 4)")

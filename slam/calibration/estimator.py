@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
+from slam.calibration.conflict import conflict
 from slam.calibration.model import Revision, RigCorrection, RigModel
 from slam.calibration.pairs import View, match, noise_variances, pair_evidence, pair_of, parallax
 from slam.calibration.posterior import (
@@ -109,20 +110,13 @@ class SelfCalibration:
 
     @property
     def doubt(self) -> str:
-        """What is wrong with focal lengths that the motion contradicts by far, in a line; empty where it does not.
-
-        Errors beyond 5 standard deviations of what is allowed to a calibration are none of it: the true ones are larger
-        still, as the prior holds them back.
-        """
-        error = float(self._focal @ (self._own.mean - self._prior.mean))
-        allowed = np.sqrt(self._focal @ (self._prior.covariances[-1] + self.posterior.covariance) @ self._focal)
-        if abs(error) <= 5 * allowed:
+        """What the images contradict by far in the calibration, in a line; empty where they do not."""
+        rows, moved = self._rows.total(), self._moved()
+        if rows is None:
             return ""
-        return (
-            f"the images fit a focal length at least {abs(100 * error):.1f} % {'shorter' if error > 0 else 'longer'} "
-            f"than the {'' if self._kept is None else 'kept '}calibration's: is it of this camera, and for images of "
-            "this size?"
-        )
+        found = rows if moved is None else rows + moved
+        found = found._replace(e=found.e - found.S @ self._prior.mean)
+        return conflict(self.model, self._prior.covariances[-1], found, f"{'kept ' if self._kept else ''}calibration")
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Apply the present posterior to features from now on; returns the change, or None.

@@ -72,7 +72,7 @@ def unit_of(row: dict[str, Any], focal: float) -> tuple[float, str]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    """The table, and what it says."""
+    """What the recordings say, and the table."""
     console, apart, recordings = Console(), found["apart"], found["recordings"]
     if not console.is_terminal:  # a file or a pipe is not 80 columns wide
         console = Console(width=_NARROW + _COLUMN * (1 + len(recordings)))
@@ -91,6 +91,8 @@ def _print(found: dict[str, Any]) -> None:
         if apart:
             cells.append(f"{apart[k]:.1f} σ" if np.isfinite(apart[k]) else "–")
         table.add_row(row["name"], unit, *cells, f"± {factor * found['usual'][k]:.2g}")
+    for text in filter(None, (found["judgement"], found["agreement"])):
+        console.print(text, markup=False, highlight=False)
     console.print(table)
     console.print(_SIGN, highlight=False)
     for number, one in enumerate(recordings, 1):
@@ -99,5 +101,3 @@ def _print(found: dict[str, Any]) -> None:
         if unsolved:
             tells += f"; in {unsolved} others too few features agree on one motion of the camera"
         console.print(f"({number}) {one['sequence']}: {one['frames']} frames, {tells}", markup=False)
-    for text in filter(None, (found["judgement"], found["agreement"])):
-        console.print(text, markup=False, highlight=False)

@@ -70,6 +70,10 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     with one_line_errors():
         logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+        notes, handler = logging.getLogger("slam.runtime.compilation"), logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("slam: %(message)s"))
+        notes.addHandler(handler)
+        notes.propagate = False  # that kernels are compiled is no warning
         require_address_space()
         app(prog_name="slam")
 

@@ -87,7 +87,8 @@ def frame_count(sequence: StereoSequence, start: int, stop: int | None) -> int |
 def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, quiet: bool) -> None:
     """Leave the picture of a run and print its table, its files, and a line where many frames were not tracked.
 
-    The first of `written` is its folder. The exit status is 1 where no frame was tracked, or none was run.
+    The first of `written` is its folder. The exit status is 1 where no frame was tracked, none was run, or the path
+    cannot be trusted, which the last line says.
     """
     folder, drawn = written[0].path, "path_length_m" in summary  # where a frame has a pose
     if not summary["frames"]:
@@ -100,6 +101,10 @@ def finish(summary: dict[str, Any], written: Sequence[Output], picture: bool, qu
     if summary["tracking"]:
         no_picture = "; no picture: no frame has a pose" if picture and not drawn else ""
         print(f"slam: {summary['tracking']}{no_picture}", file=sys.stderr)
+    if doubt := summary.get("doubt"):
+        if not summary["tracking"]:
+            print(f"slam: do not trust this path: {doubt}", file=sys.stderr)
+        raise typer.Exit(1)
     if summary["frames"] > 1 and not summary["status"].get("tracked"):
         raise typer.Exit(1)
 

@@ -189,17 +189,42 @@ class PinholeCamera:
         return np.asarray(kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
 
 
+#: guard: plausible baselines [m]; others are more often a length in another unit.
+_SHORTEST, _LONGEST = 0.005, 10.0
+
+_USUAL = (0.02, 2.0)  # guard: baselines [m] that a unit is proposed for
+
+
+def baseline_doubt(baseline: float) -> str:
+    """What is wrong with an implausible baseline; empty if it is plausible."""
+    if _SHORTEST <= baseline <= _LONGEST:
+        return ""
+    metres = {unit: baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
+    likely = [f"unit={unit} makes {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
+    hint = f" ({', '.join(likely)})" if likely else ""
+    return f"the cameras are {baseline:g} m apart by their calibration: is it in metres?{hint}"
+
+
+#: guard: Largest distance of a principal point from the middle of an image, as a share of half its width or height, and
+#: the same of one that is off in one proportion in all directions and cameras, as with images of another size.
+_OFF, _OFF_ALIKE = 0.3, 0.05
+
+
 def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
     """What is wrong with a principal point far from the middle of the images; empty if it is near."""
-    for side, camera in (("left", left), ("right", right)):
-        point, middle = np.array([camera.u0, camera.v0]), np.array([camera.width, camera.height]) / 2
-        # 0.2: largest distance of a principal point from the middle of an image, as a share of its width or height.
-        # That of a calibration for images half or twice as large is off by a quarter or a half.
-        if (np.abs(point - middle) > 2 * 0.2 * middle).any():
+    cameras = {"left": left, "right": right}
+    shares = {
+        side: np.array([2 * camera.u0 / (camera.width - 1), 2 * camera.v0 / (camera.height - 1)]) - 1
+        for side, camera in cameras.items()
+    }
+    every = np.concatenate(list(shares.values()))
+    alike = bool(every.min() > _OFF_ALIKE or every.max() < -_OFF_ALIKE)
+    for side, camera in cameras.items():
+        if alike or np.abs(shares[side]).max() > _OFF:
             return (
-                f"the principal point of the {side} camera, ({point[0]:.0f}, {point[1]:.0f}) px, is far from the "
-                f"middle of the images, ({middle[0]:.0f}, {middle[1]:.0f}) px: is the calibration for images of "
-                "another size?"
+                f"the principal point of the {side} camera, ({camera.u0:.0f}, {camera.v0:.0f}) px, is far from the "
+                f"middle of the images, ({camera.width / 2:.0f}, {camera.height / 2:.0f}) px: is the calibration for "
+                "images of another size, or were they cropped or turned, or cx and cy exchanged?"
             )
     return ""
 

@@ -40,6 +40,8 @@ class PairGeometry:
     at_same_place: int = 0  # at one and the same pixel of both images, as they are, not rectified
     off_rows: int = 0  # whose rows differ, by more than the front end finds reliably
     row_offset: float = 0.0  # median difference of their rows [px]
+    level: int = 0  # as_given, if all rows of the right image are shifted by the median difference
+    along_columns: int = 0  # with a disparity along columns alone, as of images that are turned
     shown: float = 1.0  # share of what rectification does to rows that the images show; 1 where that may be all
 
     @property
@@ -52,6 +54,11 @@ class PairGeometry:
     def same(self) -> bool:
         """Most matches are at the same place in both images."""
         return self.conclusive and most(self.at_same_place, self.matches - self.at_same_place)
+
+    @property
+    def turned(self) -> bool:
+        """Most matches have a disparity along columns alone."""
+        return self.conclusive and most(self.along_columns, self.matches - self.along_columns)
 
     @property
     def rows_differ(self) -> bool:
@@ -90,6 +97,7 @@ def pair_geometry(rig: StereoRig, left: Points, right: Points, rows: float) -> P
     a, b = (uv[inliers] for uv in pixels)
     band = max(rows, _TOLERANCE)
     shift, offset = _offsets(rig, a, b)
+    middle = float(np.nanmedian(offset)) if np.isfinite(offset).any() else 0.0
     shift_swapped, offset_swapped = _offsets(rig, b, a)
     return PairGeometry(
         len(a),
@@ -99,6 +107,8 @@ def pair_geometry(rig: StereoRig, left: Points, right: Points, rows: float) -> P
         int((np.abs(b - a).max(axis=1) <= _TOLERANCE).sum()),
         int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
+        int(((shift > _TOLERANCE) & (np.abs(offset - middle) <= band)).sum()),
+        int(((np.abs(shift) <= _TOLERANCE) & (np.abs(offset) > band)).sum()),
         1.0 if rig.is_rectified else _shown(rig, a, b, left.image, right.image),
     )
 
@@ -126,8 +136,10 @@ def _shown(rig: StereoRig, uv_left: Array, uv_right: Array, left: NDArray, right
 def _share(before: Array, after: Array, believed: float) -> float:
     """Share of the change from row differences `before` to those `after` (N,) [px] that is seen, by least squares.
 
-    1 where it is not certainly less than what is `believed`.
+    1 where it is not certainly less than what is `believed`, or rows do not agree before.
     """
+    if not np.nanmedian(np.abs(before)) < _ROWS_AGREE:
+        return 1.0
     good = np.minimum(np.abs(before), np.abs(after)) < _TOLERANCE  # NaN is not
     before, change = before[good], (before - after)[good]
     whole = float(change @ change)

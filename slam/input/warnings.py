@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import CalibrationError, SequenceError
-from slam.geometry.camera import size_doubt
+from slam.geometry.camera import baseline_doubt, size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
+from slam.input.grain import grain_doubt
 from slam.input.pair import NO_DISPARITY, PairGeometry, Points, most, pair_geometry, points_of
 from slam.models import EstimatorModels
 from slam.tracks.step import ENOUGH_FEATURES
@@ -24,11 +27,6 @@ REPEATED = "the images are those of the frame before, byte for byte"
 
 #: guard: plausible times between frames [s]: a thousand frames a second to one in ten seconds.
 SHORTEST, LONGEST = 1e-3, 10.0
-
-#: guard: plausible baselines [m]; others are more often a length in another unit.
-SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
-
-_USUAL = (0.02, 2.0)  # guard: baselines [m] that a unit is proposed for
 
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: successive frames that must show too little before a warning
@@ -50,6 +48,7 @@ class InputWarnings:
 
     def __init__(self, rig: StereoRig, models: EstimatorModels, rows: float) -> None:
         self.lines: list[str] = []  # the warnings so far
+        self.doubt = ""  # the first of those after which no path can be trusted
         self.repeated = ""  # the warning of repeated images
         self._rig, self._rows = rig, rows
         self._farthest = farthest_apart(rig, models)
@@ -62,8 +61,12 @@ class InputWarnings:
         self._last_copy = ""  # why its right image was a copy
         self._before: deque[_Images] = deque(maxlen=_SHIFTS)  # the frames before, the last one first
         self._fits = np.zeros(1 + 2 * _SHIFTS, int)  # matches if right images are a frame late, early, two late, …
-        for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig.left, rig.right))):
-            self._warn(unlikely)
+        self._level = 0  # of the same frames, if rows are shifted
+        self._grain_warned = False
+        for unlikely, no_path in ((baseline_doubt(rig.baseline), True), (size_doubt(rig.left, rig.right), False)):
+            if not unlikely:
+                continue
+            self._warn(unlikely, no_path)
             self._pair_warned = self._partners_explained = True  # and what follows from it is not
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
@@ -73,7 +76,11 @@ class InputWarnings:
         right, features fit the rig the other way round, and hardly any has a right match as it is.
         """
         own, images = None, _Images(frame, self._rig)
-        if self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK and not self._pair_warned:  # 0, 1, 2, 4 …
+        looked_at = self._count & (self._count - 1) == 0 and self._count <= _LAST_LOOK  # 0, 1, 2, 4 …
+        if looked_at and not self._grain_warned and (grain := grain_doubt(frame.left)):
+            self._grain_warned = True
+            self._warn(grain)
+        if looked_at and not self._pair_warned:
             own = self._geometry(images, images)
             unpaired = 10 * int(features.has_stereo.sum()) < len(features)
             if own is not None and not self._pair_is_right and own.swapped and unpaired:
@@ -149,11 +156,11 @@ class InputWarnings:
                 f"left and right image show the same: {own.at_same_place} of {own.matches} features have no "
                 f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
             )
-            self._warn(_swapped(own) if own.swapped else same)
+            self._warn(_swapped(own) if own.swapped else same, no_path=True)
         elif not self._pair_is_right and self._before and own.shown < 1:
             if len(self._before) == _SHIFTS:  # hardly a feature fits then, and of another moment's some may by chance
                 self._pair_warned = True
-                self._warn(_rows_differ(own, self._rig))
+                self._warn(self._rows_differ(images, own), no_path=True)
         elif self._before and (not self._moment_is_right or own.as_given < _FITS * own.matches):
             self._check_moment(images, own)
         self._partners_explained |= self._pair_warned  # the reason is known then
@@ -164,8 +171,9 @@ class InputWarnings:
         fits = [other.as_given for other in others if other is not None]
         if len(fits) == len(others):
             self._fits[: 1 + len(fits)] += [own.as_given, *fits]
+            self._level += own.level
         fit, *shifted = self._fits.tolist()
-        if most(max(shifted), fit):
+        if most(max(shifted), fit) and not most(self._level, max(shifted)):
             self._pair_warned = True
             at = int(np.argmax(shifted))
             which, wrong = ("after", "early") if at % 2 else ("before", "late")
@@ -174,17 +182,32 @@ class InputWarnings:
             self._warn(
                 f"{since}: {max(shifted)} features fit the rig with the left image {frames} {which}, {fit} with that "
                 f"of the same frame, {self._count}; the right images are {frames} too {wrong}: pair them by their "
-                f"times, or shift their numbers by {number}"
+                f"times, or shift their numbers by {number}",
+                no_path=True,
             )
             return
         if all(most(fit, other) for other in shifted):
             self._moment_is_right = True
-            self._fits[:] = 0  # what comes later is counted anew
+            self._fits[:] = self._level = 0  # what comes later is counted anew
         if own.conclusive and not self._pair_is_right and (not own.rows_differ or len(self._before) == _SHIFTS):
             self._pair_is_right = True
             if own.rows_differ:
                 self._pair_warned = True
-                self._warn(_rows_differ(own, self._rig))
+                self._warn(self._rows_differ(images, own), no_path=True)
+
+    def _rows_differ(self, images: _Images, own: PairGeometry) -> str:
+        """That rows do not agree, and the likely cause."""
+        rig = self._rig
+        if not rig.is_rectified and images.left is not None and images.right is not None:
+            with suppress(CalibrationError):
+                inverse = pair_geometry(replace(rig, R=rig.R.T), images.left, images.right, self._rows)
+                if not inverse.rows_differ and most(inverse.as_given, own.as_given):
+                    return (
+                        f"rows of left and right image agree with the inverse of the calibration's rotation, "
+                        f"{inverse.as_given} features, and {own.as_given} as it is: is R transposed, or from the right "
+                        "camera to the left one?"
+                    )
+        return _rows_differ(own, rig)
 
     def _geometry(self, left: _Images, right: _Images) -> PairGeometry | None:
         """How one frame's left image fits another's right one; None where an image is missing or unusable."""
@@ -237,8 +260,9 @@ class InputWarnings:
             )
             logger.warning("%s", self.repeated)
 
-    def _warn(self, line: str) -> None:
+    def _warn(self, line: str, no_path: bool = False) -> None:
         self.lines.append(line)
+        self.doubt = self.doubt or (line if no_path else "")
         logger.warning("%s", line)
 
 
@@ -251,7 +275,9 @@ def _swapped(found: PairGeometry) -> str:
 
 def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
     """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
-    if rig.is_rectified:
+    if found.turned:
+        cause = "the images are turned by 90°, or the cameras stand above each other: turn both, or calibrate them so"
+    elif not (rig.left.has_distortion or rig.right.has_distortion or np.abs(rig.R - np.eye(3)).max() > 1e-9):
         cause = "were they rectified, as this calibration says (no distortion or rotation), and are they of one moment?"
     elif found.shown < 1:
         return (
@@ -265,16 +291,6 @@ def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
         f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
         f"{found.row_offset:.1f} px in the median; {cause}"
     )
-
-
-def baseline_doubt(rig: StereoRig) -> str:
-    """What is wrong with an implausible baseline; empty if it is plausible."""
-    if SHORTEST_BASELINE <= rig.baseline <= LONGEST_BASELINE:
-        return ""
-    metres = {unit: rig.baseline * size for unit, size in (("cm", 0.01), ("mm", 0.001))}
-    likely = [f"unit={unit} makes {b:.3g} m" for unit, b in metres.items() if _USUAL[0] <= b <= _USUAL[1]]
-    hint = f" ({', '.join(likely)})" if likely else ""
-    return f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres?{hint}"
 
 
 def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:

@@ -8,9 +8,10 @@ import numpy as np
 
 from slam.data import StereoFeatures
 from slam.geometry.arrays import BoolArray
+from slam.geometry.camera import baseline_doubt
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log
-from slam.input.warnings import REPEATED, baseline_doubt
+from slam.input.warnings import REPEATED
 from slam.models import MotionModel
 from slam.run.summary import RunRecord
 from slam.tracks.step import ENOUGH_FEATURES, HIDDEN
@@ -27,6 +28,9 @@ _ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
 _FASTEST = {False: 10.0, True: 100.0}
 _NEAREST = {False: 0.05, True: 1.0}
 _WIDEST = {False: 1.0, True: np.inf}  # guard: baseline [m] that no hand carries
+_LAG, _LAG_SIGMAS = 0.1, 5.0  # guard: lag of the right images [frames] that counts, and in standard deviations
+_LEAST_FLOWS = 15  # guard: frames of which a lag is taken
+_FLOW = 4.0  # guard: flow [px] beyond which rows would differ by more than they are matched with
 _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is said
 
 
@@ -38,12 +42,13 @@ def outcome(
     dropped: int = 0,
     doubt: str = "",
     driving: bool = False,
+    backend: str = "",
 ) -> str:
     """What to say of a run in which many frames were not tracked, with the likely cause; empty for others.
 
     The first frame is not counted: there is no map yet, unless the run began `in_map`. The first of the `warnings` is
     taken for a cause; repeated images are counted instead. `dropped` frames of a live run came too late; `doubt`, of
-    `motion_doubt`, is a cause where nothing else is one.
+    `motion_doubt`, is a cause where nothing else is one. `backend` names one of somebody's own, which may be the cause.
     """
     untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
     frames, missed = len(record.statuses) - 1, len(untracked)
@@ -55,6 +60,8 @@ def outcome(
         cause = _starved(record, untracked, rig, in_map) or doubt
         if not cause and dropped < frames:  # where most came, the gaps are hardly all of it
             cause = _unexplained(record, rig, driving)
+            if backend:
+                cause = f"the back end {backend} (`python -m slam.testing {backend}` checks it); or {cause}"
     causes = [cause] if cause else []
     if frozen:
         causes.append(f"in {record.repeated} of them {REPEATED}")
@@ -94,7 +101,7 @@ def _starved(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map
             f"in the median of these frames {stereo:.0f} of {features:.0f} features are found in the right image: "
             "check that the images are of two cameras, the left one first, and the calibration"
         )
-    return baseline_doubt(rig)
+    return baseline_doubt(rig.baseline)
 
 
 def _unexplained(record: RunRecord, rig: StereoRig, driving: bool) -> str:
@@ -168,6 +175,45 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     return (
         f"from frame to frame the velocity changes {ratio:.0f} times as much as expected: check the times of the "
         f"images (fps=…, or seconds in times=…){'' if driving else ', and whether this is a vehicle (--kind driving)'}"
+    )
+
+
+def row_flow(features: StereoFeatures, T_other_now: Array, rig: StereoRig) -> tuple[float, float]:
+    """Sums of products over a frame's features: vertical disparity times flow, and flow times flow [px²].
+
+    The flow is how many rows a still point moves in the left image from another frame to this one; `T_other_now` (4, 4)
+    takes this frame's camera coordinates to the other's. A right image from between them is off by a share of it.
+    """
+    rows, rectified, R = np.flatnonzero(features.has_stereo), rig.rectified, rig.rectified.R_left
+    left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
+    with np.errstate(all="ignore"):
+        points = rectified.rig.triangulate(left, np.column_stack([right[:, 0], left[:, 1]]))
+        there = (points @ R @ T_other_now[:3, :3].T + T_other_now[:3, 3]) @ R.T
+        other = rectified.rig.left.project(there)
+    flow, vertical = left[:, 1] - other[:, 1], right[:, 1] - left[:, 1]
+    good = np.isfinite(flow + vertical) & (np.abs(flow) < _FLOW)
+    return float(flow[good] @ vertical[good]), float(flow[good] @ flow[good])
+
+
+def moment_doubt(record: RunRecord) -> str:
+    """What to say where rows of left and right features differ as they do between images of two moments.
+
+    The lag of the right images, in frames, is the regression of vertical disparities on the flow along columns from the
+    frame before; how early they are, on that from the frame after. Rows that differ because of the calibration do so in
+    the same way whatever the motion is.
+    """
+    found = {"": _LAG}
+    for word, flows in zip(("late", "early"), np.array(record.row_flows).reshape(-1, 2, 2).swapaxes(0, 1)):
+        while len(flows) >= _LEAST_FLOWS:  # of all frames, of the last half, … : an image may be missing in the middle
+            products, squares = flows.T
+            lag = -products.sum() / max(squares.sum(), np.finfo(float).tiny)
+            if lag * squares.sum() > _LAG_SIGMAS * np.sqrt(np.square(products + lag * squares).sum()):
+                found[word] = max(lag, found.get(word, 0.0))
+            flows = flows[len(flows) // 2 :]
+    word = max(found, key=lambda word: found[word])
+    return word and (
+        "left and right image are not of one moment: rows of their features differ with the motion, as if right images "
+        f"were {word} by a part of a frame or more; pair them by their times, and let one camera trigger the other"
     )
 
 

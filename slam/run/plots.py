@@ -220,17 +220,21 @@ def _unit(largest: float) -> tuple[float, str]:
 def draw_maps(axes: Sequence[Axes], runs: Sequence[RunData], key: Axes) -> None:
     """Each run's map from above; in the panel `key` what the marks are."""
     names: dict[str, Any] = {}
+    limits: list[Array] = []
     for axis, (run, colour, _) in zip(axes, _coloured(runs)):
-        _draw_map(axis, run, colour)
+        limits.append(_draw_map(axis, run, colour))
         handles, labels = axis.get_legend_handles_labels()
         names |= dict(zip(labels, handles))
+    (left, bottom), (right, top) = np.min(limits, axis=0)[0], np.max(limits, axis=0)[1]
+    for axis in axes[: len(limits)]:  # of all maps, so that they can be compared
+        axis.set(xlim=(left, right), ylim=(bottom, top))
     key.axis("off")
     columns = max(1, int(key.get_figure(root=True).get_figwidth() / _NAME))  # type: ignore[union-attr]
     key.legend(list(names.values()), list(names), loc="center", ncols=columns, frameon=False, markerscale=1.5)
 
 
-def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
-    """One map, in limits that hold the path and the well-known landmarks with their ellipses."""
+def _draw_map(axis: Axes, run: RunData, colour: str) -> Array:
+    """One map; returns limits (2, 2) that hold the path and the well-known landmarks with their ellipses."""
     from matplotlib.collections import EllipseCollection
 
     known, plane = well_known(run), run.covariances[:, [0, 2]][:, :, [0, 2]]
@@ -263,11 +267,10 @@ def _draw_map(axis: Axes, run: RunData, colour: str) -> None:
     around[: len(known)] = _SIGMAS * np.sqrt(np.diagonal(run.covariances[known], axis1=1, axis2=2)[:, [0, 2]])
     low, high = (points - around).min(axis=0), (points + around).max(axis=0)
     half = 0.55 * float((high - low).max()) + 0.1
-    (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
     sure = "" if len(known) == len(run.positions) else f" of {len(known)}"  # the others would cover these
     title = f"{run.name}: {len(run.positions)} landmarks, 2σ ellipses{sure}"
-    axis.set(title=title, xlabel="right [m]", ylabel="forward [m]", aspect="equal", xlim=(left, right))
-    axis.set_ylim(bottom, top)
+    axis.set(title=title, xlabel="right [m]", ylabel="forward [m]", aspect="equal")
+    return np.array([(low + high) / 2 - half, (low + high) / 2 + half])
 
 
 # --------------------------------------------------------------------------------------------- errors and times

@@ -108,7 +108,7 @@ METRICS = (
     Metric("behind", "behind, median", "ms", "live/milliseconds behind/median", shown="run"),
     Metric("behind_most", "behind, most", "ms", "live/milliseconds behind/max", shown="run"),
     Metric("milliseconds", "time of a frame, median", "ms", "milliseconds/median_total", shown="run"),
-    Metric("compiling", "compiling, once", "s", "compile_seconds", shown="run"),
+    Metric("compiling", "compiling, once, by the first run", "s", "compile_seconds", shown="run"),
 )  # fmt: skip
 
 BY_KEY = {metric.key: metric for metric in METRICS}
@@ -143,6 +143,8 @@ def figures(summary: Mapping[str, Any]) -> dict[str, float]:
         found["tracked"] = _measured(summary) / frames
     if ratios := _ratios(found):
         found["ratio"] = next(iter(ratios.values()))
+    if not (summary.get("status") or {}).get("tracked"):  # loops of poses that are the motion model's are none
+        found.pop("loops_closed", None)
     if not found.get("loops_closed") and not found.get("loops_refused"):
         found = {key: value for key, value in found.items() if not key.startswith("loops")}
     return found
@@ -169,7 +171,8 @@ def facts(summary: Mapping[str, Any]) -> str:
     found = figures(summary)
     shown = [m for m in METRICS if "picture" in m.shown and found.get(m.key)]
     words = [f"{m.label} {m.show(found[m.key])} {m.unit}".rstrip() for m in shown]
-    return "; ".join(filter(None, [*words, verdict_of_run(summary)]))
+    doubt = "do not trust this path, see the run's warnings" if summary.get("doubt") else ""
+    return "; ".join(filter(None, [doubt, *words, verdict_of_run(summary).partition(" (")[0]]))
 
 
 def _measured(summary: Mapping[str, Any]) -> int:
@@ -203,11 +206,14 @@ def verdict(found: Mapping[str, float], runs: int = 1) -> str:
     said = {over: "too small" if r > high else "too large" if r < low else "right" for over, r in ratios.items()}
     judged, ratio = next(iter(ratios.items()))
     others = [f"{over} {number(ratios[over])} times: {word}" for over, word in said.items() if word != said[judged]]
-    word = f"are {said[judged]}" if said[judged] != "right" else "hold in part" if others else "hold"
+    exact = said[judged] == "too large" and found.get("exact_calibration")
+    word = "hold in part" if others else "hold"
+    if said[judged] != "right":
+        word = "are on the safe side" if exact else f"are {said[judged]}"
     of = "runs" if runs == 1 else f"means of {runs} runs"
     times = f"{judged} errors of the pose are {number(ratio)} times what they claim"
     band = f"({low:.2f} to {high:.2f} in 95 % of {of})"
-    if said[judged] == "too large" and found.get("exact_calibration"):
+    if exact:
         others.append("they count errors of the calibration, and this world's cameras have none")
     return "; ".join([f"covariances {word}: {times} {band}", *others])
 

@@ -17,12 +17,13 @@ from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.objects import labels_in_images, score_for
 from slam.evaluation.summary import with_truth
+from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.input.features import Rectification
 from slam.interfaces import Frontend
 from slam.outputs import require_outputs
 from slam.run.options import RunOptions, origin, versions
-from slam.run.outcome import median_depth, motion_doubt, outcome, scale_doubt
+from slam.run.outcome import median_depth, moment_doubt, motion_doubt, outcome, row_flow, scale_doubt
 from slam.run.outputs import RunFiles, write_json, write_trajectory
 from slam.run.recording import RecordedFrame, Recording, save_recording
 from slam.run.replay import replay
@@ -144,6 +145,7 @@ class _Run:
                 reading[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
                 yield frame
 
+        before: FrameResult | None = None
         for frame, result in system.run(timed()):
             result.milliseconds["read"] = reading.pop(frame.index)  # type: ignore[index]
             if self.live is not None:
@@ -151,6 +153,11 @@ class _Run:
             if frame.right is None:
                 record.without_right.append(len(record.statuses))
             record.depths.append(median_depth(result.features, system.rig))
+            if result.status.measured and before is not None and before.status.measured:
+                step = inverse(before.estimate.T_world_left) @ result.estimate.T_world_left
+                late = row_flow(result.features, step, system.rig)
+                record.row_flows.append((*late, *row_flow(before.features, inverse(step), system.rig)))
+            before = result
             yield frame.index, result
             for watch in watches:
                 watch(frame, result, system)
@@ -263,16 +270,18 @@ class _Run:
         options, record, rig = self.options, self.record, self.sequence.rig
         warnings, driving = getattr(self.system, "warnings", ()), options.kind == "driving"
         calibration = getattr(self.system, "calibration", None)
-        doubt = scale_doubt(record, rig, driving) or getattr(calibration, "doubt", "")
-        doubt = doubt or motion_doubt(record, options.config.models.motion, driving)
+        no_path = scale_doubt(record, rig, driving) or moment_doubt(record) or getattr(calibration, "doubt", "")
+        doubt = no_path or motion_doubt(record, options.config.models.motion, driving)
         in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
-        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving)
+        own = options.backend if ":" in options.backend else ""
+        tracking = outcome(record, rig, warnings, in_map, dropped, doubt, driving, own)
         if doubt and not tracking:
             logger.warning("%s", doubt)
         return {
             "frames": len(record.numbers),
             "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
             "tracking": tracking,
+            "doubt": getattr(self.system, "doubt", "") or no_path,
             "warnings": [*self.sequence.warnings, *warnings, *([doubt] if doubt else [])],
             **({} if self.live is None else {"live": live_frames(self.live, record)}),
         }

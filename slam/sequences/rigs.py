@@ -173,8 +173,8 @@ def _rig(entries: Entries, images: Size | None, unit: float, rectified: bool, fi
     b = R.T @ t  # h_right = R (h_left + b), paper A, Eq. 6
     if entries.form and b[0] > np.abs(b).max() / 2:
         raise CalibrationError(
-            f"the second camera stands {b[0]:.4f} m to the left of the first one: are the cameras swapped? The "
-            "first one of a calibration is the left one"
+            f"the second camera stands {b[0]:.4f} m to the left of the first one: are the cameras swapped (the first "
+            "one of a calibration is the left one), or is its pose the inverse one?"
         )
     if R[2, 2] < _ALIKE:
         apart = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))

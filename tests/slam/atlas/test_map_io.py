@@ -137,7 +137,7 @@ def test_a_landmark_that_is_hardly_known_can_be_kept():
 
 
 def test_other_files_and_versions_are_refused(tmp_path):
-    with pytest.raises(SlamError, match="No such file"):
+    with pytest.raises(SlamError, match="there is no such file"):
         load_map(tmp_path / "none.map")
     (tmp_path / "text").write_text("hello")
     with pytest.raises(SlamError, match="not a saved map"):

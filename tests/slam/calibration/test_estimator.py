@@ -112,6 +112,18 @@ def test_a_focal_length_of_another_camera_is_doubted(share, word):
     assert f"% {word} than the calibration's: is it of this camera" in quarter_turn(None, rig).doubt
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"left_k1": 0.2, "right_k1": 0.2}, "a lens distortion that is not in the calibration (k1 about -0."),
+        ({"right_cx": 0.01}, "disparities about"),
+        ({"roll": 0.03}, "a right camera that is turned by about 1.7°"),
+    ],
+)
+def test_what_no_calibration_of_this_camera_has_is_named(wrong, words):
+    assert words in quarter_turn(parameters(**wrong)).doubt
+
+
 def test_on_a_straight_road_a_common_error_of_the_focal_lengths_stays_unknown():
     for theta in (FOCAL, parameters()):
         mean, sigma = common_focal(drive(theta, seed=6, frames=20))

@@ -83,7 +83,7 @@ GOOD = {"frames": [0, None], "settings": {}, "frontend": "surf", "backend": "ekf
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (None, r"config\.json: No such file"),
+        (None, r"config\.json: there is no such file"),
         ("", r"config\.json: no valid JSON"),
         ("{}", r"not the config\.json"),
         ("[]", r"config\.json: must hold an object, not list"),

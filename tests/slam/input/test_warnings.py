@@ -76,6 +76,17 @@ def never_rectified(left, right):
     return left, cv2.warpPerspective(right, H, (320, 240))
 
 
+def turned(left, right):
+    """Images whose disparity is along columns."""
+    return tuple(cv2.resize(np.rot90(image), (320, 240)) for image in (left, right))
+
+
+def mosaic(left, right):
+    """Grey things seen through a filter that lets less of two colours through."""
+    share = np.tile(np.array([[0.6, 1.0], [1.0, 0.4]]), (120, 160))
+    return tuple((image * share).astype(np.uint8) for image in (left, right))
+
+
 def blurred_copy(left, right):
     return left, cv2.GaussianBlur(left, (3, 3), 0.5)
 
@@ -142,6 +153,20 @@ SAID = {
     "KITTI": (stamped([0.0]), {"rig": KITTI}, ""),
     "rectified twice": (every(3), {"rig": DISTORTED}, "images were rectified before, or undistorted, and are again"),
     "equal lenses": (every(3), {"rig": ALIKE}, "images were rectified before, or undistorted, and are again"),
+    "of a size a fifth larger": (every(3), {"rig": of_size(1.2)}, "middle of the images.* cropped or turned"),
+    "cx and cy exchanged": (
+        every(3), {"rig": slam.StereoRig.rectified_pair(300.0, 120.0, 160.0, 0.12, 320, 240)}, "cx and cy exchanged"
+    ),
+    "turned": (every(3, turned), {}, "the images are turned by 90°, or the cameras stand above each other"),
+    "bytes exchanged": (
+        every(3, lambda a, b: tuple((x.astype(np.uint16) * 16).byteswap() for x in (a, b))), {}, "two bytes of each"
+    ),
+    "12 of 16 bits": (every(3, lambda a, b: (a.astype(np.uint16) * 16, b.astype(np.uint16) * 16)), {}, ""),
+    "mosaic": (every(3, mosaic), {}, "mosaic of a colour camera"),
+    "interlaced": (
+        every(3, lambda a, b: tuple(np.where(np.arange(240)[:, None] % 2, x, np.roll(x, 9, 1)) for x in (a, b))), {},
+        "rows of the image alternate, as in interlaced video",
+    ),
     "never rectified": (every(3, never_rectified), {}, "were they rectified, as this calibration says"),
 }  # fmt: skip
 
@@ -231,6 +256,13 @@ def test_right_images_of_another_moment_are_named(late):
     assert lines(frames) == []
 
 
+def test_shifted_rows_are_not_taken_for_another_moment():
+    """Some features fit the image of the frame before by chance, which moved by about as many rows."""
+    frames = list(slam.open_sequence("synthetic:desk?frames=6&speed=3&rate=20"))
+    (line,) = lines([replace(f, right=np.roll(f.right, 3, axis=0)) for f in frames])
+    assert "rows of left and right image do not agree" in line
+
+
 @pytest.mark.slow
 def test_right_images_that_slip_later_are_named():
     frames = list(slam.open_sequence("synthetic:desk?frames=80"))[::4]
@@ -259,6 +291,14 @@ def test_swapped_cameras_of_an_unrectified_rig():
     good, bad = pair_geometry(rig, *views, 1.5), pair_geometry(rig, *views[::-1], 1.5)
     assert good.conclusive and not good.swapped and not good.rows_differ
     assert bad.swapped
+
+
+def test_a_transposed_rotation_is_named():
+    """It was taken for images that are rectified twice."""
+    rig = unlike_cameras([0.02, 0.12, -0.02], (-0.1, 0.02), (-0.12, 0.02))
+    frames = every(3, seen_by_both(rig.left, rig.right, rig.R))
+    (line,) = lines(frames, rig=slam.StereoRig(rig.left, rig.right, rig.R.T, rig.b))
+    assert "agree with the inverse of the calibration's rotation" in line
 
 
 def test_images_undistorted_but_not_rectified_before_are_named():

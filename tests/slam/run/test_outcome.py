@@ -6,11 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import typer
 
+from slam.commands.run import finish
+from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.models import MotionModel
-from slam.run.outcome import motion_doubt, outcome, scale_doubt
+from slam.outputs import Output
+from slam.run.outcome import moment_doubt, motion_doubt, outcome, row_flow, scale_doubt
 from slam.run.results import rows
 from slam.run.summary import RunRecord
 
@@ -55,6 +59,7 @@ AGAIN = "features are found in both images, but not again in the next frame"
         ((200, 150), 0.12, {"dropped": 1}, AGAIN),
         ((200, 150), 0.12, {"dropped": 2, "warnings": ["A"]}, "A; and 2 frames were dropped, and the frames about"),
         ((200, 150), 0.12, {}, AGAIN),
+        ((200, 150), 0.12, {"backend": "a:B"}, "the back end a:B (`python -m slam.testing a:B` checks it); or feat"),
         ((200, 0), 0.12, {"in_map": True}, "the camera is not where the map was made"),
         ((200, 3), 0.12, {"warnings": ["left and right look swapped", "more"]}, "left and right look swapped"),
     ],
@@ -128,6 +133,41 @@ def test_a_vehicle_that_goes_sideways_is_doubted():
     for step in ((0.05, 0, 1.0), (0.01, 0, 0.0)):
         assert motion_doubt(along(step), MotionModel(), driving=True) == ""
     assert motion_doubt(along((0.3, 0, 0.05)), MotionModel()) == ""
+
+
+def features_at(left: np.ndarray, right: np.ndarray) -> StereoFeatures:
+    """Features at pixels (N, 2)."""
+    ones = np.ones(len(left))
+    return StereoFeatures(0.0, left, right, ones, 0 * ones, ones, ones.astype(np.int8), np.ones((len(left), 4), "f4"))
+
+
+@pytest.mark.parametrize(("late", "word"), [(0.0, ""), (0.3, "late"), (-0.3, "early")])
+def test_right_images_of_another_moment_are_known_by_rows_that_follow_the_motion(late, word):
+    """Cameras that do not trigger each other; one that is pitched moves rows in the same way whatever the motion is."""
+    rng, run = np.random.default_rng(0), RunRecord()
+    for _ in range(30):
+        points = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], (200, 3))  # in the frame's camera axes
+        step = exp(rng.normal(0, 1, 6) * [0.006, 0.006, 0.006, 0.01, 0.01, 0.01])  # from now to the frame before
+        left, right = RIG.project(points)
+        after = exp(rng.normal(0, 1, 6) * [0.006, 0.006, 0.006, 0.01, 0.01, 0.01])
+        there = points @ (step if late > 0 else after)[:3, :3].T + (step if late > 0 else after)[:3, 3]
+        right[:, 1] += abs(late) * (RIG.left.project(there) - left)[:, 1] + 0.4 + rng.normal(0, 0.1, len(points))
+        features = features_at(left, right)
+        run.row_flows.append((*row_flow(features, step, RIG), *row_flow(features, after, RIG)))
+    said = moment_doubt(run)
+    assert bool(said) == bool(word) and f"right images were {word} by" in (said or "right images were  by")
+
+
+@pytest.mark.parametrize(("doubt", "status"), [("", 0), ("rows do not agree", 1)])
+def test_a_path_that_cannot_be_trusted_does_not_look_like_one_that_can(doubt, status, tmp_path, capsys):
+    summary = {"frames": 9, "status": {"tracked": 8}, "tracking": "", "doubt": doubt, "path_length_m": 1.0}
+    try:
+        finish(summary, [Output(tmp_path, "--out", [])], picture=False, quiet=True)
+        code = 0
+    except typer.Exit as end:
+        code = end.exit_code
+    assert code == status
+    assert capsys.readouterr().err == (f"slam: do not trust this path: {doubt}\n" if doubt else "")
 
 
 def test_a_baseline_that_no_hand_carries_is_the_cause_unless_it_is_a_vehicle_s():

@@ -50,9 +50,15 @@ def test_covariances_that_are_too_large_on_an_exact_world_say_why(tmp_path):
         tree = summary(0.1)
         tree["consistency"]["exact calibration"] = exact
         said = verdict_of_run(tree)
-        assert said.endswith("this world's cameras have none") == exact
+        assert said.endswith("this world's cameras have none") == exact == ("are on the safe side" in said)
         (group,) = groups(plan, [Run(trial, "completed", figures(tree), {}, tmp_path)])
         assert honesty(group) == [f"ekf: {said}."]
+
+
+def test_loops_of_poses_that_were_never_measured_are_no_figure():
+    tree = {"frames": 9, "status": {"tracked": 8}, "loops": {"closed": 7}}
+    assert figures(tree)["loops_closed"] == 7
+    assert "loops_closed" not in figures(tree | {"status": {"predicted": 8}})
 
 
 def test_a_nees_of_which_most_stretches_had_no_covariance_is_no_figure():

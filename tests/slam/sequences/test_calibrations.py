@@ -273,7 +273,7 @@ REFUSED = [
     ('{"rig": {}, "parameters": [], "evidence": null}', "errors of a rig, as `slam calibrate` or a run found them"),
     ("cam0:\ncam1:\n", "K1, K2, R, T are missing; in it: cam0, cam1"),
     *((CAMCHAIN.replace(old, new, 1), text) for old, new, text in (
-        ("-0.2]", "0.2]", "are the cameras swapped? The first one of a calibration is the left one"),
+        ("-0.2]", "0.2]", "are the cameras swapped (the first one of a calibration is the left one)"),
         ("  T_cn_cnm1:", "  T_12:", "it looks like Kalibr's, but R, T are missing"),
         ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),

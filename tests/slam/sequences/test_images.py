@@ -74,7 +74,7 @@ def test_what_is_no_image_at_all(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "d.tiff"), SCENE.astype(np.float32))
     for name, words in (
         ("a.png", "not a readable image"),
-        ("b.png", "No such file"),
+        ("b.png", "there is no such file"),
         ("c.png", ""),
         ("d.tiff", "pixels are float32, not 8 or 16 bit"),
     ):
@@ -117,7 +117,7 @@ def test_damaged_vanished_and_other_images_cost_no_more_than_themselves(kitti: P
     assert [(f.index, f.right is None) for f in sequence] == [(0, True), (3, False), (4, True), (5, False)]
     for words in (
         "frame 0 is given without its right image: ",
-        "000001.png: No such file",
+        "000001.png: there is no such file",
         "frame 2 skipped: ",
         "000002.png: image is 32x48, not 64x48",
     ):

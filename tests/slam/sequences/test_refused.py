@@ -93,7 +93,7 @@ def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, eur
         ("calibration=nowhere.yaml", CalibrationError, "the calibration is missing"),
         ("calibration=~nobody_of_this_name", CalibrationError, None),
         ("calibration=/dev/zero", CalibrationError, None),
-        ("times=nowhere.txt", SequenceError, "nowhere.txt: No such file"),
+        ("times=nowhere.txt", SequenceError, "nowhere.txt: there is no such file"),
         ("times=/dev/zero", SequenceError, None),
         ("times=t.txt&fps=3", ConfigurationError, "'fps' does nothing here"),
         ("tolerance=0.1", ConfigurationError, "'tolerance' does nothing here"),

@@ -31,7 +31,7 @@ def test_paths_are_read_in_the_forms_of_kitti_and_tum(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "No such file"),
+        (None, "there is no such file"),
         ("", "has 8 columns, found"),
         ("hello\n", "cannot be read as a trajectory"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", r"a path of 0\.0 m in 1 poses; a drive needs 10 m to 100 km"),
